@@ -319,5 +319,5 @@ ROWS = [
 def place(root: Path, monkeypatch: pytest.MonkeyPatch, fixture: Callable[[str], Any]) -> Workshop:
     """Return where they are made."""
     monkeypatch.setenv("VLATOOL_CACHE", str(root / "cache"))
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
     return Workshop(root, fixture("policy_template"), fixture("pruned_once"), monkeypatch)

@@ -160,7 +160,7 @@ def test_the_file_runs_only_where_its_folder_is_named(policy_dir: Path, tmp_path
     source = pruned(policy(policy_dir))
     ran = policy_dir.parent / "ran"
     (policy_dir / "train.py").write_text(f"open({str(ran)!r}, 'w').close()\n")
-    with trust.nothing_named(), pytest.raises(SourceError, match="which you did not name"):
+    with trust.forget_named(), pytest.raises(SourceError, match="which you did not name"):
         distilled(source, tmp_path / "out", **ALONE)
     with pytest.raises(SourceError, match="has changed since"):
         distilled(source, tmp_path / "out", **ALONE)

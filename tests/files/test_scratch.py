@@ -53,7 +53,7 @@ def last_words(place: Path) -> None:
 
 def a_child(place: Path) -> None:
     file = str(place / "graphs/main.onnx")
-    call("vlatool.stage._inside:run", {"stage": "sources.onnx", "options": {"model": file}, "source": ""}, print, file)
+    call("vlatool.stage._child:run", {"stage": "sources.onnx", "options": {"model": file}, "source": ""}, print, file)
 
 
 def named_in_the_fix(place: Path) -> None:

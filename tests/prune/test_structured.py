@@ -152,7 +152,7 @@ def test_what_was_asked_and_reached_is_said_and_recorded(pruned: Bundle, source_
     assert (record["asked"], record["without_rule"]) == (0.1, [])
     assert 0.09 <= record["reached"] <= 0.15
     assert record["reached"] == round(1 - record["macs"][1] / record["macs"][0], 4)
-    assert f"asked for 10.0% less work, reached {record['reached']:.1%} (" in context.said[0]
+    assert f"asked for 10.0% less work, reached {record['reached']:.1%} (" in context.messages[0]
     assert [line.split(",")[0] for line in removed_by(again)] == [
         f"prune.structured: asked for {asked}% less work" for asked in ("30.0", "10.0")
     ]

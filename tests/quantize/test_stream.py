@@ -26,7 +26,7 @@ from vlatool.quantize._records import Record
 from vlatool.quantize._rewrite import Task, copy_task, weight_task
 from vlatool.quantize._stream import write_records
 from vlatool.quantize._worker import serve
-from vlatool.stage.base import Tell
+from vlatool.stage.base import OnProgress
 from vlatool.weights.shards import StoredTensor, fingerprint, read_header, read_shards, reading, stored_array
 
 FORM = Format()
@@ -105,7 +105,7 @@ class Stop(Exception):
     """Ends a run from within."""
 
 
-def stopping(after: int) -> Tell:
+def stopping(after: int) -> OnProgress:
     left = iter(range(after))
 
     def tell(_what: str, _share: float | None) -> None:

@@ -109,7 +109,7 @@ def compare(source: Path, made: Path, count: int) -> float:
     from vlatool.user_code import trust
 
     bundle = Bundle.open(source)
-    trust.name(read_location(source), None, "")
+    trust.allow(read_location(source), None, "")
     stored, observations = stored_modules(bundle), observations_for(bundle, count)
     noises = [noise for step in bundle.manifest.program for noise in step.noise.items()]
     random = np.random.default_rng(0)

@@ -247,9 +247,11 @@ def test_what_another_process_removes_meanwhile_is_no_entry(kept: Bundle, cache:
     (cache / FILES).mkdir()
     gone = {folder: cache / folder / name for folder, name in (
         ("stages", "export.onnx-" + "0" * 16), ("workloads", "0" * 32 + ".json"), (FILES, "c" * 64))}  # fmt: skip
-    below = cache_module._below
+    below = cache_module._children
     monkeypatch.setattr(
-        cache_module, "_below", lambda folder: below(folder) + [gone[name] for name in gone if name == folder.name]
+        cache_module,
+        "_children",
+        lambda folder: below(folder) + [gone[name] for name in gone if name == folder.name],
     )
     before = {path.relative_to(cache).as_posix() for path in below(cache / "stages")}
     found = contents(cache)

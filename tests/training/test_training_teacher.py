@@ -22,7 +22,7 @@ from vlatool.user_code import trust
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
-    with trust.nothing_named():
+    with trust.forget_named():
         yield write_deep(tmp_path / "wide", layers=3, width=24)
 
 
@@ -70,7 +70,7 @@ def test_a_policy_of_the_users_learns_from_another_one(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """Both typed as folders, with nothing else named or trusted."""
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
     student, out = write_deep(tmp_path / "narrow"), tmp_path / "out"
     short = ("--steps", "30", "--batch", "8", "--average", "0", "--learning-rate", "0.01", "--threads", "1")
     with pytest.raises(SystemExit) as caught:

@@ -52,5 +52,5 @@ def test_what_vlatools_own_code_raises_is_named_and_not_blamed_on_the_policy() -
     """It stays an error with exit code 3: what a child says decides no exit code."""
     says = r"^vlatool\.stage\._inside\.run failed in the process that runs policy\.py: KeyError: 'stage'\.\n"
     with pytest.raises(SourceError, match=says) as caught:
-        children.call("vlatool.stage._inside:run", {}, lambda *_: None, "policy.py")
+        children.call("vlatool.stage._child:run", {}, lambda *_: None, "policy.py")
     assert caught.value.fix.startswith("that is vlatool's own code: report it")

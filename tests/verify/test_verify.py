@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlatool.bundle.bundle import Bundle, restate
+from vlatool.bundle.bundle import Bundle, replace_manifest
 from vlatool.cli import main
 from vlatool.errors import SourceError, UsageError
 from vlatool.render.formats.terminal import TerminalRenderer
@@ -98,7 +98,7 @@ def against(policy_dir: Path):
 def _trusted(policy_template: Path) -> None:
     from vlatool.user_code import trust
 
-    trust.name(policy_template)
+    trust.allow(policy_template)
 
 
 def found(bundle: Bundle, against: str, **options: Any) -> Report:
@@ -320,7 +320,7 @@ def test_without_a_recording_both_run_on_random_observations(copied, bundles, ag
     from dataclasses import replace
 
     files = {name: each for name, each in bundle.manifest.files.items() if not name.startswith("data/")}
-    report = found(restate(bundle, replace(bundle.manifest, files=files)), against(), samples=3)
+    report = found(replace_manifest(bundle, replace(bundle.manifest, files=files)), against(), samples=3)
     assert report.verdict == "pass"
     assert "3 random observations" in report.title
     assert any("there is no recording" in each for each in report.warnings)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field, PrivateAttr
 
 from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.bundle.unexported import export_command
+from vlatool.bundle.module_bundle import export_command
 from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
@@ -162,9 +162,9 @@ class Latency(Measure):
             if self.memory_mb and not bundle.manifest.graphs:
                 raise UsageError(f"The memory of eager torch is not limited: {bundle.path} has no graph.", "export it")
         job = self._job(bundles)
-        if context.elsewhere is None:
-            return self._report(bundles, job, agent.measure(job, context.tell), HERE)
-        answer = context.elsewhere(to_json(job), [bundle.path for bundle in bundles], context.tell)
+        if context.measure_remotely is None:
+            return self._report(bundles, job, agent.measure(job, context.progress), HERE)
+        answer = context.measure_remotely(to_json(job), [bundle.path for bundle in bundles], context.progress)
         try:
             measured = from_json(Measured, answer, "answer")
             where = str(measured.host.get("board") or measured.host.get("cpu") or "the target")

@@ -84,7 +84,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     model = shipped().conditioned(measured_questions(calibration))
     owned = [board for board in boards if board.price_usd_per_hour is None]
     rented = [board for board in boards if board.price_usd_per_hour is not None]
-    context.tell("predicting", None)
+    context.progress("predicting", None)
     cloud = _cheapest(rented, load, model, asked) if asked.cloud else None
     choices = choose(owned or rented, load, model, asked)
     return boards_report(source, load, choices, asked, cloud, context.command)
@@ -132,10 +132,10 @@ def _counted_source(bundle: Bundle, context: Context) -> Workload:
 
     A factory that reads its own weights cannot fill modules that have none, and may look at their values.
     """
-    context.tell("counting the policy's work, without its weights", None)
+    context.progress("counting the policy's work, without its weights", None)
     with contextlib.suppress(SourceError):  # what is wrong with the policy itself, the export says
-        return counted_apart(bundle, context.tell)
-    context.tell("it cannot be counted so; exporting the policy to count its graphs", None)
+        return counted_apart(bundle, context.progress)
+    context.progress("it cannot be counted so; exporting the policy to count its graphs", None)
     return _counted_export(bundle, context)
 
 

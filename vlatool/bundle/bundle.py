@@ -32,7 +32,7 @@ DIGEST = "manifest.sha256"
 """The SHA-256 of the manifest, as ``sha256sum`` writes it: what protects everything that the manifest says."""
 LOCATION = "location.json"
 REPORTS = "reports"
-UNRECORDED = (REPORTS, "recipe.yaml", MANIFEST, DIGEST, "SIGNATURE", LOCATION, LEDGER)
+UNRECORDED_NAMES = (REPORTS, "recipe.yaml", MANIFEST, DIGEST, "SIGNATURE", LOCATION, LEDGER)
 """Names at the top of a bundle that the manifest holds no hash of: they are written about the bundle."""
 ASSETS = "assets"
 
@@ -104,7 +104,7 @@ class Bundle:
         """
         check_files(self.manifest)
         try:
-            stranger = find_unlisted(self.path, set(self.manifest.files), UNRECORDED[1:], REPORTS)
+            stranger = find_unlisted(self.path, set(self.manifest.files), UNRECORDED_NAMES[1:], REPORTS)
         except OSError as error:
             raise BundleError(
                 f"{self.path} cannot be read: {error.strerror}.",
@@ -148,8 +148,8 @@ class Bundle:
             BundleError: when a file is not what the manifest says, or changed before the block ended.
         """
         files = {name: self._record(name) for name in names}
-        with verified_directory(self.path, folder, files) as place:
-            yield place
+        with verified_directory(self.path, folder, files) as path:
+            yield path
         self._verified.update(files)
 
     def _record(self, name: str) -> tuple[str, int]:
@@ -197,7 +197,7 @@ def seal(directory: Path, manifest: Manifest) -> Bundle:
     files = {}
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
-        if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in DESKTOP_FILES:
+        if path.is_file() and name.partition("/")[0] not in UNRECORDED_NAMES and path.name not in DESKTOP_FILES:
             status = path.stat()
             linked = status.st_nlink > 1  # shared among stages of the cache, and read-only
             files[name] = FileRecord(cached_hash(path) if linked else hash_file(path), status.st_size)
@@ -206,7 +206,7 @@ def seal(directory: Path, manifest: Manifest) -> Bundle:
     return Bundle(directory, sealed)
 
 
-def restate(bundle: Bundle, manifest: Manifest) -> Bundle:
+def replace_manifest(bundle: Bundle, manifest: Manifest) -> Bundle:
     """Write another manifest for a bundle whose files stay as they are, and return it."""
     write_manifest(bundle.path, manifest)
     return Bundle(bundle.path, manifest)

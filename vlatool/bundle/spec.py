@@ -18,11 +18,11 @@ KINDS = ("tensor", "text", "discrete")
 NORMALISATIONS = ("none", "mean_std", "min_max", "quantiles")
 STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99")}
 MODES = ("", "delta", "absolute", "velocity", "relative")
-MOST_INDICES = 2**18
+MAX_INDICES = 2**18
 """Labels that are made up for a discrete output that names none: more than any vocabulary of tokens has."""
 
 
-MOST_HZ = 100_000
+MAX_HZ = 100_000
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class TensorSpec:
 def _indices(shape: tuple[Any, ...]) -> tuple[str, ...]:
     """Labels of actions without names, such as 256 action tokens: the indices of the last axis, unless it is free."""
     width = shape[-1] if shape else 0
-    return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MOST_INDICES else ()
+    return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MAX_INDICES else ()
 
 
 @dataclass(frozen=True)
@@ -219,8 +219,8 @@ class PolicySpec:
                 )
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
-        if isinstance(self.control_hz, bool) or not _between(self.control_hz, 0, MOST_HZ):
-            allowed = f"a rate in Hz above 0 and below {MOST_HZ:,}"
+        if isinstance(self.control_hz, bool) or not _is_between(self.control_hz, 0, MAX_HZ):
+            allowed = f"a rate in Hz above 0 and below {MAX_HZ:,}"
             raise SpecError(f"control_hz is {short_repr(self.control_hz)}; allowed: {allowed}.")
         integer(self.chunk, "chunk", SpecError, 1)
         check_limit("elements", self.chunk, "chunk", SpecError)
@@ -267,7 +267,7 @@ class PolicySpec:
         return plain
 
 
-def _between(value: Any, low: float, high: float) -> bool:
+def _is_between(value: Any, low: float, high: float) -> bool:
     return isinstance(value, int | float) and low < value < high
 
 

@@ -25,8 +25,8 @@ from vlatool.files.printable import mask_passwords, one_line, printable
 from vlatool.machine.host import cache_directory
 from vlatool.report import REPORT as REPORT_FILE
 from vlatool.report import Report
-from vlatool.stage.base import Context, Tell
-from vlatool.workers import PROCESSES, asked_for, launcher
+from vlatool.stage.base import Context, OnProgress
+from vlatool.workers import PROCESSES, launcher, parse_workers
 
 PLACES = ("-o", "--output", "--cache", "--junit", "--video")
 """Options that name a place to write to: paths are not recorded."""
@@ -69,7 +69,7 @@ def crew(workers: str | None) -> tuple[int, str]:
     """
     if workers is None:
         return default_workers(), PROCESSES
-    name, count = asked_for(workers)
+    name, count = parse_workers(workers)
     launcher(name, count).check()
     return count or default_workers() if name == PROCESSES else count, name
 
@@ -102,7 +102,7 @@ def progress(workers: int = 1, launched_by: str = PROCESSES) -> Iterator[Context
         yield Context(tell, workers, **common)
 
 
-def _plain_lines() -> Tell:
+def _plain_lines() -> OnProgress:
     """Write what is new at once, and only numbers that changed every ``EVERY`` seconds."""
     last, told = "", 0.0
 

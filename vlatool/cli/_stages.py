@@ -20,7 +20,7 @@ from vlatool.cli._default import DefaultGroup
 from vlatool.cli._once import once
 from vlatool.errors import PluginError, UsageError, fix_for, suggest
 from vlatool.stage.base import Measure, Stage, Transform
-from vlatool.stage.build import validated
+from vlatool.stage.build import stage_from
 
 DEFAULTS = {
     "export": "onnx",
@@ -92,7 +92,7 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
         chosen = {name: value for name, value in options.items() if _typed(context, name)}
         name = f"vlatool {stage.kind()} {registry_name(stage)}"
         launch = _torchrun.launch_for(name, trains=issubclass(stage, Transform) and stage.trains)
-        built = validated(stage, _torchrun.with_processes(chosen, launch), name).named()
+        built = stage_from(stage, _torchrun.with_processes(chosen, launch), name).named()
         if measures:
             _run.measure(typing.cast(Measure, built), **arguments)
         elif launch is not None:

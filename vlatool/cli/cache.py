@@ -92,12 +92,12 @@ def prune(
 
 def _place(cache: Path | None) -> Path:
     from vlatool.machine.host import cache_directory
-    from vlatool.stage.cache import is_cache
+    from vlatool.stage.cache import looks_like_cache
 
     place = cache or cache_directory()
     if (cache is not None or place.exists()) and not place.is_dir():
         raise DataError(f"No such directory: {place}.", "name the directory of a cache")
-    if cache is not None and not is_cache(place):
+    if cache is not None and not looks_like_cache(place):
         raise DataError(f"{place} is not a cache: vlatool keeps nothing in it.", "name the directory of a cache")
     return place
 

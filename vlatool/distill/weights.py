@@ -49,7 +49,7 @@ class Weights(ModuleStage):
         stored = read_tensors(self.file)
         check_tensors(modules, stored, str(self.file))
         for graph, module in modules.items():
-            context.tell(f"loading the weights of {graph}", None)
+            context.progress(f"loading the weights of {graph}", None)
             load_tensors(graph, module, stored, str(self.file))
         return ModuleChanges()
 

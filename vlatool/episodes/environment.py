@@ -13,7 +13,7 @@ from vlatool.accuracy.success import truth_of
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import DataError, fix_for, suggest
 from vlatool.files.limits import LIMITS_VARIABLE, limit
-from vlatool.machine.awaited import awaited
+from vlatool.machine.watched_calls import watched_call
 
 SECONDS = "environment_seconds"
 GUIDE = "docs/guides/environment.md has a wrapper of ten lines"
@@ -56,7 +56,7 @@ def limited(
     fix = f"where it needs longer, raise the limit: {raised}; else call {own} of the environment yourself and see where"
     whose = f"{call} of the environment of task '{task}'"
     at = "" if seed is None else f"{when} seed {seed}"
-    return awaited(f"{call} {of}", whose, at, f"{fix} it hangs", allowed)
+    return watched_call(f"{call} {of}", whose, at, f"{fix} it hangs", allowed)
 
 
 class World:

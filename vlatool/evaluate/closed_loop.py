@@ -177,7 +177,7 @@ class ClosedLoop(Measure):
         place = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
         context.unfinished.append(place)
         with Store.open(place) as kept:
-            report = self._measured(source, replace(context, kept=kept))
+            report = self._measured(source, replace(context, store=kept))
         taken = f"{kept.taken} of the {kept.asked} episodes are of an interrupted run of the same command."
         notes = [*([taken] if kept.taken else []), *([kept.problem] if kept.problem else [])]
         context.notes.extend(notes)
@@ -313,7 +313,7 @@ class ClosedLoop(Measure):
             )
         if self.policy or self.environment:
             if file or self.policy:  # a package that is named makes no code of the current directory run
-                trust.name(file.parent if file else Path(job.folder))
+                trust.allow(file.parent if file else Path(job.folder))
             return
         if file is None:
             raise SourceError(

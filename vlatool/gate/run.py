@@ -100,7 +100,7 @@ def _of_episodes(episodes: Episodes, gate: Gate) -> Iterator[ClaimResult]:
 def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:
     """Load both bundles as a robot does, golden action and all, and ask both where answers are claimed."""
     claim = gate.answers
-    timed.context.tell("both bundles, on observations that are not recorded", None)
+    timed.context.progress("both bundles, on observations that are not recorded", None)
     job = replace(timed.job, pairs=claim.observations if claim else 0, seconds=claim.seconds if claim else 0.0)
     if claim is None:
         return measure_agreement(job, timed.timeout)

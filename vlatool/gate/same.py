@@ -7,8 +7,8 @@ from typing import Any
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Manifest
+from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.spec import TensorSpec
-from vlatool.bundle.unexported import no_graph
 from vlatool.errors import BundleError, DataError, GraphError, fix_for, require, suggest
 from vlatool.gate.claims import accuracy
 from vlatool.gate.config import Gate
@@ -35,7 +35,7 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
     """
     for bundle in (candidate, baseline):
         if not bundle.manifest.graphs:
-            raise no_graph(bundle, "run")
+            raise no_graph_error(bundle, "run")
         engine, known = bundle.manifest.engine, registry.names("engines")
         if engine and engine not in known:
             raise BundleError(

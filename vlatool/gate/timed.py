@@ -34,7 +34,7 @@ class Timed:
             GraphError: when a bundle cannot be run, or the process takes longer than the timeout.
         """
         if number == len(self.pairs):
-            self.context.tell(f"process {number + 1}: both bundles, call by call", None)
+            self.context.progress(f"process {number + 1}: both bundles, call by call", None)
             self.pairs.append(self._measure(replace(self.job, seed=self.job.seed + number), number))
         return self.pairs[number]
 

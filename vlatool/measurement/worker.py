@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.bundle.unexported import export_command
+from vlatool.bundle.module_bundle import export_command
 from vlatool.data import observations_for
 from vlatool.errors import BundleError
 from vlatool.machine.processes import die_with_parent

@@ -23,7 +23,7 @@ from vlatool.errors import (
 )
 from vlatool.files.printable import message_of
 from vlatool.module.bytecode import ignore_bytecode
-from vlatool.user_code.children import left
+from vlatool.user_code.children import exit_error
 
 CORRECT_CODE = "correct what fails; VLATOOL_DEBUG=1 shows where it was raised"
 """What is done about code of a user that raises, where no more is known of it."""
@@ -181,7 +181,7 @@ def map_user_exceptions(what: str) -> Iterator[None]:
     except Exception:
         raise
     except BaseException as error:  # the seam: user code may raise anything
-        raise left(about, type(error).__name__, message_of(error)) from error
+        raise exit_error(about, type(error).__name__, message_of(error)) from error
 
 
 def _check_package(factory: str) -> None:

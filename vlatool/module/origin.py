@@ -75,12 +75,12 @@ class Origin:
             file = Path(str(getattr(module, "__file__", None) or os.devnull))
             if path is None or name.startswith(OWN_NAME) or not file.resolve().is_relative_to(path.parent):
                 continue
-            name = file.resolve().relative_to(path.parent)
-            if name.suffix == ".py" and "site-packages" not in name.parts and name.as_posix() not in self.code:
+            own = file.resolve().relative_to(path.parent)
+            if own.suffix == ".py" and "site-packages" not in own.parts and own.as_posix() not in self.code:
                 raise SourceError(
-                    f"The factory '{self.factory}' imports {name}, which no import statement of its files names, so "
+                    f"The factory '{self.factory}' imports {own}, which no import statement of its files names, so "
                     "its changes would not be noticed.",
-                    f"import it with an import statement, or name it in policy.yaml: files: [{name}]",
+                    f"import it with an import statement, or name it in policy.yaml: files: [{own}]",
                 )
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
+from vlatool.bundle.module_bundle import export_command
 from vlatool.bundle.program import ProgramStep
-from vlatool.bundle.unexported import export_command
 from vlatool.data import PLAYED, observations_for
 from vlatool.errors import BundleError, GraphError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of
@@ -147,7 +147,7 @@ class ModuleStage(Transform):
         made_by |= {"options": {**made_by["options"], **done.options}, **done.record}
         edits = concatenate_edits(read_edits(bundle), done.edits)
         changed = write_modules(bundle, out, edits, modules, made_by, done.training, done.program, done.played)
-        context.tell("running the changed policy", None)
+        context.progress("running the changed policy", None)
         return changed
 
 

@@ -39,7 +39,7 @@ from vlatool.optimize.trained import trainings, with_trainings, with_wrong_instr
 from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
-from vlatool.stage.base import Context, Tell
+from vlatool.stage.base import Context, OnProgress
 from vlatool.stage.controls import controls, predicted_for, removed_by
 from vlatool.stage.finish import reseal
 from vlatool.stage.run import cached_measure, cached_transform
@@ -103,11 +103,11 @@ def _confined(plan: Plan, profile: Profile, confine: str, draft: Path, context: 
     )  # fmt: skip
     about = f"optimize, confined to {confine},"
     here = "vlatool.optimize.pipeline:optimize_here"
-    children.call(here, to_json(job), context.tell, about, environment={MAX_CPU_ISA: confine}, own=True)
+    children.call(here, to_json(job), context.progress, about, environment={MAX_CPU_ISA: confine}, own=True)
     return read_report(draft / "reports")
 
 
-def optimize_here(request: Mapping[str, Any], tell: Tell) -> None:
+def optimize_here(request: Mapping[str, Any], tell: OnProgress) -> None:
     """Run an ``OptimizeJob`` in this process; its report is in the draft."""
     job = from_json(OptimizeJob, request)
     profile, recipe = Profile.model_validate(job.profile), Recipe.model_validate(job.recipe)

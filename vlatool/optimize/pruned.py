@@ -79,7 +79,7 @@ class PrunedSearch:
         while (asked := study.ask(pruning.trials)) is not None:
             number, shape = asked
             place = len(study.tried()) + 1  # numbers of the study count shapes that were asked for twice, too
-            self.context.tell(f"trial {place} of {pruning.trials}: {space.name(shape)}", None)
+            self.context.progress(f"trial {place} of {pruning.trials}: {space.name(shape)}", None)
             study.tell(number, self._try(shape, space))
         tried = study.tried()
         chosen = self._finalists(tried, space)

@@ -164,8 +164,8 @@ class Search:
         self._planned = max(self._planned, done + 1)
         left = (time.monotonic() - self._begun) / done * (self._planned - done) if done else math.nan
         rest = f", about {left:.0f} s left" if done else ""
-        self.context.tell(f"search: plan {done + 1} of at most {self._planned}{rest}: {name}", done / self._planned)
-        quiet = replace(self.context, tell=lambda _what, _share: None)
+        self.context.progress(f"search: plan {done + 1} of at most {self._planned}{rest}: {name}", done / self._planned)
+        quiet = replace(self.context, progress=lambda _what, _share: None)
         try:
             bundle = self.baseline
             for stage in transforms(stages):
@@ -277,7 +277,7 @@ class Search:
             try:
                 self._layers = sensitivities_apart(self.baseline, stage, RECORDED, SAMPLES, self.context, SECONDS)
             except GraphError as error:  # the plans that were tried stand
-                self.context.tell(f"search: the layers could not be measured: {error.message}", None)
+                self.context.progress(f"search: the layers could not be measured: {error.message}", None)
                 self._layers = []
         return self._layers
 

@@ -54,7 +54,7 @@ class Clock:
         """
         paths = [self._whole, *self._exports(pruned)]
         job = LatencyJob(tuple(map(str, paths)), self._engine, self._threads, CALLS, SECONDS, check=False)
-        measured = agent.measure(job, self._context.tell)
+        measured = agent.measure(job, self._context.progress)
         low, *others = (float(np.percentile(policy.samples, UNDISTURBED)) for policy in measured.policies)
         whole = float(np.median(measured.policies[0].samples))
         return whole, [ms / low * whole for ms in others]
@@ -63,7 +63,7 @@ class Clock:
         """Export the policy after each list of edits, and tell how far that is."""
         for number, edits in enumerate(pruned, 1):
             if len(pruned) > 1:
-                self._context.tell(f"exporting without some of it: {number} of {len(pruned)}", number / len(pruned))
+                self._context.progress(f"exporting without some of it: {number} of {len(pruned)}", number / len(pruned))
             yield self._export(edits)
 
     def _export(self, edits: Sequence[Edit]) -> Path:
@@ -76,7 +76,7 @@ class Clock:
         everything = concatenate_edits(read_edits(self._source), edits)
         bundle = write_modules(self._source, made, everything, modules, self._made_by)
         stage = cast(Transform, build_stage("export.onnx", {}))
-        stage.run(bundle, exported, replace(self._context, tell=lambda _what, _share: None))
+        stage.run(bundle, exported, replace(self._context, progress=lambda _what, _share: None))
         return exported
 
 

@@ -58,12 +58,12 @@ class Sparse(ModuleStage):
         """
         check_pattern(self.pattern, self.ratio)
         found = sparse_layers(modules, source, self.include, self.exclude)
-        context.said.extend(found.told())
+        context.messages.extend(found.told())
         layers = found.chosen
-        context.said.extend(unrecorded_note(source, self.samples) if self.looks else ())
+        context.messages.extend(unrecorded_note(source, self.samples) if self.looks else ())
         given = self._given(layers, modules, source, context) if self.looks else {}
         for number, (name, layer) in enumerate(layers.items()):
-            context.tell(f"pruning {name}", number / len(layers))
+            context.progress(f"pruning {name}", number / len(layers))
             flat = layer.weight.detach().reshape(len(layer.weight), -1)
             layer.weight.data = self.sparse(flat, given.get(name)).reshape(layer.weight.shape).to(layer.weight.dtype)
         return ModuleChanges()
@@ -108,7 +108,7 @@ class Sparse(ModuleStage):
         recorded = passages(source, program, noise, self.samples, 1)
         with require("torch", "build").no_grad(), looking(look):
             for number, passage in enumerate(recorded):
-                context.tell("looking at what layers are given", number / len(recorded))
+                context.progress("looking at what layers are given", number / len(recorded))
                 passage.run(program, noise)
         return {name: total / counts[name] for name, total in sums.items()}
 

@@ -82,7 +82,7 @@ class Depth(ModuleStage):
         """
         sizes = self._chosen(self._sizes(modules), source)
         left = _listed_blocks(sizes, self.keep) if self.keep else self._left(sizes, modules, source, context)
-        context.said.extend(
+        context.messages.extend(
             f"kept {len(kept)} of {sizes[graph, name]} blocks of {name or 'the module itself'}: "
             f"{', '.join(map(str, kept))}"
             for (graph, name), kept in left.items()
@@ -105,7 +105,7 @@ class Depth(ModuleStage):
             raise RecipeError(f"{asked} removes no block of {_listed(sizes)}.", "ask for more")
         if self.rank == "even":
             return {stack: spread(sizes[stack], sizes[stack] - count) for stack, count in goes.items()}
-        context.said.extend(unrecorded_note(source, self.samples))
+        context.messages.extend(unrecorded_note(source, self.samples))
         ranking = Ranking(modules, source, self.samples)
         left = {stack: list(range(sizes[stack])) for stack in goes}
         for (graph, name), block in self._going(ranking, left, goes, context):
@@ -125,7 +125,7 @@ class Depth(ModuleStage):
         scores: dict[Place, float] = {}
         for done in range(total):
             places = [(*stack, block) for stack, count in open_.items() if count for block in left[stack]]
-            context.tell(f"ranking {len(places)} blocks", done / total)
+            context.progress(f"ranking {len(places)} blocks", done / total)
             if not scores or self.rank == "error":
                 scores = rank(places, removed)
             graph, name, block = least = min(places, key=scores.__getitem__)

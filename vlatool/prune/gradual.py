@@ -71,7 +71,7 @@ class Gradual(ImitationStage):
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Train, and say which layers stay dense."""
-        context.said.extend(sparse_layers(modules, source, self.include, self.exclude).told())
+        context.messages.extend(sparse_layers(modules, source, self.include, self.exclude).told())
         return super().change(modules, source, context)
 
     def objective(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Objective:

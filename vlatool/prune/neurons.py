@@ -53,7 +53,7 @@ class Neurons(ModuleStage):
         edits: list[Edit] = []
         for graph, first, second, incoming, outgoing in layers:
             if selection.has((first,)):
-                context.tell(f"pruning {first}", None)
+                context.progress(f"pruning {first}", None)
                 keep = self._kept(incoming, outgoing)
                 edits += [Edit(graph, first, "outputs", keep), Edit(graph, second, "inputs", keep)]
         if not edits:

@@ -50,7 +50,7 @@ class Steps(ModuleStage):
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Change the program alone."""
         before, program = source.manifest.program, self._program(source.manifest.program)
-        context.said.extend(
+        context.messages.extend(
             f"steps of '{old.graph}': {old.repeat} -> {new.repeat}"
             for old, new in zip(before, program, strict=True) if old != new
         )  # fmt: skip

@@ -46,12 +46,12 @@ class Structured(ModuleStage):
             RecipeError: when all that could go is left out, or a pattern matches nothing.
             SourceError: when torch.export cannot trace a module.
         """
-        context.tell("tracing the policy", None)
+        context.progress("tracing the policy", None)
         walks = walks_of(modules, source)
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
-        context.tell(f"ranking the units of {len(groups)} groups", None)
+        context.progress(f"ranking the units of {len(groups)} groups", None)
         if groups:
-            context.said.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
+            context.messages.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
             rank_units(groups, self.rank, modules, source, self.samples)
         return self.choose(walks, groups, {step.graph: step.repeat for step in source.manifest.program}, context)
 
@@ -70,7 +70,7 @@ class Structured(ModuleStage):
         self._remove(groups, work, context)
         whole, left = [group.size for group in groups], [group.stays for group in groups]
         record = recorded(self.ratio, work, whole, left, walks.values())
-        context.said.extend(sentences(record))
+        context.messages.extend(sentences(record))
         edits = tuple(group.edit() for group in groups if group.stays < group.size)
         return ModuleChanges(edits, record={PRUNED: record})
 
@@ -89,7 +89,7 @@ class Structured(ModuleStage):
         goal = whole * (1 - self.ratio)
         before, last = left, list[int]()
         while left > goal:
-            context.tell("choosing what goes", min(1.0, (whole - left) / (whole - goal)))
+            context.progress("choosing what goes", min(1.0, (whole - left) / (whole - goal)))
             prices = []
             for number, group in enumerate(groups):
                 cost, loses = group.cheapest(self.least)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, UNRECORDED, Bundle, hash_file
+from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, UNRECORDED_NAMES, Bundle, hash_file
 from vlatool.errors import BundleError, SourceError, VlatoolError
 from vlatool.files.directory_writer import write_directory
 from vlatool.files.ownership import LEDGER
@@ -18,11 +18,11 @@ from vlatool.files.scratch import scratch_directory
 from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
-from vlatool.rebuild.differences import Compared, compare_bundles
+from vlatool.rebuild.differences import FileMatch, compare_bundles
 from vlatool.sources import source_stage
 from vlatool.stage.base import Context, Transform, installed_version, source_of
 from vlatool.stage.build import build_stage, stage_class
-from vlatool.stage.finish import DECIDED, FINALIZED, history, reseal
+from vlatool.stage.finish import FINALIZED_FIELDS, OPTIMIZE, history, reseal
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust
 
@@ -51,7 +51,7 @@ class Rebuilt:
     bundle: Bundle
     hash: str
     source: str
-    files: tuple[Compared, ...]
+    files: tuple[FileMatch, ...]
     stages: tuple[tuple[str, bool], ...]
     left_out: tuple[str, ...] = ()
 
@@ -61,7 +61,7 @@ class Rebuilt:
         return all(file.identical for file in self.files)
 
     @property
-    def first_difference(self) -> Compared | None:
+    def first_difference(self) -> FileMatch | None:
         """The file that differs and that others which differ were made from, None when none does."""
         differing = [file for file in self.files if not file.identical]
         return min(differing, key=lambda file: _rank(file.file), default=None)
@@ -80,7 +80,7 @@ class Rebuilt:
     def beside(self) -> tuple[str, ...]:
         """What is in the bundle, and in no hash, so that nothing of it was compared."""
         hashed = (MANIFEST, DIGEST, LEDGER)
-        return tuple(name for name in UNRECORDED if name not in hashed and (self.bundle.path / name).exists())
+        return tuple(name for name in UNRECORDED_NAMES if name not in hashed and (self.bundle.path / name).exists())
 
 
 def _rank(name: str) -> int:
@@ -237,7 +237,7 @@ def _start(
         policy = getattr(first, "model", None) or getattr(first, "policy", None)
         if policy is not None:
             places.folders.insert(0, policy if policy.is_dir() else policy.parent)
-    stages = [(entry, None if entry["stage"] == FINALIZED else _stage(entry, places)) for entry in later]
+    stages = [(entry, None if entry["stage"] == OPTIMIZE else _stage(entry, places)) for entry in later]
     beginning = [] if first is None else [(entries[0], first)]
     return _Start(str(source), begin, (*beginning, *stages))
 
@@ -348,7 +348,7 @@ def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> It
 
 def _finalized(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
     """Seal a candidate as ``optimize`` does; what it measured and decided is taken from the record."""
-    bundle = source_of(bundle, FINALIZED)
+    bundle = source_of(bundle, OPTIMIZE)
     out.mkdir()
     manifest = replace(
         bundle.manifest,
@@ -356,7 +356,7 @@ def _finalized(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
         made_by={**bundle.manifest.made_by, **entry.get("options", {})},
         source={},
         files={graph.file: bundle.manifest.files[graph.file] for graph in bundle.manifest.graphs.values()},
-        **{name: entry[name] for name in DECIDED if name in entry},
+        **{name: entry[name] for name in FINALIZED_FIELDS if name in entry},
     )
     return reseal(bundle, out, manifest, ROBOT_FOLDERS)
 

@@ -18,7 +18,7 @@ from typing import IO, Any, cast
 from vlatool.errors import MissingExtra, TargetError
 from vlatool.files.limits import check_limit, limit
 from vlatool.files.printable import one_line, printable
-from vlatool.remote._heard import parsed
+from vlatool.remote._validate_replies import parse_message
 
 ALIVE_S = 5
 """Seconds between signs of life to the target."""
@@ -27,8 +27,8 @@ STALLED_S = 60
 CLEANING_S = 20
 """Seconds that the target has to clean up before ssh is ended here; it goes on there."""
 BLOCK = 1 << 16
-NOISE = 1 << 20
-SAID = 1 << 16
+MAX_NOISE_BYTES = 1 << 20
+MAX_STDERR_BYTES = 1 << 16
 """Bytes of ssh's standard error that are kept, the last ones."""
 
 AGAIN = "run it again; the target removes what was sent when the connection ends"
@@ -135,7 +135,7 @@ class Connection:
         while rest:
             ready = self._ready(STALLED_S * 1000, self._in)
             if self._out in ready and not self._take():
-                raise self.ended()
+                raise self.end_error()
             if self._messages:
                 return False
             if self._in in ready:
@@ -169,11 +169,11 @@ class Connection:
             if self._messages:
                 return self._messages.popleft()
             if self._out in self._ready(500) and not self._take():
-                raise self.ended()
+                raise self.end_error()
             if timeout_s is not None and time.monotonic() - start > timeout_s and not self._messages:
                 raise TargetError(f"{self._target} said nothing for {timeout_s:g} s {self.doing}.", self._try())
 
-    def ended(self) -> TargetError:
+    def end_error(self) -> TargetError:
         """Return the error for a connection that is no more: what ssh said, and what it means."""
         code = self.close()
         text = printable(self._said.decode("utf-8", "replace"))
@@ -200,7 +200,7 @@ class Connection:
         finally:
             if self._ssh.poll() is None:
                 self._ssh.kill()
-            self._hear()
+            self._read_errors()
         return self._ssh.wait()
 
     def dispose(self) -> None:
@@ -224,7 +224,7 @@ class Connection:
             poll.register(stream, select.POLLOUT)
         ready = {handle for handle, _ in poll.poll(milliseconds)}
         if not self._err.closed and self._err.fileno() in ready:
-            self._hear()
+            self._read_errors()
         if time.monotonic() > self._until:
             self._until = math.inf
             raise TargetError(
@@ -233,11 +233,11 @@ class Connection:
             )
         return [stream for stream in (self._out, *more) if stream.fileno() in ready]
 
-    def _hear(self) -> None:
+    def _read_errors(self) -> None:
         """Take what ssh and the target's standard error say; its end is kept."""
         with contextlib.suppress(BlockingIOError, ValueError):
             received = os.read(self._err.fileno(), BLOCK)
-            self._said = (self._said + received)[-SAID:]
+            self._said = (self._said + received)[-MAX_STDERR_BYTES:]
             self._count(len(received))
             if not received:
                 self._err.close()
@@ -256,7 +256,7 @@ class Connection:
         """Read to the end what the target said before it hung up."""
         while not self._messages:
             if not self._take():
-                raise self.ended()
+                raise self.end_error()
         return False
 
     def _take(self) -> bool:
@@ -272,9 +272,9 @@ class Connection:
                 if marked:
                     self._answered = True
                     check_limit("target_message_bytes", len(rest), f"A message of {self._target}", TargetError)
-                    self._messages.append(parsed(rest, self._target))
+                    self._messages.append(parse_message(rest, self._target))
         elif mark in self._buffer:
             check_limit("target_message_bytes", len(self._buffer), f"A message of {self._target}", TargetError)
-        elif len(self._buffer) > NOISE:
+        elif len(self._buffer) > MAX_NOISE_BYTES:
             self._buffer = self._buffer[-len(mark) :]
         return bool(received)

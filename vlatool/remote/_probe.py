@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from vlatool.errors import MissingExtra, TargetError, VlatoolError
-from vlatool.remote._heard import Python
+from vlatool.remote._validate_replies import Python
 from vlatool.runtime.engine import engine_class
 
 OLDEST = (3, 10)
@@ -102,7 +102,7 @@ def _word(python: str) -> str:
     return '"$HOME"/' + shlex.quote(python[2:]) if python.startswith("~/") else shlex.quote(python)
 
 
-def dotted(version: Iterable[int]) -> str:
+def version_text(version: Iterable[int]) -> str:
     """Return ``3.11.2``."""
     return ".".join(map(str, version))
 
@@ -122,10 +122,12 @@ def refusal(
     new = [other for other in pythons if other.version[:2] >= OLDEST]
     if new:
         return _lacking(target, min(new, key=lambda other: len(other.errors)))
-    fix = f"install Python {dotted(OLDEST)} or later there, or name one: --remote-python /path/to/venv/bin/python"
+    fix = f"install Python {version_text(OLDEST)} or later there, or name one: --remote-python /path/to/venv/bin/python"
     if pythons:
-        versions = ", ".join(f"{other.command} is {dotted(other.version)}" for other in pythons)
-        return TargetError(f"The Python of {target} is too old: {versions}; {dotted(OLDEST)} or later is needed.", fix)
+        versions = ", ".join(f"{other.command} is {version_text(other.version)}" for other in pythons)
+        return TargetError(
+            f"The Python of {target} is too old: {versions}; {version_text(OLDEST)} or later is needed.", fix
+        )
     if codes:
         which = python or "python3"
         names = " and ".join(packages)
@@ -150,7 +152,7 @@ def _lacking(target: str, python: Python) -> MissingExtra:
         fix += f"then --remote-python '~/{venv}'"
     else:
         fix += "; or name a Python that has them: --remote-python /path/to/venv/bin/python"
-    version = dotted(python.version)
+    version = version_text(python.version)
     return MissingExtra(
         f"{command} on {target} (Python {version}) cannot import {' and '.join(errors)}: {reasons}.", fix
     )

@@ -12,7 +12,7 @@ from vlatool.errors import BundleError
 from vlatool.files.limits import MIB
 from vlatool.files.validate import path_problem, short_repr
 from vlatool.files.verified_read import open_inside
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.external_data import OpenFile, external_files
 
 WHOLE = 4 * MIB
@@ -36,7 +36,7 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
             file that the manifest does not record.
         GraphError: when the engine refuses the graph.
     """
-    with risky(engine, f"opened the graph '{graph.file.rpartition('/')[2].removesuffix('.onnx')}'"):
+    with engine_call(engine, f"opened the graph '{graph.file.rpartition('/')[2].removesuffix('.onnx')}'"):
         return _opened(bundle, graph, engine, threads)
 
 

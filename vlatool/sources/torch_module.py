@@ -97,7 +97,7 @@ class TorchModule(Source):
 
     def named(self) -> Self:
         """Allow the policy's code to run in this process: the user named its folder."""
-        trust.name(read_description(self.policy).folder, None if self.policy.is_dir() else self.policy, self.factory)
+        trust.allow(read_description(self.policy).folder, None if self.policy.is_dir() else self.policy, self.factory)
         return self
 
     def _factory(self, described: Description) -> str:

@@ -41,10 +41,10 @@ def build_stage(name: str, options: Mapping[str, Any]) -> Stage:
     Raises:
         RecipeError: listing each option that is unknown or has an impossible value.
     """
-    return validated(stage_class(name), options, f"stage {name}")
+    return stage_from(stage_class(name), options, f"stage {name}")
 
 
-def validated(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> AnyStage:
+def stage_from(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> AnyStage:
     """Build ``kind`` from options, with a sentence for each problem."""
     try:
         return kind.model_validate(dict(options))

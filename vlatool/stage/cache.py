@@ -40,10 +40,10 @@ STREAM_FILES = re.compile(
 """What unfinished work is made of: a file that is written part by part, training, or the trials of ``optimize``."""
 DRAFT = re.compile(r"\.(?P<final>.+)\.tmp-\d+-[0-9a-f]{8}")
 PART = re.compile(r"\.[0-9a-f]{64}\.(?P<process>\d+)-[0-9a-f]{8}\.part")
-NEW_S = 60.0
+MIN_AGE_S = 60.0
 """Seconds in which what was just made counts as in use: its maker has not locked it yet."""
 IN_USE = "is in use"
-RECENT = f"was made or used in the last {NEW_S:.0f} s"
+RECENT = f"was made or used in the last {MIN_AGE_S:.0f} s"
 
 Inode = tuple[int, int]
 
@@ -109,9 +109,9 @@ class Removed:
     stays: dict[str, str]
 
 
-def is_cache(place: Path) -> bool:
+def looks_like_cache(directory: Path) -> bool:
     """Return whether a directory is empty, or holds one of the folders of a cache."""
-    return not any(place.iterdir()) or any((place / name).exists() for name in (*NAMES, FILES, TAG))
+    return not any(directory.iterdir()) or any((directory / name).exists() for name in (*NAMES, FILES, TAG))
 
 
 def contents(cache: Path) -> Contents:
@@ -122,7 +122,7 @@ def contents(cache: Path) -> Contents:
     """
     entries, unknown = [], []
     for folder in NAMES:
-        for path in _below(cache / folder):
+        for path in _children(cache / folder):
             try:
                 entry = _entry(cache, folder, path)
             except FileNotFoundError:  # another process removed it since the folder was read
@@ -131,10 +131,10 @@ def contents(cache: Path) -> Contents:
                 entries.append(entry)
             elif not DRAFT.fullmatch(path.name) and not _draft_of(folder, path.name):
                 unknown.append(path.relative_to(cache).as_posix())
-    kept, others = _kept(cache)
+    kept, others = _shared_files(cache)
     unknown += others
     known = (*NAMES, FILES, TAG)
-    unknown += [path.name for path in _below(cache) if path.name not in known]
+    unknown += [path.name for path in _children(cache) if path.name not in known]
     return Contents(cache, tuple(sorted(entries, key=lambda entry: entry.used)), kept, tuple(sorted(unknown)))
 
 
@@ -144,10 +144,10 @@ def _draft_of(folder: str, name: str) -> str:
     return draft["final"] if draft and NAMES[folder].fullmatch(draft["final"]) else ""
 
 
-def _kept(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
+def _shared_files(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
     """Return the shared files by their names below the cache, and the names of what else is there."""
     kept, unknown = {}, []
-    for path in _below(cache / FILES):
+    for path in _children(cache / FILES):
         name = path.relative_to(cache).as_posix()
         with contextlib.suppress(FileNotFoundError):
             status = path.lstat()
@@ -188,7 +188,7 @@ def prune(
             uses.subtract(files.keys())
             left -= sum(size for inode, size in files.items() if not uses[inode])
     if not dry_run:
-        stays |= _sweep(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
+        stays |= _remove_unused(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
     return Removed(tuple(removed), held.bytes - left, stays)
 
 
@@ -197,7 +197,7 @@ def _now() -> float:
     return time.time_ns() / 1e9
 
 
-def _below(folder: Path) -> list[Path]:
+def _children(folder: Path) -> list[Path]:
     if folder.is_symlink() or not folder.is_dir():
         return []
     return sorted(folder.iterdir())
@@ -254,7 +254,7 @@ def _own_files(path: Path, is_own: Callable[[str], object]) -> dict[str, tuple[I
 def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
     """Remove the files of an entry, file by file; return why something of it stays."""
     path = cache / entry.name
-    if _now() - entry.used < NEW_S:
+    if _now() - entry.used < MIN_AGE_S:
         return RECENT
     lock = path / LOCK if entry.what == "unfinished work" else path
     with exclusive_lock(lock) as mine:
@@ -276,7 +276,7 @@ def _remove_folders(path: Path) -> None:
             os.rmdir(folder)
 
 
-def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
+def _remove_unused(cache: Path, unused: Iterable[str]) -> dict[str, str]:
     """Remove shared files without links, and what killed writers left; return why something stays."""
     stays = {}
     for name in unused:
@@ -294,20 +294,20 @@ def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
 
 def _drafts(cache: Path) -> Iterator[Path]:
     """Remove drafts of stages whose writers are gone; yield unfinished shared files of such writers."""
-    for path in _below(cache / WORKLOADS):
+    for path in _children(cache / WORKLOADS):
         if final := _draft_of(WORKLOADS, path.name):
             remove_stale_drafts(path.with_name(final))
     for folder in (STAGES, TRANSFERS):
-        for final in {match["final"] for path in _below(cache / folder) if (match := DRAFT.fullmatch(path.name))}:
+        for final in {match["final"] for path in _children(cache / folder) if (match := DRAFT.fullmatch(path.name))}:
             remove_stale_drafts(cache / folder / final)
-    for path in _below(cache / FILES):
+    for path in _children(cache / FILES):
         match = PART.fullmatch(path.name)
         with contextlib.suppress(FileNotFoundError):
-            if match and _abandoned(path.lstat(), match["process"]):
+            if match and _is_stale(path.lstat(), match["process"]):
                 yield path
 
 
-def _abandoned(status: os.stat_result, process: str) -> bool:
+def _is_stale(status: os.stat_result, process: str) -> bool:
     """Whether a draft's writer is gone; one in another container has no number here, so a draft must be old too."""
-    old = _now() - status.st_mtime >= NEW_S
+    old = _now() - status.st_mtime >= MIN_AGE_S
     return old and stat.S_ISREG(status.st_mode) and not Path(f"/proc/{process}").exists()

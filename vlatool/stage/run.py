@@ -19,9 +19,9 @@ from vlatool.files.outputs import BUNDLE, refuse_replacing
 from vlatool.files.resumable_work import remove_all_unused
 from vlatool.machine.host import cache_directory as cache_directory
 from vlatool.report import REPORT, Report, read_report
-from vlatool.stage import tried
-from vlatool.stage._inside import measured_with as measured_with
-from vlatool.stage._inside import needed, run_apart
+from vlatool.stage import first_run
+from vlatool.stage._child import child_imports, run_in_child
+from vlatool.stage._child import measure_in_child as measure_in_child
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.user_code import children
 
@@ -56,17 +56,17 @@ def run_transform(
         refuse_replacing(out, force=force, kind=BUNDLE)
     apart = stage.runs_graphs or bool(stage.runs(source))
     if apart and not stage.runs(source):
-        children.prepare(needed(stage))  # while this process checks
+        children.prepare(child_imports(stage))  # while this process checks
     stage.check(source, None)
     with write_directory(out, force=force, damaged=damaged) as draft:
-        stage.accept(run_apart(stage, source, draft, context) if apart else stage.run(source, draft, context))
+        stage.accept(run_in_child(stage, source, draft, context) if apart else stage.run(source, draft, context))
         for report in reports.iterdir() if reports is not None and reports.is_dir() else ():
             (draft / REPORTS).mkdir(exist_ok=True)
             if report.is_file() and not (draft / REPORTS / report.name).exists():
                 shutil.copy2(report, draft / REPORTS)
     made = Bundle.open(out, verify=False)
     if apart:
-        tried.note(made)
+        first_run.remember_run(made)
     return made
 
 
@@ -82,7 +82,7 @@ def cached_transform(stage: Transform, source: Bundle | None, cache: Path, conte
         try:
             return Bundle.open(path)
         except BundleError:
-            context.tell(f"the cached {stage.name()} is damaged; making it again", None)
+            context.progress(f"the cached {stage.name()} is damaged; making it again", None)
     mark_cache(cache)
     bundle = run_transform(stage, source, path, context, damaged=True)
     acquire(path)
@@ -107,13 +107,13 @@ def first_steps(
         try:
             source = cached_transform(step, source, cache, context)
         except VlatoolError as error:
-            raise type(error)(error.message, "; ".join(filter(None, (error.fix, _alone(step, stage))))) from error
+            raise type(error)(error.message, "; ".join(filter(None, (error.fix, _failed_step(step, stage))))) from error
     return last, source
 
 
-def _alone(step: Transform, stage: Transform) -> str:
+def _failed_step(step: Transform, stage: Transform) -> str:
     """Return in words which stage of several failed, and how to give it other options."""
-    options = ", ".join(f"{name} {_words(value)}" for name, value in step.given().items())
+    options = ", ".join(f"{name} {_words(value)}" for name, value in step.explicit_options().items())
     command = f"vlatool {step.name().replace('.', ' ').replace('_', '-')}"
     return f"{stage.name()} starts with {step.name()} ({options}); to give it other options, run it first: {command}"
 
@@ -122,9 +122,9 @@ def _words(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def measured(stage: Measure, source: Bundle, context: Context) -> Report:
+def run_measure(stage: Measure, source: Bundle, context: Context) -> Report:
     """Run a stage that measures; in a child process where it opens graphs itself."""
-    return measured_with({}, stage, source, context) if stage.runs_graphs else stage.run(source, context)
+    return measure_in_child({}, stage, source, context) if stage.runs_graphs else stage.run(source, context)
 
 
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:
@@ -137,9 +137,9 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
                 os.utime(path)
             return report
         except DataError:
-            context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
+            context.progress(f"the cached {stage.name()} is damaged; measuring again", None)
     own = replace(context, unfinished=[], notes=[])
-    report = replace(measured(stage, source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    report = replace(run_measure(stage, source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     mark_cache(cache)
     with write_directory(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 PROJECTIONS = "(hints)"
 """Under what the projections are trained, beside the graphs of the student."""
-Forms, Outputs = Mapping[BlockName, Form], Mapping[BlockName, "Tensor"]
+Forms = Mapping[BlockName, Form]
+Outputs = Mapping[BlockName, "Tensor"]
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from vlatool.training.torchrun import (
     rendezvous_store,
     write_rendezvous,
 )
-from vlatool.user_code.children import Apart
+from vlatool.user_code.children import Child
 
 MODULE = "vlatool.training.rank_process"
 GRACE_S = 5.0
@@ -35,7 +35,7 @@ class RankProcesses:
         threads: One for each, which waits for it.
     """
 
-    def __init__(self, children: Sequence[Apart | Follower] = (), threads: ThreadPoolExecutor | None = None) -> None:
+    def __init__(self, children: Sequence[Child | Follower] = (), threads: ThreadPoolExecutor | None = None) -> None:
         self.group = Group(0, len(children) + 1)
         self._children, self._threads = children, threads
         self._errors: list[BaseException] = []
@@ -73,12 +73,12 @@ class RankProcesses:
         if self._end(calls, wait=True):
             raise self._cause(self._errors[0])
 
-    def _submit(self, child: Apart | Follower, function: str, job: Mapping[str, Any]) -> Future[None]:
+    def _submit(self, child: Child | Follower, function: str, job: Mapping[str, Any]) -> Future[None]:
         if self._threads is None:
             raise RuntimeError("a crew of several has threads")
         return self._threads.submit(self._call, child, function, job)
 
-    def _call(self, child: Apart | Follower, function: str, job: Mapping[str, Any]) -> None:
+    def _call(self, child: Child | Follower, function: str, job: Mapping[str, Any]) -> None:
         try:
             child.call(f"{MODULE}:{function}", job, lambda _what, _share: None)
         except BaseException as error:  # told in the first process; the others wait for this one in vain
@@ -128,9 +128,9 @@ def launch_processes(
     job = {**job, "place": str(folder), "size": size, **(write_rendezvous(folder) if launch else {})}
     with contextlib.ExitStack() as opened:
         threads = opened.enter_context(ThreadPoolExecutor(size - 1))
-        others: list[Apart | Follower] = []
+        others: list[Child | Follower] = []
         for rank in range(1, size):
-            other = Follower(launch, rank) if launch else Apart(f"{about}, process {rank + 1} of {size}", PRELOAD)
+            other = Follower(launch, rank) if launch else Child(f"{about}, process {rank + 1} of {size}", PRELOAD)
             opened.enter_context(other)
             others.append(other)
         crew = RankProcesses(others, threads)

@@ -24,7 +24,7 @@ from vlatool.training.objective import Objective
 from vlatool.training.stage import TrainingStage
 from vlatool.training.torchrun import check_shared, current_launch, rendezvous_store
 
-Progress = Callable[[str, float | None], None]
+OnProgress = Callable[[str, float | None], None]
 FILE_SYSTEM_TIMEOUT_S = 120.0
 """Seconds in which a shared file system shows what the first process wrote."""
 
@@ -54,7 +54,7 @@ class RankState:
 _state: list[RankState] = []
 
 
-def load(job: Mapping[str, Any], _tell: Progress) -> None:
+def load(job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Load the student; ``join`` follows."""
     stage, folder = build_stage(job["stage"], job["options"]), Path(job["place"])
     if not isinstance(stage, TrainingStage):
@@ -73,20 +73,20 @@ def load(job: Mapping[str, Any], _tell: Progress) -> None:
     _state[:] = [RankState(stage, folder, group, frames, expert, objective, draw, opened)]
 
 
-def join(job: Mapping[str, Any], _tell: Progress) -> None:
+def join(job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Become one of the group, whose other processes do so at the same time."""
     peer, (store, here) = _state[0], rendezvous_store(job)
     peer.opened.enter_context(join_group(store, peer.group, peer.stage.settings().device.name, here=here))
 
 
-def prepare(_job: Mapping[str, Any], _tell: Progress) -> None:
+def prepare(_job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Find out where the training stands, and hold a part of the weights where that is asked for."""
     peer, objective = _state[0], _state[0].objective
     settings = peer.stage.settings()
     peer.trainer = Trainer(objective.trainable, settings, peer.folder, peer.group, objective.constraint)
 
 
-def train(job: Mapping[str, Any], _tell: Progress) -> None:
+def train(job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Take the steps until one of them, on so many rounds of rows."""
     peer = _state[0]
     for number in range(peer.frames.count, job["rounds"]):
@@ -112,13 +112,13 @@ def _wait_for_round(frames: Frames, number: int) -> bool:
     return frames.has(number)
 
 
-def show(_job: Mapping[str, Any], _tell: Progress) -> None:
+def show(_job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Give this process's part of the averaged weights, which are about to act."""
     with _state[0].training.averaged_weights(), _state[0].training.whole():
         pass
 
 
-def examine(_job: Mapping[str, Any], _tell: Progress) -> None:
+def examine(_job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Compute the held-out loss, as the first process does."""
     peer, held_out = _state[0], HeldOut(_state[0].folder)
     held_out.read()
@@ -127,12 +127,12 @@ def examine(_job: Mapping[str, Any], _tell: Progress) -> None:
         held_out.mixture_loss(*terms, peer.stage.batch, peer.stage.settings().device)
 
 
-def judge(job: Mapping[str, Any], _tell: Progress) -> None:
+def judge(job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Remember how well the averaged weights did."""
     _state[0].training.judge(job["score"])
     _state[0].training.save()
 
 
-def finish(_job: Mapping[str, Any], _tell: Progress) -> None:
+def finish(_job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Give this process's part of the result."""
     _state[0].training.finish()

@@ -112,7 +112,7 @@ def write_labels(frames: Path, names: Sequence[str], outputs: Sequence[str], tea
                 if value.is_floating_point() and not bool(torch.isfinite(value).all()):
                     raise DataError("The teacher gives an action that is not finite.", "look at the recordings")
                 kept[name][rows[own]] = value.cpu().numpy()[own]
-            context.tell(f"the teacher labels {count} observations", (int(rows[0]) + 1) / count)
+            context.progress(f"the teacher labels {count} observations", (int(rows[0]) + 1) / count)
     return [name.removeprefix(LABEL) for name in kept if name.startswith(LABEL)]
 
 

@@ -132,7 +132,7 @@ class Session:
     def run(self) -> dict[str, Any]:
         """Play, label and train until all steps are done; return what there is to know of it."""
         if self._trainer.step:
-            self._context.tell(f"going on from step {self._trainer.step}", None)
+            self._context.progress(f"going on from step {self._trainer.step}", None)
         if self._held_out is not None:
             self._held_out.prepare(self._recording(), self._write_held_out, self._write_held_out_batches)
         self._prepare_expert()
@@ -312,7 +312,7 @@ class Session:
         who = "student" if number else "teacher"
         about: dict[str, Any] = {"step": self._trainer.step, "actor": who}
         if self._scene is not None and episodes:
-            self._context.tell(f"the {who} plays {episodes} episodes", None)
+            self._context.progress(f"the {who} plays {episodes} episodes", None)
             scene, tasks = self._scene
             jobs = [
                 replace(job, noise=self._plan.noise, record=str(folder / f"{index:05d}"))
@@ -355,5 +355,5 @@ class Session:
     def _report(self, step: int, loss: float) -> None:
         steps, left = self._settings.steps, self._forecast.time_left(step)
         words = [f"step {step} of {steps}", f"loss {loss:.4g}", self._success, left]
-        self._context.tell(", ".join(filter(None, words)), step / steps)
+        self._context.progress(", ".join(filter(None, words)), step / steps)
         self._events.add(step, {"loss": self._trainer.losses[-1], "learning rate": self._settings.rate(step - 1)})

@@ -118,7 +118,7 @@ class TrainingStage(ModuleStage):
     def named(self) -> Self:
         """Allow the code of a teacher that is a policy to run in this process: the user named its folder."""
         if self.teacher and teacher_source(self.teacher):
-            trust.name(description_file(self.teacher).parent, None if self.teacher.is_dir() else self.teacher)
+            trust.allow(description_file(self.teacher).parent, None if self.teacher.is_dir() else self.teacher)
         return self
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
@@ -219,7 +219,7 @@ class TrainingStage(ModuleStage):
         """Return what the student does with a batch, and how far that is from what the teacher says of it."""
         raise NotImplementedError(self.name())
 
-    def told(self, made: Bundle) -> tuple[str, ...]:
+    def summary(self, made: Bundle) -> tuple[str, ...]:
         """Say what the student learnt from, and how far it came."""
         training = json.loads(made.file(TRAINING).read_bytes())
         losses, last = training["losses"], max(1, len(training["losses"]) // 20)
@@ -246,7 +246,7 @@ class TrainingStage(ModuleStage):
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Say how it was trained, where the loss curve is, and how to go on."""
-        return (*self.told(made), *curve_lines(made), *super().lines(made))
+        return (*self.summary(made), *curve_lines(made), *super().lines(made))
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Train the modules in place."""
@@ -313,7 +313,7 @@ class TrainingStage(ModuleStage):
         """Return what another process of the training needs to know."""
         threads = require("torch", "build").get_num_threads()
         path = str(source.path.absolute())
-        return {"stage": self.name(), "options": self.given(), "source": path, "threads": threads}
+        return {"stage": self.name(), "options": self.explicit_options(), "source": path, "threads": threads}
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Train; what a run that is killed goes on from is there until the result is written."""

@@ -25,7 +25,7 @@ from vlatool import errors
 from vlatool.errors import InputError, MissingExtra, RecipeError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of, one_line
 from vlatool.machine.version import VERSION
-from vlatool.user_code.children import Apart
+from vlatool.user_code.children import Child
 
 VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 """What torchrun tells each process."""
@@ -252,14 +252,14 @@ def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
         raise
     store.set(f"{launch.rank}/here", "null")
     with contextlib.ExitStack() as opened:
-        child: Apart | None = None
+        child: Child | None = None
         while call := _next_call(store, f"{launch.rank}/call/{(number := number + 1)}"):
             if call["function"] == LEAVE_CALL:
                 opened.close()
                 child = None
                 continue
             if child is None:
-                child = opened.enter_context(Apart(f"{about}, process {launch.rank + 1} of {launch.size}", PRELOAD))
+                child = opened.enter_context(Child(f"{about}, process {launch.rank + 1} of {launch.size}", PRELOAD))
             store.set(f"{launch.rank}/answer/{number}", json.dumps(_run_call(child, launch, call)))
     store.set(f"{launch.rank}/left", "1")
 
@@ -278,7 +278,7 @@ def _next_call(store: Any, name: str) -> Any:
         raise SourceError("The first process of the training is gone.", AGAIN) from error
 
 
-def _run_call(child: Apart, launch: Launch, call: Mapping[str, Any]) -> Any:
+def _run_call(child: Child, launch: Launch, call: Mapping[str, Any]) -> Any:
     """Call what is asked for; return None, or what came instead."""
     try:
         child.call(call["function"], {**call["job"], "rank": launch.rank}, lambda _what, _share: None)

@@ -31,7 +31,7 @@ EPISODE = "episode"
 MAX_BATCH_ROWS = 256
 """Rows of a batch that the function is asked for, at most."""
 GUIDE = "docs/guides/your-own-policy.md shows one"
-Progress = Callable[[str, float | None], None]
+OnProgress = Callable[[str, float | None], None]
 
 
 def requested_rows(asked: int | None, source: Bundle, plays: bool) -> int:
@@ -74,10 +74,10 @@ def write_user_batches(
     """
     paths = {"source": str(source.path.absolute()), "target": str(target.absolute())}
     job = {**paths, "count": count, "seed": seed, "along": along}
-    call(f"{MODULE}:write", job, context.tell, origin_of(source).training.rpartition(":")[0], PRELOAD)
+    call(f"{MODULE}:write", job, context.progress, origin_of(source).training.rpartition(":")[0], PRELOAD)
 
 
-def write(job: Mapping[str, Any], tell: Progress) -> None:
+def write(job: Mapping[str, Any], tell: OnProgress) -> None:
     """Do what ``write_user_batches`` says, in this process."""
     source = Bundle.open(Path(job["source"]), verify=False)
     origin = origin_of(source)
@@ -111,7 +111,7 @@ class _Rows:
         encode: ObservationEncoder,
         count: int,
         size: int,
-        tell: Progress,
+        tell: OnProgress,
         *,
         along: bool,
     ) -> None:

@@ -19,22 +19,22 @@ from vlatool.errors import GraphError, InputError, MissingExtra, SourceError, Vl
 from vlatool.files.json import parse_json
 from vlatool.files.limits import LIMITS_VARIABLE, limit
 from vlatool.files.printable import MAX_CHARACTERS, truncate
-from vlatool.machine.risky import Deed, crashed
+from vlatool.machine.engine_calls import EngineCall, engine_crash
 
-ENDINGS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
+CONNECTION_ERRORS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
 """Errors of connections: none of a file, and to this program the sign that nobody reads it any more."""
 
 
-LONGEST = 2 * MAX_CHARACTERS
+MAX_MESSAGE = 2 * MAX_CHARACTERS
 """Characters of a message of a child, which may quote what foreign code says."""
 
 
-LAST_WORDS = 240
+MAX_LAST_LINE = 240
 """Characters of the last line that a child printed, for an error: its end says more than its beginning."""
 
 
 @dataclass
-class Last:
+class ChildState:
     """What a child was seen to do before it ended.
 
     Args:
@@ -45,17 +45,17 @@ class Last:
     """
 
     own: bool = False
-    doing: Deed | None = None
+    doing: EngineCall | None = None
     told: str = ""
     said: str = ""
 
     @property
     def words(self) -> str:
         """The end of the last line."""
-        return self.said if len(self.said) <= LAST_WORDS else f"...{self.said[-LAST_WORDS:]}"
+        return self.said if len(self.said) <= MAX_LAST_LINE else f"...{self.said[-MAX_LAST_LINE:]}"
 
 
-class Killed(SourceError):
+class ChildKilled(SourceError):
     """The process that runs a user's code was killed: what it was asked for may be asked of another one."""
 
 
@@ -68,13 +68,13 @@ def read(line: bytes, about: str) -> dict[str, Any]:
     try:
         message = parse_json(line)
     except ValueError as error:
-        raise nonsense(about) from error
-    if not isinstance(message, dict) or not _makes_sense(message):
-        raise nonsense(about)
+        raise invalid_reply(about) from error
+    if not isinstance(message, dict) or not _is_valid(message):
+        raise invalid_reply(about)
     return message
 
 
-def _makes_sense(line: Mapping[str, Any]) -> bool:
+def _is_valid(line: Mapping[str, Any]) -> bool:
     match line:
         case {"progress": [str(), None]} | {"warning": str()} | {"result": _} | {"memory": True}:
             return True
@@ -85,7 +85,7 @@ def _makes_sense(line: Mapping[str, Any]) -> bool:
         case {"error": str(), "message": str(), "fix": str()} | {"raised": str(), "message": str(), "ours": bool()}:
             return isinstance(line.get("where", ""), str)
         case {"errno": int(number), "message": str(), "file": None | str()}:
-            return number in errno.errorcode and number not in ENDINGS
+            return number in errno.errorcode and number not in CONNECTION_ERRORS
     return False
 
 
@@ -109,13 +109,13 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
         raise MemoryError
     message = plain(answer["message"])
     if "error" in answer:
-        kind = Killed if answer["error"] == Killed.__name__ else getattr(errors, answer["error"], None)
+        kind = ChildKilled if answer["error"] == ChildKilled.__name__ else getattr(errors, answer["error"], None)
         if isinstance(kind, type) and issubclass(kind, VlatoolError if own else InputError | MissingExtra):
-            raise kind(truncate(answer["message"], LONGEST), truncate(answer["fix"], LONGEST))
+            raise kind(truncate(answer["message"], MAX_MESSAGE), truncate(answer["fix"], MAX_MESSAGE))
         name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
-        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}", truncate(answer["fix"], LONGEST))
+        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}", truncate(answer["fix"], MAX_MESSAGE))
     if "errno" in answer:
-        raise OSError(answer["errno"], message, answer["file"] and truncate(answer["file"], LONGEST))
+        raise OSError(answer["errno"], message, answer["file"] and truncate(answer["file"], MAX_MESSAGE))
     name = plain(answer["raised"])
     if own:
         raise RuntimeError(f"{about} failed in its process: {name}: {message}")
@@ -127,28 +127,28 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
             f"{about}: the process that runs it failed: {name}: {message}.",
             "VLATOOL_DEBUG=1 shows where; report it where that is in vlatool",
         )
-    raise left(about, name, message)
+    raise exit_error(about, name, message)
 
 
-def nonsense(about: str) -> SourceError:
+def invalid_reply(about: str) -> SourceError:
     """Return the error for what no child of vlatool says."""
     return SourceError(f"The process of the policy ({about}) answered nonsense.", "let it write to its own files alone")
 
 
 def plain(text: str) -> str:
     """Return a text without what would steer a terminal, shortened where it is very long."""
-    text = truncate(text, LONGEST)
+    text = truncate(text, MAX_MESSAGE)
     return "".join(character if unicodedata.category(character)[0] != "C" else " " for character in text).rstrip()
 
 
-def left(about: str, name: str, text: str) -> SourceError:
+def exit_error(about: str, name: str, text: str) -> SourceError:
     """Return the error for code that raises what is no ``Exception``."""
     if name == "SystemExit":
         return SourceError(f"{about} called sys.exit({text}).", "raise an exception that says what is wrong instead")
     return SourceError(f"{about} raised {name}{text and ': '}{text}.", "raise an Exception that says what is wrong")
 
 
-def ended(status: bytes, about: str, last: Last) -> BaseException:
+def ending_error(status: bytes, about: str, last: ChildState) -> BaseException:
     """Return the error of a child that ended without an answer.
 
     Args:
@@ -163,7 +163,7 @@ def ended(status: bytes, about: str, last: Last) -> BaseException:
     if code == -signal.SIGINT:
         return KeyboardInterrupt()
     if last.doing and code != -signal.SIGKILL:
-        return _engine_ended(code, last.doing, last.words)
+        return _engine_error(code, last.doing, last.words)
     if code >= 0:
         return SourceError(
             f"{about} ended its process with exit code {code} before it was done (os._exit, or a library's exit).",
@@ -171,7 +171,7 @@ def ended(status: bytes, about: str, last: Last) -> BaseException:
         )
     name = _signal(code)
     if code == -signal.SIGKILL:
-        return Killed(
+        return ChildKilled(
             f"{about}: the process that ran it was killed (SIGKILL) before it was done.",
             "where memory ran out, use a machine with more of it",
         )
@@ -182,16 +182,16 @@ def ended(status: bytes, about: str, last: Last) -> BaseException:
     return SourceError(f"{about} crashed its process ({name}) before it was done.", "look for a library that crashes")
 
 
-def _engine_ended(code: int, doing: Deed, said: str) -> GraphError:
+def _engine_error(code: int, doing: EngineCall, said: str) -> GraphError:
     """Return the error of an engine that did not let its process live."""
     if code == -signal.SIGALRM:
         seconds = limit("engine_seconds")
-        error = crashed(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)
+        error = engine_crash(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)
         return GraphError(
             error.message, f"if it needs longer, raise it: {LIMITS_VARIABLE}=engine_seconds={10 * seconds}"
         )
     how = f"with {_signal(code)}" if code < 0 else f"with exit code {code}"
-    return crashed(doing, f"ended its process {how}", said)
+    return engine_crash(doing, f"ended its process {how}", said)
 
 
 def _signal(code: int) -> str:

@@ -53,14 +53,14 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
     """
     file = factory_file(options.against, Path.cwd())
     if file is not None:
-        trust.name(file.parent)
+        trust.allow(file.parent)
     job = {
         "bundle": str(bundle.path.absolute()), "against": options.against, "folder": str(Path.cwd()),
         "data": str(options.data.absolute()) if options.data else "", "samples": options.samples,
         "tolerance": options.tolerance, "seed": options.seed,
     }  # fmt: skip
     about = split_factory(options.against)[0]
-    comparison = children.call("vlatool.verify._compare:compare", job, context.tell, about, PRELOAD)
+    comparison = children.call("vlatool.verify._compare:compare", job, context.progress, about, PRELOAD)
     return _report(bundle, options, comparison)
 
 

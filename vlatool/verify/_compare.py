@@ -20,7 +20,7 @@ from vlatool.verify._original import Original, as_fed
 from vlatool.verify._sample import Sample, error_of
 
 Array = NDArray[Any]
-LARGEST = 1e9
+MAX_ERROR = 1e9
 
 
 def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
@@ -32,8 +32,8 @@ def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
     recording = _recording(bundle, Path(job["data"]) if job["data"] else None)
     random = np.random.default_rng(seed)
     samples = []
-    for place, (number, observation, begins) in enumerate(_observations(policy, recording, int(job["samples"]))):
-        tell("running both", place / int(job["samples"]))
+    for index, (number, observation, begins) in enumerate(_observations(policy, recording, int(job["samples"]))):
+        tell("running both", index / int(job["samples"]))
         if begins:
             policy.reset()
             original.reset()
@@ -140,11 +140,11 @@ def _error(got: Array, expected: Array) -> float:
         got, expected = got.reshape(-1), expected.reshape(-1)
         alike = (got == expected) | (np.isnan(got) & np.isnan(expected))
         got, expected = got[~alike | np.isfinite(got)], expected[~alike | np.isfinite(got)]
-    return min(relative_error(got, expected), LARGEST)
+    return min(relative_error(got, expected), MAX_ERROR)
 
 
 def _worst(errors: list[float]) -> float:
-    return float(np.nanmax([LARGEST if error != error else error for error in errors], initial=0.0))
+    return float(np.nanmax([MAX_ERROR if error != error else error for error in errors], initial=0.0))
 
 
 def _warnings(policy: Policy, original: Original, recording: Recording | None) -> list[str]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vlatool.runtime.policy import Policy
 
 Array = NDArray[Any]
-LARGEST = 1e9
+MAX_ERROR = 1e9
 
 
 @dataclass(frozen=True)
@@ -47,4 +47,4 @@ def error_of(policy: Policy, got: Array, expected: Array) -> float:
     """Return the relative error of an action: by the spread of each element; the share of others where discrete."""
     if policy.spec.action.kind == "discrete":
         return float(np.mean(got != expected))
-    return min(policy.chunk_error(got, expected), LARGEST)
+    return min(policy.chunk_error(got, expected), MAX_ERROR)

@@ -16,7 +16,7 @@ from vlatool.errors import PluginError, UsageError, suggest
 KIND = "workers"
 PROCESSES = "processes"
 """The launcher that is there without any other package."""
-Tell = Callable[[str, float | None], None]
+OnProgress = Callable[[str, float | None], None]
 Done = Callable[[int, Any], None]
 Note = Callable[[str], None]
 
@@ -69,7 +69,7 @@ class Workers:
     def check(self) -> None:
         """Raise a user error when there is nobody to compute; cheap."""
 
-    def answers(self, work: Work, tell: Tell, done: Done, note: Note) -> Generator[Any, None, None]:
+    def answers(self, work: Work, tell: OnProgress, done: Done, note: Note) -> Generator[Any, None, None]:
         """Yield the answer to every request, in order; close the iterator to end the workers.
 
         Args:
@@ -94,20 +94,20 @@ def launcher(name: str, count: int) -> Workers:
     return made
 
 
-def asked_for(text: str) -> tuple[str, int]:
+def parse_workers(text: str) -> tuple[str, int]:
     """Read what a person wrote for workers: ``4`` processes, ``ray``, or ``ray:8``; return launcher and number.
 
     Raises:
         UsageError: for anything else.
 
     Example:
-        >>> asked_for("4")
+        >>> parse_workers("4")
         ('processes', 4)
     """
     name, _, count = text.partition(":") if not text.isdecimal() else (PROCESSES, "", text)
     if name not in registry.names(KIND):
         raise UsageError(
-            f"--workers is '{text}'; it takes a number of processes, or {suggest(name, _others())}.",
+            f"--workers is '{text}'; it takes a number of processes, or {suggest(name, _other_launchers())}.",
             "write --workers 4, or --workers ray:4",
         )
     if ":" in text or count:
@@ -118,5 +118,5 @@ def asked_for(text: str) -> tuple[str, int]:
     return name, 0
 
 
-def _others() -> list[str]:
+def _other_launchers() -> list[str]:
     return [name for name in registry.names(KIND) if name != PROCESSES]

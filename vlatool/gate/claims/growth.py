@@ -45,7 +45,7 @@ def examine_memory(
     """
     peaks: tuple[list[float], list[float]] = ([], [])
     for number in range(PROBES):
-        context.tell("memory of each in fresh processes", number / PROBES)
+        context.progress("memory of each in fresh processes", number / PROBES)
         with inputs.file(OBSERVATIONS, MEMORY, number) if inputs else contextlib.nullcontext() as path:
             for bundle, taken in zip((candidate, baseline), peaks, strict=True):
                 probed = cold_start(bundle.path, how.engine, how.threads, timeout=how.timeout, observations=path)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import GraphError
-from vlatool.machine.risky import REMEDY
+from vlatool.machine.engine_calls import REMEDY
 from vlatool.runtime.engine import FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
 
 INTEGER = ("MatMulInteger", "QLinear", "QGemm", "ConvInteger", "DynamicQuantize", "QAttention", "QEmbed")

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, fix_for, require, suggest
+from vlatool.machine.engine_calls import REMEDY
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
-from vlatool.machine.risky import REMEDY
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Stages

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
+from vlatool.machine.engine_calls import REMEDY
 from vlatool.machine.host import VNNI
-from vlatool.machine.risky import REMEDY
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port, port
 from vlatool.runtime.engine import Engine, Int8Layout, Node, Profiled, Stages

@@ -24,13 +24,13 @@ from vlatool.workers import Folder
 
 READABLE = "see that this user may read it, and that its disk is well"
 
-BLOCK = 1 << 26
+BLOCK_BYTES = 1 << 26
 """Bytes that are sent at a time."""
-READ = 1 << 20
+READ_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
-class Sent:
+class TransferFile:
     """A file: its name in the folder, SHA-256, bytes, and whether it may be executed."""
 
     name: str
@@ -49,7 +49,7 @@ class Parcel:
     """
 
     folder: str
-    files: tuple[Sent, ...]
+    files: tuple[TransferFile, ...]
 
     @property
     def digest(self) -> str:
@@ -78,8 +78,8 @@ def parcel_of(folder: Folder) -> Parcel:
     """
     root = Path(folder.path)
     try:
-        paths = [root / name for name in folder.names] or list(_few(root))
-        files = tuple(_sent(path, path.relative_to(root).as_posix()) for path in paths)
+        paths = [root / name for name in folder.names] or list(_has_few_files(root))
+        files = tuple(_transfer_file(path, path.relative_to(root).as_posix()) for path in paths)
     except OSError as error:
         raise SourceError(
             f"{error.filename or root} cannot be sent to the workers: {error.strerror}.", READABLE
@@ -89,16 +89,16 @@ def parcel_of(folder: Folder) -> Parcel:
     return Parcel(folder.path, files)
 
 
-def _few(root: Path) -> Iterator[Path]:
+def _has_few_files(root: Path) -> Iterator[Path]:
     for count, path in enumerate(files_below(root), 1):
         check_limit("shipped_files", count, f"{root}, which is sent to the workers,", SourceError)
         yield path
 
 
-def _sent(path: Path, name: str) -> Sent:
+def _transfer_file(path: Path, name: str) -> TransferFile:
     path = path.resolve()
     status = path.stat()
-    return Sent(name, cached_hash(path), status.st_size, bool(status.st_mode & stat.S_IXUSR))
+    return TransferFile(name, cached_hash(path), status.st_size, bool(status.st_mode & stat.S_IXUSR))
 
 
 def blocks(parcel: Parcel) -> Iterator[bytes]:
@@ -112,10 +112,10 @@ def blocks(parcel: Parcel) -> Iterator[bytes]:
         path, left = Path(parcel.folder, file.name), file.size
         try:
             with path.open("rb") as stream:
-                while more := stream.read(min(READ, left)):
+                while more := stream.read(min(READ_BYTES, left)):
                     left -= len(more)
                     waiting += more
-                    if len(waiting) >= BLOCK:
+                    if len(waiting) >= BLOCK_BYTES:
                         yield bytes(waiting)
                         waiting.clear()
         except OSError as error:
@@ -125,7 +125,7 @@ def blocks(parcel: Parcel) -> Iterator[bytes]:
     yield bytes(waiting)
 
 
-class Arriving:
+class IncomingParcel:
     """A parcel that is being written into the cache of this machine.
 
     Raises:
@@ -192,7 +192,7 @@ class Arriving:
         self._stream = None
 
 
-class Places:
+class PathTranslation:
     """The names of folders here and there: each path in a text is that of the other side.
 
     Args:
@@ -202,24 +202,24 @@ class Places:
     def __init__(self, pairs: Sequence[tuple[str, str]]) -> None:
         self._pairs = sorted(pairs, key=lambda pair: -len(pair[0]))  # a folder in another one first
 
-    def named(self, value: object) -> object:
+    def translate(self, value: object) -> object:
         """Return JSON values in which every text that is a path in a folder is that path on the other side."""
         if isinstance(value, str):
             inside = (there + value[len(here) :] for here, there in self._pairs if _is_in(value, here))
             return next(inside, value)
         if isinstance(value, dict):
-            return {key: self.named(item) for key, item in value.items()}
-        return [self.named(item) for item in value] if isinstance(value, list) else value
+            return {key: self.translate(item) for key, item in value.items()}
+        return [self.translate(item) for item in value] if isinstance(value, list) else value
 
-    def told(self, value: object) -> object:
+    def rewrite(self, value: object) -> object:
         """Return JSON values in which the paths are those of the other side wherever a text mentions them."""
         if isinstance(value, str):
             for here, there in self._pairs:
                 value = value.replace(here, there)
             return value
         if isinstance(value, dict):
-            return {key: self.told(item) for key, item in value.items()}
-        return [self.told(item) for item in value] if isinstance(value, list) else value
+            return {key: self.rewrite(item) for key, item in value.items()}
+        return [self.rewrite(item) for item in value] if isinstance(value, list) else value
 
 
 def _is_in(text: str, folder: str) -> bool:

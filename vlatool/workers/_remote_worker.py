@@ -18,19 +18,19 @@ from vlatool.files.limits import LIMITS_VARIABLE
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import file_of
 from vlatool.machine.host import MAX_CPU_ISA, OLDER_MAX_CPU_ISA, architecture, versions
-from vlatool.machine.instruction_sets import computed_in
+from vlatool.machine.instruction_sets import openvino_set
 from vlatool.machine.processes import SINGLE
 from vlatool.machine.version import VERSION
 from vlatool.user_code import trust
-from vlatool.user_code.children import Apart, Killed
+from vlatool.user_code.children import Child, ChildKilled
 from vlatool.workers import Work
-from vlatool.workers._shipped import Arriving, Parcel, Places
+from vlatool.workers._file_transfer import IncomingParcel, Parcel, PathTranslation
 
-PASSED = (*SINGLE, MAX_CPU_ISA, OLDER_MAX_CPU_ISA, LIMITS_VARIABLE, "VLATOOL_DEBUG")
+PASSED_VARIABLES = (*SINGLE, MAX_CPU_ISA, OLDER_MAX_CPU_ISA, LIMITS_VARIABLE, "VLATOOL_DEBUG")
 """Variables that a worker has as the machine has them that sends the work: they change what is computed."""
-MOST_SAID = 1000
+MAX_PROGRESS_LINES = 1000
 """The last lines of progress of a job that are told; a job says which episodes it begins."""
-MATTERS = ("numpy", "onnxruntime", "onnxruntime-gpu", "onnxruntime-openvino", "openvino", "torch", "tensorrt")
+RELEVANT_PACKAGES = ("numpy", "onnxruntime", "onnxruntime-gpu", "onnxruntime-openvino", "openvino", "torch", "tensorrt")
 """Packages that may round differently in another version."""
 
 
@@ -41,7 +41,7 @@ class Order:
     Args:
         function, about, preload, last: Of the work.
         parcels: What its requests name.
-        variables: Those of ``PASSED`` that are set.
+        variables: Those of ``PASSED_VARIABLES`` that are set.
         named: Whose code may run, as ``trust.named_so_far`` says it.
     """
 
@@ -51,24 +51,24 @@ class Order:
     last: str
     parcels: tuple[Parcel, ...]
     variables: Mapping[str, str]
-    named: Any
+    translate: Any
 
     @classmethod
     def of(cls, work: Work, parcels: Sequence[Parcel]) -> Order:
         """Return the order for some work, given in this process."""
-        variables = {name: os.environ[name] for name in PASSED if name in os.environ}
+        variables = {name: os.environ[name] for name in PASSED_VARIABLES if name in os.environ}
         preload = tuple(work.preload)
-        return cls(work.function, work.about, preload, work.last, tuple(parcels), variables, trust.named_so_far())
+        return cls(work.function, work.about, preload, work.last, tuple(parcels), variables, trust.named_folders())
 
 
 def this_machine() -> dict[str, str]:
     """Return what may differ between machines and change what is computed: name -> version."""
-    installed = versions(MATTERS)
+    installed = versions(RELEVANT_PACKAGES)
     about = {"vlatool": VERSION, "Python": platform.python_version(), "processor": str(architecture())}
-    return {**about, "instruction set": computed_in(), **installed}
+    return {**about, "instruction set": openvino_set(), **installed}
 
 
-class Seat:
+class RemoteWorker:
     """A worker.
 
     Args:
@@ -77,16 +77,19 @@ class Seat:
 
     def __init__(self, order: Mapping[str, Any]) -> None:
         self._order = from_json(Order, order)
-        self._arriving: Arriving | None = None
+        self._arriving: IncomingParcel | None = None
         self._refused: dict[str, Any] = {}
         self._opened = contextlib.ExitStack()
-        self._child: Apart | None = None
-        self._said: deque[str] = deque(maxlen=MOST_SAID)
-        for name in PASSED:
+        self._child: Child | None = None
+        self._said: deque[str] = deque(maxlen=MAX_PROGRESS_LINES)
+        for name in PASSED_VARIABLES:
             os.environ.pop(name, None)
         os.environ.update(self._order.variables)
         pairs = [(parcel.folder, str(parcel.place)) for parcel in self._order.parcels]
-        self._there, self._back = Places(pairs), Places([(place, folder) for folder, place in pairs])
+        self._to_local, self._to_sender = (
+            PathTranslation(pairs),
+            PathTranslation([(path, folder) for folder, path in pairs]),
+        )
 
     def hello(self) -> dict[str, Any]:
         """Return what this machine is, and which parcels it lacks: their places in the order."""
@@ -98,7 +101,7 @@ class Seat:
         if self._refused:
             return self._refused
         try:
-            self._arriving = self._arriving or Arriving(self._order.parcels[number])
+            self._arriving = self._arriving or IncomingParcel(self._order.parcels[number])
             self._arriving.add(block)
             if last:
                 self._arriving.end()
@@ -106,7 +109,7 @@ class Seat:
         except (VlatoolError, OSError, MemoryError) as error:
             if self._arriving is not None:
                 self._arriving.abandon(error)
-            self._refused = self._told(error)
+            self._refused = self._error_record(error)
             return self._refused
         return {"result": None}
 
@@ -117,13 +120,13 @@ class Seat:
         with contextlib.redirect_stderr(printed), warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             try:
-                answer = {"result": self._call(self._order.function, self._there.named(request))}
+                answer = {"result": self._call(self._order.function, self._to_local.translate(request))}
             except (VlatoolError, OSError, MemoryError, KeyboardInterrupt) as error:
                 self._dismiss()
-                answer = self._told(error)
+                answer = self._error_record(error)
         told = [str(warning.message) for warning in warned if issubclass(warning.category, UserWarning)]
-        return {"answer": self._back.told(answer), "printed": self._back.told(printed.getvalue()), "warnings": told,
-                "told": list(self._said)}  # fmt: skip
+        reply, output = self._to_sender.rewrite(answer), self._to_sender.rewrite(printed.getvalue())
+        return {"answer": reply, "printed": output, "warnings": told, "told": list(self._said)}
 
     def close(self) -> None:
         """Let the child end well."""
@@ -134,8 +137,8 @@ class Seat:
 
     def _call(self, function: str, request: Any) -> Any:
         if self._child is None:
-            trust.restore([[self._there.named(value) for value in folder] for folder in self._order.named])
-            self._child = self._opened.enter_context(Apart(self._order.about, self._order.preload))
+            trust.restore([[self._to_local.translate(value) for value in folder] for folder in self._order.translate])
+            self._child = self._opened.enter_context(Child(self._order.about, self._order.preload))
         return self._child.call(function, request, lambda what, _share: self._said.append(what))
 
     def _dismiss(self) -> None:
@@ -143,9 +146,9 @@ class Seat:
         self._opened.close()
         self._child = None
 
-    def _told(self, error: BaseException) -> dict[str, Any]:
+    def _error_record(self, error: BaseException) -> dict[str, Any]:
         """Return an error as ``vlatool.user_code.children.result`` reads it; ``lost`` where another worker may try."""
-        if isinstance(error, Killed | KeyboardInterrupt):
+        if isinstance(error, ChildKilled | KeyboardInterrupt):
             return {"lost": getattr(error, "message", "its process was interrupted."), "fix": getattr(error, "fix", "")}
         if isinstance(error, VlatoolError):
             return {"error": type(error).__name__, "message": error.message, "fix": error.fix}

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from vlatool.bundle.bundle import LOCATION, Bundle
-from vlatool.bundle.unexported import export_command
+from vlatool.bundle.module_bundle import export_command
 from vlatool.errors import BundleError
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly

@@ -13,10 +13,10 @@ from vlatool.files.messages import from_json
 from vlatool.files.printable import one_line, printable
 
 T = TypeVar("T")
-DEEPEST = 32
-LARGEST = 1e18
+MAX_DEPTH = 32
+MAX_NUMBER = 1e18
 """Largest number that a measurement can be; bytes and nanoseconds of a day are far below."""
-MOST_PACKAGES = 64
+MAX_PACKAGES = 64
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Python:
 
 
 @dataclass(frozen=True)
-class Ended:
+class AgentExit:
     """How the agent on the target ended, and the last that it logged."""
 
     code: int
@@ -52,7 +52,7 @@ class Ended:
 
 
 @dataclass(frozen=True)
-class NoRoom:
+class DiskFull:
     """What the target says when its disk is too full for what is sent."""
 
     free: int
@@ -60,18 +60,18 @@ class NoRoom:
     path: str
 
 
-def parsed(text: bytes | str, target: str) -> dict[str, Any]:
+def parse_message(text: bytes | str, target: str) -> dict[str, Any]:
     """Return a message of the target.
 
     Raises:
         TargetError: when it is no mapping of plain values with finite numbers.
     """
     try:
-        message = json.loads(text, parse_constant=_no_number)
+        message = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise nonsense(target, one_line(str(error), 200)) from error
+        raise invalid_reply(target, one_line(str(error), 200)) from error
     if not isinstance(message, dict):
-        raise nonsense(target, f"a message is a {type(message).__name__}")
+        raise invalid_reply(target, f"a message is a {type(message).__name__}")
     checked: dict[str, Any] = sane(message, target)
     return checked
 
@@ -82,12 +82,12 @@ def sane(value: Any, target: str, depth: int = 0) -> Any:
     Raises:
         TargetError: when it is nested too deep, or holds a number that is not finite or too large.
     """
-    if depth > DEEPEST:
-        raise nonsense(target, f"a message has more than {DEEPEST} levels")
+    if depth > MAX_DEPTH:
+        raise invalid_reply(target, f"a message has more than {MAX_DEPTH} levels")
     if isinstance(value, str):
         return printable(value)
-    if isinstance(value, (int, float)) and not (math.isfinite(value) and abs(value) <= LARGEST):
-        raise nonsense(target, "a number is too large")
+    if isinstance(value, (int, float)) and not (math.isfinite(value) and abs(value) <= MAX_NUMBER):
+        raise invalid_reply(target, "a number is too large")
     if isinstance(value, list):
         return [sane(item, target, depth + 1) for item in value]
     if isinstance(value, dict):
@@ -95,7 +95,7 @@ def sane(value: Any, target: str, depth: int = 0) -> Any:
     return value
 
 
-def told(kind: type[T], value: Any, target: str, where: str) -> T:
+def read_reply(kind: type[T], value: Any, target: str, where: str) -> T:
     """Return what the target says, as an object of a type.
 
     Raises:
@@ -104,7 +104,7 @@ def told(kind: type[T], value: Any, target: str, where: str) -> T:
     try:
         return from_json(kind, value, where)
     except ValueError as error:
-        raise nonsense(target, one_line(str(error), 200)) from error
+        raise invalid_reply(target, one_line(str(error), 200)) from error
 
 
 def python_of(facts: Any, target: str) -> Python:
@@ -113,22 +113,22 @@ def python_of(facts: Any, target: str) -> Python:
     Raises:
         TargetError: when something of it is missing or of another type.
     """
-    python = told(Python, facts, target, "python")
+    python = read_reply(Python, facts, target, "python")
     return replace(
         python,
         command=one_line(python.command),
         architecture=one_line(python.architecture),
         kernel=one_line(python.kernel),
-        packages=_lines(python.packages),
-        errors=_lines(python.errors),
+        packages=_on_one_line(python.packages),
+        errors=_on_one_line(python.errors),
     )
 
 
-def _lines(texts: Mapping[str, str]) -> dict[str, str]:
-    return {one_line(name, 80): one_line(text) for name, text in list(texts.items())[:MOST_PACKAGES]}
+def _on_one_line(texts: Mapping[str, str]) -> dict[str, str]:
+    return {one_line(name, 80): one_line(text) for name, text in list(texts.items())[:MAX_PACKAGES]}
 
 
-def nonsense(target: str, what: str) -> TargetError:
+def invalid_reply(target: str, what: str) -> TargetError:
     """Return the error for a target that does not say what vlatool's own program there would."""
     return TargetError(
         f"What {target} answered makes no sense: {what}.",
@@ -136,5 +136,5 @@ def nonsense(target: str, what: str) -> TargetError:
     )
 
 
-def _no_number(text: str) -> float:
+def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is not a number")

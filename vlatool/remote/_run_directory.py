@@ -14,7 +14,7 @@ from pathlib import Path
 BLOCK = 4096
 PREFIX = "vlatool-run-"
 LOCK = "lock"
-MADE = "made"
+CREATED = "made"
 """File that names the directories which the first run made; the last run removes them."""
 
 
@@ -27,7 +27,7 @@ class Refused(Exception):
         self.text = text
 
 
-class Place:
+class RunDirectory:
     """A private directory with a lock that is held as long as its run lives."""
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class Place:
         missing = [str(parent) for parent in (cache, *cache.parents) if not parent.exists()]
         self._shared.mkdir(mode=0o700, parents=True, exist_ok=True)
         if missing:
-            (self._shared / MADE).write_text("\0".join(missing), encoding="utf-8", errors="surrogateescape")
+            (self._shared / CREATED).write_text("\0".join(missing), encoding="utf-8", errors="surrogateescape")
         sweep(self._shared)
         return Path(tempfile.mkdtemp(prefix=PREFIX, dir=self._shared))
 
@@ -109,10 +109,10 @@ class Place:
         if self._shared is None:
             return
         with contextlib.suppress(OSError):
-            record = self._shared / MADE
+            record = self._shared / CREATED
             left = os.listdir(self._shared)
             parents = [self._shared, self._shared.parent]
-            if left == [MADE]:
+            if left == [CREATED]:
                 parents += map(Path, record.read_text(encoding="utf-8", errors="surrogateescape").split("\0"))
                 record.unlink()
             for parent in parents:
@@ -136,13 +136,13 @@ def sweep(folder: Path) -> None:
 class Guard:
     """A process that outlives this one when it is killed, ends the agent and removes the directory."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, directory: RunDirectory) -> None:
         waits, self._tells = os.pipe()
         self._process = os.fork()
         if self._process == 0:
             os.close(self._tells)
             with contextlib.suppress(BaseException):
-                _guard(waits, place)
+                _guard(waits, directory)
             os._exit(0)
         os.close(waits)
 
@@ -158,7 +158,7 @@ class Guard:
             os.waitpid(self._process, 0)
 
 
-def _guard(waits: int, place: Place) -> None:
+def _guard(waits: int, directory: RunDirectory) -> None:
     os.setsid()
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
@@ -172,7 +172,7 @@ def _guard(waits: int, place: Place) -> None:
     if "done" not in words:
         for word in words:
             kill(int(word))
-        place.remove()
+        directory.remove()
 
 
 def kill(group: int) -> None:

@@ -15,16 +15,16 @@ from vlatool.graph.flat import named_everywhere
 from vlatool.graph.onnx_graph import type_name
 from vlatool.graph.precision import shares_and_unknown
 from vlatool.graph.seen import Seen, note_seen, read_seen
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.engines import traced
 from vlatool.stage.base import Context
 
-NAMED = 4
+MAX_NAMES = 4
 """Layers that a sentence names."""
 
 
-def counted_shares(path: Path, context: Context) -> dict[str, float]:
+def count_shares(path: Path, context: Context) -> dict[str, float]:
     """Return precision -> share of a graph's multiply-accumulates.
 
     Where layers have no static shape, or a loop ends nobody knows when, the graph is run once on drawn inputs, and what
@@ -43,8 +43,10 @@ def counted_shares(path: Path, context: Context) -> dict[str, float]:
         path.write_bytes(model.SerializeToString())
         shares, unknown = shares_and_unknown(path)
     if unknown:
-        named = ", ".join(unknown[:NAMED]) + (f" and {len(unknown) - NAMED} more" if len(unknown) > NAMED else "")
-        context.said.append(f"{path.stem}: not counted, for want of fixed shapes: {named}")
+        named = ", ".join(unknown[:MAX_NAMES]) + (
+            f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
+        )
+        context.messages.append(f"{path.stem}: not counted, for want of fixed shapes: {named}")
     return shares
 
 
@@ -55,17 +57,17 @@ def _run(path: Path) -> dict[str, Seen]:
     stored = {tensor.name for tensor in model.graph.initializer}
     with scratch_directory() as scratch, contextlib.suppress(VlatoolError):
         copy = write_beside(model, path, scratch / path.name)
-        with risky(engine_class(), f"ran {path.name} to see its shapes"):
+        with engine_call(engine_class(), f"ran {path.name} to see its shapes"):
             session = traced(copy, scratch / "trace")
             try:
-                session.run(_drawn([value for value in model.graph.input if value.name not in stored]))
+                session.run(_draw_inputs([value for value in model.graph.input if value.name not in stored]))
             except Exception:  # the seam: what ONNX Runtime refuses, and types that numpy lacks, is not counted
                 return {}
             return {name: Seen(*ran) for name, ran in session.ran().items()}
     return {}
 
 
-def _drawn(values: list[Any]) -> dict[str, Any]:
+def _draw_inputs(values: list[Any]) -> dict[str, Any]:
     """Return arrays that fit the inputs of a graph, each free axis of length 1: zeros for ids, ones without axes."""
     random = np.random.default_rng(0)
     feeds = {}

@@ -5,33 +5,33 @@ from __future__ import annotations
 import contextlib
 import sys
 
-from vlatool.user_code._answers import Last, plain
+from vlatool.user_code._answers import ChildState, plain
 
-SHOWN_LINES, SHOWN_CHARACTERS = 200, 400
+MAX_LINES, MAX_CHARACTERS = 200, 400
 """Of what a child prints."""
-BLOCK = 1 << 16
+BLOCK_BYTES = 1 << 16
 
 
-class Said:
+class ChildOutput:
     """What a child prints, shown on standard error as the policy's, a limited number of lines."""
 
-    def __init__(self, about: str, last: Last) -> None:
+    def __init__(self, about: str, last: ChildState) -> None:
         self._about, self._last, self._rest, self._shown = about, last, b"", 0
 
     def take(self, printed: bytes) -> None:
         """Show the lines that are whole now."""
         *lines, self._rest = (self._rest + printed).split(b"\n")
-        if len(self._rest) > BLOCK:
+        if len(self._rest) > BLOCK_BYTES:
             lines, self._rest = [*lines, self._rest], b""
         for line in lines:
             self._show(plain(line.decode("utf-8", "replace")))
 
     def _show(self, line: str) -> None:
         self._last.said = line.strip() or self._last.said
-        if not line.strip() or self._shown > SHOWN_LINES:
+        if not line.strip() or self._shown > MAX_LINES:
             return
         self._shown += 1
-        line = line[:SHOWN_CHARACTERS] if self._shown <= SHOWN_LINES else "prints more; not shown"
+        line = line[:MAX_CHARACTERS] if self._shown <= MAX_LINES else "prints more; not shown"
         with contextlib.suppress(OSError, ValueError, AttributeError):
             sys.stderr.write(f"[{self._about}] {line}\n")
             sys.stderr.flush()

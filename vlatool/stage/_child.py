@@ -24,13 +24,13 @@ PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", 
 """What stages with a user's code need; imported once, by the server that forks the children."""
 
 
-def needed(stage: Stage) -> tuple[str, ...]:
+def child_imports(stage: Stage) -> tuple[str, ...]:
     """Return the modules that a child needs for a stage of vlatool's own code; the server imports them once."""
     packages = (package.replace("-", "_") for package in stage.used_packages())
     return (*packages, *stage.imports, "numpy.random", type(stage).__module__, __name__)
 
 
-def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Context) -> Bundle:
+def run_in_child(stage: Transform, source: Bundle | None, draft: Path, context: Context) -> Bundle:
     """Run a stage in a child process and return what it wrote to ``draft``, verified where a user's code took part.
 
     Raises:
@@ -39,17 +39,17 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
         BundleError: when what it wrote is not a whole bundle.
     """
     job, whose = {**_job(stage, source, context), "out": str(draft)}, stage.runs(source)
-    about, preload = whose or stage.name(), (*PRELOAD, *stage.imports) if whose else needed(stage)
-    answer = children.call("vlatool.stage._inside:run", job, context.tell, about, preload, own=not whose)
+    about, preload = whose or stage.name(), (*PRELOAD, *stage.imports) if whose else child_imports(stage)
+    answer = children.call("vlatool.stage._child:run", job, context.progress, about, preload, own=not whose)
     said = answer.get("said") if isinstance(answer, Mapping) else None
-    context.said.extend(map(str, said if isinstance(said, list) else ()))  # a policy may have answered
+    context.messages.extend(map(str, said if isinstance(said, list) else ()))  # a policy may have answered
     return Bundle.open(draft, verify=bool(whose))
 
 
 def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any]:
     """Return what a child needs to know of a stage."""
     return {
-        "stage": stage.name(), "options": stage.given(), "workers": context.workers,
+        "stage": stage.name(), "options": stage.explicit_options(), "workers": context.workers,
         "launcher": context.launcher,
         "source": str(source.path.absolute()) if source else "", "command": context.command,
         "events": context.events, "video": context.video, "force": context.force,
@@ -63,12 +63,12 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
         raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.", "name a stage that makes a bundle")
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
     context = _context(job, tell)
-    with _blamed():
+    with _name_plugin():
         bundle = stage.run(source, Path(job["out"]), context)
-    return {"hash": bundle.hash, "said": context.said}
+    return {"hash": bundle.hash, "said": context.messages}
 
 
-def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle, context: Context) -> Report:
+def measure_in_child(environment: Mapping[str, str], stage: Measure, source: Bundle, context: Context) -> Report:
     """Run a measuring stage in a child process that has further variables from its start.
 
     Raises:
@@ -77,8 +77,8 @@ def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle
     job, settings = _job(stage, source, context), " ".join(f"{name}={value}" for name, value in environment.items())
     about = f"{stage.name()} with {settings}" if settings else stage.name()
     job["keeps"] = context.unfinished is not None
-    here, preload = "vlatool.stage._inside:measure", needed(stage)
-    answer = children.call(here, job, context.tell, about, preload, environment, own=True)
+    here, preload = "vlatool.stage._child:measure", child_imports(stage)
+    answer = children.call(here, job, context.progress, about, preload, environment, own=True)
     if context.unfinished is not None:
         context.unfinished.extend(map(Path, answer["unfinished"]))
     context.notes.extend(map(str, answer["notes"]))
@@ -95,13 +95,13 @@ def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
     source = Bundle.open(Path(job["source"]), verify=False)
     unfinished: list[Path] = []
     context = replace(_context(job, tell), unfinished=unfinished if job["keeps"] else None)
-    with _blamed():
+    with _name_plugin():
         report = stage.run(source, context).to_json()
     return {"report": report, "unfinished": list(map(str, unfinished)), "notes": context.notes}
 
 
 @contextlib.contextmanager
-def _blamed() -> Iterator[None]:
+def _name_plugin() -> Iterator[None]:
     """Name the package that adds a stage when that fails: the parent does not see where an exception came from."""
     try:
         yield

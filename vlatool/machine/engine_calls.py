@@ -13,25 +13,25 @@ from typing import Any
 
 from vlatool.errors import GraphError
 
-Deed = tuple[str, str, str]
+EngineCall = tuple[str, str, str]
 """Which library (``ONNX Runtime 1.23.2``), what it does in the past tense, and the package that installs it."""
 REMEDY = (
     "where the graph was quantized, leave layers out with --exclude or use another --layout; otherwise use another "
     "release of {package}"
 )
 
-_listener: Callable[[Deed | None], None] | None = None
-_now: Deed | None = None
+_listener: Callable[[EngineCall | None], None] | None = None
+_now: EngineCall | None = None
 
 
-def listen(listener: Callable[[Deed | None], None] | None) -> None:
+def listen(listener: Callable[[EngineCall | None], None] | None) -> None:
     """Let a function be told what begins, and None when nothing is under way any more."""
     global _listener, _now
     _listener, _now = listener, None
 
 
 @contextlib.contextmanager
-def risky(engine: Any, deed: str) -> Iterator[None]:
+def engine_call(engine: Any, deed: str) -> Iterator[None]:
     """Tell whoever watches this process what an engine does meanwhile.
 
     Args:
@@ -45,16 +45,16 @@ def risky(engine: Any, deed: str) -> Iterator[None]:
         yield
         return
     before, doing = _now, (_title(engine), deed, str(getattr(engine, "package", "")))
-    _tell(doing)
+    _notify(doing)
     try:
         yield
     except SystemExit as left:
-        raise crashed(doing, f"called sys.exit({left.code})") from None
+        raise engine_crash(doing, f"called sys.exit({left.code})") from None
     finally:
-        _tell(before)
+        _notify(before)
 
 
-def crashed(doing: Deed, how: str, last: str = "") -> GraphError:
+def engine_crash(doing: EngineCall, how: str, last: str = "") -> GraphError:
     """Return the error of an engine that ended its process, or wanted to.
 
     Args:
@@ -67,7 +67,7 @@ def crashed(doing: Deed, how: str, last: str = "") -> GraphError:
     return GraphError(f"{title} {how} when it {deed}.{said}", REMEDY.format(package=package or "the engine"))
 
 
-def _tell(doing: Deed | None) -> None:
+def _notify(doing: EngineCall | None) -> None:
     global _now
     _now = doing
     if _listener is not None:

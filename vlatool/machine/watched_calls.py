@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-SIZE = 1 << 11
+PAGE_BYTES = 1 << 11
 """Bytes of a page; below limits on the size of files (``ulimit -f``), which count it."""
 HEAD = struct.Struct("<ddI")
 """When the call began (``time.monotonic``; 0 for none), how long it may take, in seconds, and bytes of its words."""
@@ -51,12 +51,12 @@ class Page:
     """
 
     def __init__(self, fd: int) -> None:
-        self._memory = mmap.mmap(fd, SIZE)
+        self._memory = mmap.mmap(fd, PAGE_BYTES)
         self._words = b""
 
     def begin(self, waiting: str, whose: str, at: str, fix: str, limit_s: float) -> None:
         """Note a call."""
-        words = _fitting([waiting, whose, at, fix])
+        words = _truncate_to_fit([waiting, whose, at, fix])
         if words != self._words:
             self._memory[HEAD.size : HEAD.size + len(words)] = self._words = words
         HEAD.pack_into(self._memory, 0, time.monotonic(), limit_s, len(words))
@@ -68,7 +68,7 @@ class Page:
     def read(self) -> Call | None:
         """Return the call that is under way, None for none, and for what makes no sense: a user's code may write it."""
         begun, limit_s, length = HEAD.unpack_from(self._memory, 0)
-        if not (begun > 0 and limit_s > 0 and math.isfinite(begun) and length <= SIZE - HEAD.size):
+        if not (begun > 0 and limit_s > 0 and math.isfinite(begun) and length <= PAGE_BYTES - HEAD.size):
             return None
         try:
             words = json.loads(self._memory[HEAD.size : HEAD.size + length].decode())
@@ -84,10 +84,10 @@ class Page:
         self._memory.close()
 
 
-def _fitting(texts: list[str]) -> bytes:
+def _truncate_to_fit(texts: list[str]) -> bytes:
     """Return texts as JSON that fits on a page, each cut short where they do not: a task may have any name."""
-    length = SIZE
-    while len(words := json.dumps([text[:length] for text in texts]).encode()) > SIZE - HEAD.size:
+    length = PAGE_BYTES
+    while len(words := json.dumps([text[:length] for text in texts]).encode()) > PAGE_BYTES - HEAD.size:
         length //= 2
     return words
 
@@ -98,11 +98,11 @@ _page: Page | None = None
 def new_page() -> int:
     """Return the descriptor of an empty page that another process may be given."""
     fd = os.memfd_create("vlatool-awaited", os.MFD_CLOEXEC)
-    os.ftruncate(fd, SIZE)
+    os.ftruncate(fd, PAGE_BYTES)
     return fd
 
 
-def noted_on(fd: int) -> None:
+def note_calls_on(fd: int) -> None:
     """Let calls of this process be noted on a page."""
     global _page
     _page = Page(fd)
@@ -110,7 +110,7 @@ def noted_on(fd: int) -> None:
 
 
 @contextlib.contextmanager
-def awaited(waiting: str, whose: str, at: str, fix: str, limit_s: float) -> Iterator[None]:
+def watched_call(waiting: str, whose: str, at: str, fix: str, limit_s: float) -> Iterator[None]:
     """Note a call, the block, for whoever looks; see ``Call``."""
     if _page is None:
         yield
