@@ -214,7 +214,7 @@ ROWS = [
     Row("a full disk at the recordings", "No space left on device", 3,
         lambda at: at.unwritable("vlatool.training.rounds.new_array")),
     Row("a full disk at the labels", "No space left on device", 3,
-        lambda at: at.unwritable("vlatool.training.session.label")),
+        lambda at: at.unwritable("vlatool.training.session.write_labels")),
     Row("a full disk at the bundle", "the disk is full", 3,
         lambda at: at.unwritable("vlatool.module.stage.write_module")),
     Row("a full disk at the report", "the disk is full", 3,

@@ -180,7 +180,7 @@ def test_what_was_just_made_stays(kept: Bundle, cache: Path):
 def test_what_took_long_to_flush_was_just_made(cache: Path, float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch):
     """Its folder is as old as the last file in it, but nobody has had the time to lock it."""
     monkeypatch.setattr("vlatool.files.directory_writer._flush", lambda folder: os.utime(folder, (0, 0)))
-    monkeypatch.setattr("vlatool.stage.run.hold", lambda path: False)
+    monkeypatch.setattr("vlatool.stage.run.acquire", lambda path: False)
     made = cached_transform(DynamicInt8(), float_bundle, cache, Context())
     assert prune(cache, older_than_s=DAY).entries == ()
     assert Bundle.open(made.path)

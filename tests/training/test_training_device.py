@@ -140,13 +140,13 @@ def test_nothing_of_a_lesson_stays_on_another_device(tmp_path: Path, kind: str, 
     training = build_stage(stage, options)
     assert isinstance(training, TrainingStage)
     modules = load_modules(source)
-    teacher, lesson = training.prepared(modules, source)
+    teacher, lesson = training.prepare_objective(modules, source)
     rows = rows_of(source, teacher.program.noise)
     expert = {"expert." + name[len(LABEL) :]: value for name, value in rows.items() if name.startswith(LABEL)}
     losses = [(lesson.loss, rows)] + ([(lesson.expert, rows | expert)] if lesson.expert else [])
     for loss, given in losses:
         assert loss(given).device.type == "cpu", "and looked whether modules take batches"
-    with on_meta(lesson.trained, teacher.program.modules):
+    with on_meta(lesson.trainable, teacher.program.modules):
         for loss, given in losses:
             far = loss(given)
             assert far.device.type == "meta"
