@@ -153,8 +153,8 @@ def test_what_this_process_uses_stays(kept: Bundle, cache: Path, float_bundle: B
 HOLD = """
 import sys
 from pathlib import Path
-from vlatool.files.locks import hold
-print(hold(Path(sys.argv[1])), flush=True)
+from vlatool.files.locks import acquire
+print(acquire(Path(sys.argv[1])), flush=True)
 sys.stdin.read()
 """
 

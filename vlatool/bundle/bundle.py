@@ -56,8 +56,8 @@ class Bundle:
         """Read the manifest, check it against its digest, and check every file before anything else is parsed.
 
         Args:
-            path: The directory.
-            verify: Check that the files are those of the manifest, with their sizes and SHA-256, and no others.
+            path: the directory.
+            verify: whether to check that the files are exactly those of the manifest, by size and SHA-256.
 
         Raises:
             BundleError: when the directory is missing or no bundle, or a file is missing, changed, unknown or a link.
@@ -85,8 +85,8 @@ class Bundle:
         """Check every file that was not verified by reading it, and that nothing else is there.
 
         Args:
-            prefix: Check the content only of files whose names start with it.
-            but: Leave out those whose names start with this; none when empty.
+            prefix: prefix of the names of the files whose content is checked.
+            but: prefix of the names that are left out; none when empty.
 
         Raises:
             BundleError: when a file is missing, changed, a link, or not in the manifest.
@@ -122,8 +122,8 @@ class Bundle:
         """Return the content of a recorded file: the very bytes that were verified, read once.
 
         Args:
-            name: As in the manifest.
-            allowed: Name of the limit on its size.
+            name: name in the manifest.
+            allowed: name of the limit on its size.
 
         Raises:
             BundleError: when the manifest does not record it, it is larger than the limit, or it is not what the

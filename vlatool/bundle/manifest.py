@@ -33,11 +33,11 @@ class Graph:
     """One ONNX file of a policy.
 
     Args:
-        file: Path inside the bundle.
-        precision: Share of the multiply-accumulates that run in each dtype, as exported (0-1); ``int4 weights`` where
+        file: path inside the bundle.
+        precision: share of the multiply-accumulates that run in each dtype, as exported (0-1); ``int4 weights`` where
             the weights alone are int4.
-        opset: Opset of the default ONNX domain.
-        compute: Dtype in which the engine computes what is not quantized: ``bfloat16``, or float32 when empty.
+        opset: opset of the default ONNX domain.
+        compute: dtype in which the engine computes what is not quantized: ``bfloat16``, or float32 when empty.
     """
 
     file: str
@@ -62,31 +62,31 @@ class Manifest:
     """The content of ``manifest.json``.
 
     Args:
-        name: Name of the policy.
-        version: Version of the policy, as its author counts.
-        spec: What the policy consumes and produces.
-        graphs: Graph name -> graph; empty in a source bundle.
-        program: How the graphs are run, in order.
-        files: Path inside the bundle -> SHA-256 and size, of every file but the reports.
+        name: name of the policy.
+        version: version of the policy, as its author counts.
+        spec: what the policy consumes and produces.
+        graphs: graph name -> graph; empty in a source bundle.
+        program: how the graphs are run, in order.
+        files: path inside the bundle -> SHA-256 and size, of every file but the reports.
         parent: ``sha256:...`` of the bundle that this one was made from.
-        made_by: Version of vlatool, stage, options, versions of the packages that change the result.
-        build: The build record: for each stage from the source to this bundle what ``made_by`` says, the seed, the hash
+        made_by: version of vlatool, stage, options, versions of the packages that change the result.
+        build: build record: for each stage from the source to this bundle what ``made_by`` says, the seed, the hash
             of its input, the SHA-256 of its graphs, of its input files and of its calibration samples.
-        source: Factory and hashes of the code and weights (a source bundle, and those exported from it).
-        environment: Factory and tasks of the closed-loop evaluation.
-        parts: Part of the policy -> globs of module names.
-        golden: File with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
-        golden_tolerance: Largest relative L2 difference from the golden action with which a machine loads the bundle,
+        source: factory and hashes of the code and weights (a source bundle, and those exported from it).
+        environment: factory and tasks of the closed-loop evaluation.
+        parts: part of the policy -> globs of module names.
+        golden: file with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
+        golden_tolerance: largest relative L2 difference from the golden action with which a machine loads the bundle,
             from what was measured when it was made; ``GOLDEN_TOLERANCE`` when 0.
-        golden_chunk_tolerance: The same for the action in physical units, each element from the offset of its
+        golden_chunk_tolerance: the same for the action in physical units, each element from the offset of its
             statistics and in units of their spread; ``golden_tolerance`` when 0.
-        findings: What a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
+        findings: what a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
             and ``gate`` refuse the bundle unless each is overruled by its name.
-        accuracy: Measured accuracy: name -> value, interval, samples.
-        description: One sentence.
+        accuracy: measured accuracy: name -> value, interval, samples.
+        description: one sentence.
         license: SPDX identifier of the policy's licence.
-        engine: Engine that the graphs were made for; ONNX Runtime on the CPU when empty.
-        schema: Version of this format.
+        engine: engine that the graphs were made for; ONNX Runtime on the CPU when empty.
+        schema: version of this format.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A bundle of modules, as pruning and distillation make it, that has no graphs yet: what to do about it."""
+"""Bundles of torch modules, as pruning and distillation make them, which have no graphs yet: how to export them."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def no_graph_error(bundle: Bundle, purpose: str) -> BundleError:
     """Return the error of a bundle that has no graph, with the command that makes a bundle with graphs of it.
 
     Args:
-        bundle: Without graphs.
-        purpose: What the graph is needed for: ``run``.
+        bundle: bundle without graphs.
+        purpose: what the graph is needed for: ``run``.
     """
     return BundleError(f"{bundle.path} has no graph to {purpose}.", f"export it first: {export_command(bundle.path)}")
 

@@ -87,14 +87,14 @@ class ProgramStep:
     """One entry of a program: run a graph, once or several times.
 
     Args:
-        graph: Name of the graph.
-        feeds: Graph input name -> value name.
-        gives: Graph output name -> value name.
-        repeat: How often the graph runs.
-        carry: Given value -> the value that it replaces before the next repeat.
-        schedule: Value -> one number for each repeat, presented as an array of shape (1,).
-        noise: Value -> {shape, distribution}; drawn once before the first repeat, from the seedable generator.
-        keep: Value -> {shape, dtype}; zero after ``reset``, else what the last inference gave under that name.
+        graph: name of the graph.
+        feeds: graph input name -> value name.
+        gives: graph output name -> value name.
+        repeat: how often the graph runs.
+        carry: given value -> the value that it replaces before the next repeat.
+        schedule: value -> one number for each repeat, presented as an array of shape (1,).
+        noise: value -> {shape, distribution}; drawn once before the first repeat, from the seedable generator.
+        keep: value -> {shape, dtype}; zero after ``reset``, else what the last inference gave under that name.
     """
 
     graph: str

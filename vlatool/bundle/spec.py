@@ -30,21 +30,21 @@ class TensorSpec:
     """One named input or output of a policy.
 
     Args:
-        name: The key of the observation, or of the result.
-        shape: With the batch axis in front; a string names an axis whose length is free. Empty for one number without
+        name: the key of the observation, or of the result.
+        shape: axes, the batch first; a string names an axis whose length is free. Empty for one number without
             axes, which an action is not.
-        dtype: What the graph sees: float32, float16, float64, int8 to int64, uint8 to uint64 or bool; uint8 holds
+        dtype: what the graph sees: float32, float16, float64, int8 to int64, uint8 to uint64 or bool; uint8 holds
             pixels.
         kind: ``tensor``; ``text`` (the observation holds a string, the graph sees token ids); ``discrete`` (an output
             of logits over ``labels``; the action is the index of the largest).
-        unit: One unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
-        labels: A name for each element of the last axis; the indices, when a discrete output names none.
-        mode: How a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
-        normalisation: How the runtime maps physical values to what the graph sees (outputs: and back): ``none``,
+        unit: one unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
+        labels: a name for each element of the last axis; the indices, when a discrete output names none.
+        mode: how a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
+        normalisation: how the runtime maps physical values to what the graph sees (outputs: and back): ``none``,
             ``mean_std``, ``min_max`` or ``quantiles``.
         statistics: ``file#key`` of the statistics that the normalisation needs; file relative to the assets.
-        tokenizer: File of the tokenizer, relative to the assets (``kind: text``).
-        max_tokens: Number of ids that the tokenizer pads or cuts to (``kind: text``).
+        tokenizer: file of the tokenizer, relative to the assets (``kind: text``).
+        max_tokens: number of ids that the tokenizer pads or cuts to (``kind: text``).
         finite: False for an input of floats in which the policy itself handles NaN and infinity, such as a depth image
             without a return; everywhere else they are refused.
     """
@@ -188,11 +188,11 @@ class PolicySpec:
     """What a policy consumes and produces.
 
     Args:
-        inputs: In the order in which the source takes them.
-        outputs: The first is the action.
-        control_hz: Rate of the control loop in Hz.
-        chunk: Actions in one inference.
-        execute: Actions that are executed before the next inference; 0 means the whole chunk.
+        inputs: inputs in the order in which the source takes them.
+        outputs: the first is the action.
+        control_hz: rate of the control loop in Hz.
+        chunk: actions in one inference.
+        execute: actions that are executed before the next inference; 0 means the whole chunk.
     """
 
     inputs: tuple[TensorSpec, ...]

@@ -58,13 +58,13 @@ def check_tensors(modules: Mapping[str, nn.Module], stored: Mapping[str, Any], w
     """See that a file holds the weights of modules and nothing else.
 
     Args:
-        modules: Graph name -> module.
-        stored: Name -> tensor; a name may have that of the graph before it.
-        where: The file, for messages.
+        modules: graph name -> module.
+        stored: name -> tensor; a name may have that of the graph before it.
+        where: the file, for messages.
 
     Raises:
         SourceError: when a tensor is unknown, there under both names, or of other numbers than the module's: codes of
-            a quantized file or complex numbers are no weights, whatever their shape.
+            a quantized file or complex numbers are not weights, whatever their shape.
     """
     held = {graph: module.state_dict() for graph, module in modules.items()}
     known = {name: value for state in held.values() for name, value in state.items()}

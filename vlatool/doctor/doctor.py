@@ -60,10 +60,10 @@ class Check:
     """One finding.
 
     Args:
-        name: What was looked at.
+        name: what was looked at.
         status: ``ok``, ``warn`` (works, but) or ``missing``.
-        finding: What was found, in words.
-        fix: What to do; empty when nothing is to be done.
+        finding: what was found, in words.
+        fix: what to do; empty when nothing is to be done.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What a library of machine code is about to do: it may end the process, and whoever watches that is told before.
+"""Calls of engines that may end the process: the parent process is notified before each.
 
 A graph that nobody has run yet can make an engine abort, crash or hang. The build side opens and runs such graphs in
 child processes (``vlatool.user_code.children``); a child tells its parent here what it does, so that the parent can say
@@ -25,18 +25,18 @@ _now: EngineCall | None = None
 
 
 def listen(listener: Callable[[EngineCall | None], None] | None) -> None:
-    """Let a function be told what begins, and None when nothing is under way any more."""
+    """Set a listener that receives each call as it begins, and None when none is running."""
     global _listener, _now
     _listener, _now = listener, None
 
 
 @contextlib.contextmanager
 def engine_call(engine: Any, deed: str) -> Iterator[None]:
-    """Tell whoever watches this process what an engine does meanwhile.
+    """Notify the parent process of what an engine does in the block.
 
     Args:
-        engine: A class of ``vlatool.runtime.engine``.
-        deed: What it does, in the past tense: ``opened the graph 'main'``.
+        engine: a class of ``vlatool.runtime.engine``.
+        deed: what the engine does, in the past tense: ``opened the graph 'main'``.
 
     Raises:
         GraphError: when it wants to leave the process.
@@ -58,9 +58,9 @@ def engine_crash(doing: EngineCall, how: str, last: str = "") -> GraphError:
     """Return the error of an engine that ended its process, or wanted to.
 
     Args:
-        doing: What it did.
-        how: How it ended, in the past tense.
-        last: What it wrote last.
+        doing: call that was running.
+        how: how it ended, in the past tense.
+        last: last line of its output.
     """
     title, deed, package = doing
     said = f" It said last: {last}" if last else ""

@@ -148,7 +148,7 @@ def onednn_max_cpu_isa(variables: Mapping[str, str] = os.environ) -> str | None:
     """The instruction set that ``ONEDNN_MAX_CPU_ISA`` confines oneDNN, and so OpenVINO, to; None when there is none.
 
     oneDNN obeys the older name where the newer one is not set, takes small letters for large ones, and ``ALL`` and
-    ``DEFAULT`` confine it to nothing. What is no name of an instruction set is told as ``?``: it may be anything, and
+    ``DEFAULT`` confine it to nothing. Anything else is reported as ``?``: it may be anything, and
     reports are shared.
     """
     value = (variables.get(MAX_CPU_ISA) or variables.get(OLDER_MAX_CPU_ISA, "")).upper()

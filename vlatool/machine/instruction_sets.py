@@ -38,11 +38,11 @@ class BoardSet:
     """The set that OpenVINO computes in on a board, beside the one that it computes in here.
 
     Args:
-        board: Name of the profile.
-        wanted: The board's set; empty where there is nothing to compare (no profile, no x86, no OpenVINO on it).
-        lacks: The feature that this host's processor would need for it; empty when it has it.
-        host: The highest set of this host's processor; empty when it is no x86.
-        isa_limit: What OpenVINO obeys of ``ONEDNN_MAX_CPU_ISA`` in this process; empty when it confines nothing.
+        board: name of the profile.
+        wanted: the board's set; empty where there is nothing to compare (no profile, no x86, no OpenVINO on it).
+        lacks: the feature that this host's processor would need for it; empty when it has it.
+        host: the highest set of this host's processor; empty when it is not an x86.
+        isa_limit: what OpenVINO obeys of ``ONEDNN_MAX_CPU_ISA`` in this process; empty when it confines nothing.
     """
 
     board: str = ""
@@ -53,7 +53,7 @@ class BoardSet:
 
     @property
     def to_set(self) -> str:
-        """What the variable must say in a further process; empty where there is no need for one, or no use in it."""
+        """What the variable must say in a further process; empty where it is not needed or not useful."""
         needed = self.wanted and not self.lacks and not self.isa_limit and self.host != self.wanted
         return self.wanted if needed else ""
 
@@ -148,7 +148,7 @@ class BoardSet:
 
 
 def rung(features: Collection[str]) -> str:
-    """Return the highest set that has these features (names of ``/proc/cpuinfo``); empty when it is no x86 with AVX2.
+    """Return the highest set that has these features (names of ``/proc/cpuinfo``); empty without x86 and AVX2.
 
     Example:
         >>> rung(["avx2", "fma", "avx_vnni"])
@@ -185,10 +185,10 @@ def compare_sets(board: str, features: Collection[str], host: Collection[str], i
     """Return a board's set beside this host's.
 
     Args:
-        board: Name of the profile.
-        features: Features of the board's processor.
-        host: Features of this host's processor.
-        isa_limit: What ``ONEDNN_MAX_CPU_ISA`` says.
+        board: name of the profile.
+        features: features of the board's processor.
+        host: features of this host's processor.
+        isa_limit: what ``ONEDNN_MAX_CPU_ISA`` says.
     """
     wanted = rung(features)
     needed, own, isa_limit = RUNGS.get(wanted, ""), rung(host), effective_set(isa_limit, host)

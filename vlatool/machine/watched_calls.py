@@ -1,4 +1,4 @@
-"""Calls that may never return, on a page of memory that another process looks at: a library may let no thread run.
+"""A watchdog for calls that may never return: they are noted on a page of shared memory that the parent reads.
 
 A child writes what it calls and since when; its parent reads that, says what it waits for, and ends the child when the
 call takes longer than it may (``vlatool.user_code.children``). A process whose page nobody reads calls as ever.
@@ -27,11 +27,11 @@ class Call:
     """A call that is under way.
 
     Args:
-        waiting: What is waited for, for the progress: ``reset() of seed 17``.
-        whose: What did not return, the start of a sentence.
-        at: When it was called, the end of a sentence; may be empty.
-        fix: What to do where it takes too long.
-        limit_s: How long it may take.
+        waiting: what is waited for, for the progress: ``reset() of seed 17``.
+        whose: what did not return, the start of a sentence.
+        at: when it was called, the end of a sentence; may be empty.
+        fix: what to do where it takes too long.
+        limit_s: how long it may take.
         begun: ``time.monotonic`` when it began.
     """
 
@@ -47,7 +47,7 @@ class Page:
     """The page, as both processes see it.
 
     Args:
-        fd: Of ``new_page``; it stays open for whoever has it.
+        fd: descriptor from ``new_page``, which stays open.
     """
 
     def __init__(self, fd: int) -> None:
@@ -66,7 +66,7 @@ class Page:
         HEAD.pack_into(self._memory, 0, 0.0, 0.0, 0)
 
     def read(self) -> Call | None:
-        """Return the call that is under way, None for none, and for what makes no sense: a user's code may write it."""
+        """Return the call that is under way, None for none, and for invalid content: user code may write it."""
         begun, limit_s, length = HEAD.unpack_from(self._memory, 0)
         if not (begun > 0 and limit_s > 0 and math.isfinite(begun) and length <= PAGE_BYTES - HEAD.size):
             return None
@@ -111,7 +111,7 @@ def note_calls_on(fd: int) -> None:
 
 @contextlib.contextmanager
 def watched_call(waiting: str, whose: str, at: str, fix: str, limit_s: float) -> Iterator[None]:
-    """Note a call, the block, for whoever looks; see ``Call``."""
+    """Note the block as a call on the page; see ``Call``."""
     if _page is None:
         yield
         return

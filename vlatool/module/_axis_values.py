@@ -13,14 +13,14 @@ class Values:
     """The axes of the values of a graph, and the products that it computes.
 
     Attributes:
-        factors: What axes are made of.
-        products: Axes over which each multiply-accumulate runs.
-        widths: Of each product, axes of the weights that it takes, without those of a kernel.
-        reads: Factors of axes of weights over which a product sums: what reads units, where others write them.
-        counts: Node -> argument that states a number, and its place in a list -> axes that have so many elements.
-        apart: Nodes whose equal parts are not the same, as they are where nothing keeps their elements.
-        shapes: Node -> axes of its value, of several values, or None where it is no tensor.
-        stored: Nodes whose values are weights, or weights with their axes in another order.
+        factors: what axes are made of.
+        products: axes over which each multiply-accumulate runs.
+        widths: widths of each product, axes of the weights that it takes, without those of a kernel.
+        reads: factors of axes of weights over which a product sums: what reads units, where others write them.
+        counts: node -> argument that states a number, and its place in a list -> axes that have so many elements.
+        apart: nodes whose equal parts are not the same, as they are where nothing keeps their elements.
+        shapes: node -> axes of its value, of several values, or None where it is not a tensor.
+        stored: nodes whose values are weights, or weights with their axes in another order.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Values:
         self._silent = Silent(self.stored)
 
     def shape(self, node: Any) -> Shape | None:
-        """Return the axes of a node's value, None where it is no tensor."""
+        """Return the axes of a node's value, None where it is not a tensor."""
         found = self.shapes.get(node)
         return found if isinstance(found, list) and (not found or isinstance(found[0], tuple)) else None
 
@@ -44,7 +44,7 @@ class Values:
         """Return the axes of an argument.
 
         Raises:
-            TypeError: when it is no tensor.
+            TypeError: when it is not a tensor.
         """
         shape = self.shape(node) if hasattr(node, "op") else None
         if shape is None:
@@ -82,8 +82,8 @@ class Values:
         """Note a product.
 
         Args:
-            axes: Over which it runs.
-            widths: Those of its weights, without those of a kernel.
+            axes: axes over which it runs.
+            widths: those of its weights, without those of a kernel.
         """
         self.products.append(axes)
         self.widths.append(list(widths))

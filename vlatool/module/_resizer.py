@@ -23,8 +23,8 @@ class Resizer:
     """Writes the new sizes into operators that state some.
 
     Args:
-        walk: Of the graph.
-        keep: Factor -> its elements that stay.
+        walk: walk of the graph.
+        keep: factor -> its elements that stay.
     """
 
     def __init__(self, walk: Walk, keep: Mapping[int, Sequence[int]]) -> None:

@@ -71,7 +71,7 @@ def _slice(walk: Values, node: Any) -> Shape:
 
 
 def _put_slice(walk: Values, node: Any) -> Shape:
-    """Put a value in the place of a slice."""
+    """Replace a slice by a value."""
     part, along = _piece(walk, node, node.args[1])
     put = walk.shape_of(node.args[1])
     walk.broadcast([[*part[:along], (), *part[along + 1 :]], [*put[:along], (), *put[along + 1 :]]])
@@ -83,9 +83,9 @@ def _piece(walk: Values, node: Any, like: Any) -> tuple[Shape, int]:
     """Return the axes of a slice, and the axis that it is one of.
 
     Args:
-        walk: Of the graph.
-        node: With the arguments of a slice.
-        like: Node whose value has its sizes.
+        walk: walk of the graph.
+        node: node with the arguments of a slice.
+        like: node whose value has its sizes.
     """
     given = walk.shape_of(node.args[0])
     along = argument(node, "dim", 0) % len(given)

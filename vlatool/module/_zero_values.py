@@ -1,4 +1,4 @@
-"""Which values are zero where weights are: what a sum over two values may lose without a change."""
+"""Values that are zero where weights are zero: terms that a sum may lose without a change."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Silent:
     """Finds out whether the values of a graph's nodes are zero where weights are.
 
     Args:
-        stored: Nodes whose values are weights, or weights with their axes in another order.
+        stored: nodes whose values are weights, or weights with their axes in another order.
     """
 
     def __init__(self, stored: set[Any]) -> None:

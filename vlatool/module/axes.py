@@ -40,11 +40,11 @@ class Member:
     """One axis of a weight that a factor is a part of.
 
     Args:
-        weight: Name in the state of the module.
-        axis: Number of the axis.
-        atom: Which factor of the axis.
-        reads: Whether a product sums over the axis: the weight reads the units, which others write.
-        numbers: Of each element of the axis, the unit that it belongs to; -1 for none.
+        weight: name in the state of the module.
+        axis: number of the axis.
+        atom: position of the factor in the axis.
+        reads: whether a product sums over the axis: the weight reads the units, which others write.
+        numbers: unit that each element of the axis belongs to; -1 for none.
     """
 
     weight: str
@@ -63,10 +63,10 @@ class Walk(Values):
     """Walks a graph of torch.export and finds out which axes belong together.
 
     Args:
-        program: An ``ExportedProgram``.
+        program: an ``ExportedProgram``.
 
     Attributes:
-        unknown: Operators without a rule, or of a form that theirs does not know; all axes that touch them stay.
+        unknown: operators without a rule, or of a form that theirs does not know; all axes that touch them stay.
     """
 
     def __init__(self, program: Any) -> None:

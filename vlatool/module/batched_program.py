@@ -29,7 +29,7 @@ FITS = (
     "docs/guides/your-own-policy.md says what forward() is given"
 )
 SAME = 1e-3
-"""Relative and absolute difference that the order of additions makes."""
+"""Relative and absolute difference that a different order of additions may cause."""
 
 
 class BatchedProgram:
@@ -38,17 +38,17 @@ class BatchedProgram:
     Values have the batch in front: where the program says ``[1, 50, 7]``, a batch of B has ``(B, 50, 7)``. Modules that
     take one observation alone, such as those with ``reshape(1, ...)``, are run row by row. Kept values are given and
     returned with the batch before their whole shape: ``(B, 2, 1, 128)`` where the program says ``[2, 1, 128]``; modules
-    get them with the batch in the place of an axis of 1, whichever they take. They begin at zero where none are given,
+    get them with the batch instead of an axis of size 1, whichever they take. They begin at zero where none are given,
     as they do after ``reset``.
 
     Args:
-        steps: As in the manifest.
-        modules: Graph name -> module.
+        steps: steps of the program, as in the manifest.
+        modules: graph name -> module.
 
     Attributes:
-        noise: What the program draws, value name -> shape and distribution.
-        kept: What the program keeps from run to run, value name -> shape and dtype.
-        loop: The first step that runs several times and carries values from turn to turn; None where there is none.
+        noise: what the program draws, value name -> shape and distribution.
+        kept: what the program keeps from run to run, value name -> shape and dtype.
+        loop: the first step that runs several times and carries values from turn to turn; None where there is none.
     """
 
     def __init__(self, steps: Iterable[ProgramStep], modules: Mapping[str, nn.Module]) -> None:
@@ -65,8 +65,8 @@ class BatchedProgram:
         """Run all steps.
 
         Args:
-            inputs: Encoded inputs, value name -> (B, ...).
-            noise: What the program draws, value name -> (B, ...); with it what was kept of the run before, if it was.
+            inputs: encoded inputs, value name -> (B, ...).
+            noise: what the program draws, value name -> (B, ...); with it what was kept of the run before, if it was.
 
         Returns:
             Every value, of the inputs too.
@@ -95,9 +95,9 @@ class BatchedProgram:
         """Run what comes before ``loop``, and one of its turns, each row its own; ``look`` at a batch first.
 
         Args:
-            inputs: Encoded inputs, value name -> (B, ...).
-            start: What the turn is given of the carried values, value name -> (B, ...).
-            turns: Number of the turn of each row, from 0, (B,) int64.
+            inputs: encoded inputs, value name -> (B, ...).
+            start: what the turn is given of the carried values, value name -> (B, ...).
+            turns: number of the turn of each row, from 0, (B,) int64.
 
         Returns:
             Every value after that turn.
@@ -301,7 +301,7 @@ def run_module(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) ->
 
 
 def _remedy_of_casting(error: Exception) -> str:
-    """Say what helps where a module mixes what a training casts to bfloat16 with what it leaves in float32."""
+    """Return the remedy where a module mixes what a training casts to bfloat16 with what it leaves in float32."""
     torch = require("torch", "build")
     cast = torch.is_autocast_enabled("cpu") or torch.is_autocast_enabled("cuda")
     about = any(word in message_of(error) for word in ("dtype", "autocast"))
@@ -312,9 +312,9 @@ def draw_noise(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.ran
     """Draw a batch of what a program draws.
 
     Args:
-        noise: Value name -> shape and distribution, as the program has them.
-        size: Of the batch.
-        random: Where it is drawn from.
+        noise: value name -> shape and distribution, as the program has them.
+        size: size of the batch.
+        random: generator of random numbers.
     """
     torch = require("torch", "build")
     batches = {name: {**wanted, "shape": (size, *wanted["shape"][1:])} for name, wanted in noise.items()}

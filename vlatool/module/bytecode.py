@@ -1,4 +1,4 @@
-"""A policy's own code is compiled from its source: bytecode in ``__pycache__`` is in no hash, and could do anything."""
+"""A policy's code is always compiled from source: bytecode in ``__pycache__`` is not hashed and could do anything."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlatool.user_code import trust
 
 VARIABLE = "PYTHONPYCACHEPREFIX"
 _folders: dict[str, bool] = {}
-"""Folder -> whether it was trusted before: then what it has links to is no more cached than what is in it."""
+"""Folder -> whether it was trusted before: then the targets of its links are not cached either."""
 _original_get_code = SourceFileLoader.get_code
 
 

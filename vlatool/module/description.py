@@ -40,18 +40,18 @@ class Description:
     """What ``policy.yaml`` says.
 
     Args:
-        folder: Where relative paths start.
+        folder: where relative paths start.
         factory: ``path.py:make`` or ``package.module:make``; empty for a policy that is an ONNX file.
-        arguments: Keyword arguments of the factory.
-        program: How the graphs are run.
+        arguments: keyword arguments of the factory.
+        program: how the graphs are run.
         environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation, and
             ``timeout``: seconds that a call of it may take.
-        parts: Part name -> globs of module names.
-        calibration, evaluation: Recorded observations, or None.
-        weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
+        parts: part name -> globs of module names.
+        calibration, evaluation: recorded observations, or None.
+        weights: glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
             module alone. Empty when the factory loads the weights.
         training: ``FILE.py:FUNCTION`` of the folder that yields batches of observations to train on; empty for none.
-        files: Globs of the files that the factory reads; None: every file of weights beside it.
+        files: globs of the files that the factory reads; None: every file of weights beside it.
     """
 
     folder: Path
@@ -171,7 +171,7 @@ def _check_code(file: Path, data: Mapping[str, Any]) -> None:
 
 
 def _check_timeout(file: Path, data: Mapping[str, Any]) -> None:
-    """Refuse what is no time that a call of the environment may take."""
+    """Refuse an invalid timeout for calls of the environment."""
     seconds = (data.get("environment") or {}).get("timeout", 1)
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= 1e6:
         raise SourceError(

@@ -104,9 +104,9 @@ def apply_bundle(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: b
     """Change what the factory made as a bundle says.
 
     Args:
-        modules: Graph name -> module, which is changed in place, or replaced where it must be traced.
-        bundle: With edits, weights, both or none.
-        weights: Whether its weights are loaded, too; without them, only the structure counts.
+        modules: graph name -> module, which is changed in place, or replaced where it must be traced.
+        bundle: bundle with edits, weights, both or neither.
+        weights: whether its weights are loaded, too; without them, only the structure counts.
 
     Raises:
         SourceError: when an edit or a tensor does not fit the module, or the factory gives one that was changed before.
@@ -131,9 +131,9 @@ def apply(
     """Keep what each edit says, in order.
 
     Args:
-        modules: Graph name -> module, changed in place, or replaced where it must be traced.
-        edits: Of any graphs.
-        bundle: Whose policy runs once where a module loses units, since it is traced then; no other edit needs it.
+        modules: graph name -> module, changed in place, or replaced where it must be traced.
+        edits: edits of any graphs.
+        bundle: bundle whose policy runs once for the trace where a module loses units; other edits do not need it.
 
     Raises:
         SourceError: when there is no such module, it has no such axis or fewer channels or blocks.
@@ -182,9 +182,9 @@ def refuse_traced(bundle: Bundle, what: str, command: str) -> None:
     """Refuse a policy that lost units: its parts are those of a trace, and not of the classes that it was made of.
 
     Args:
-        bundle: The policy.
-        what: Parts that would be looked for by their class.
-        command: That looks for them.
+        bundle: the policy.
+        what: parts that would be looked for by their class.
+        command: command that looks for them.
 
     Raises:
         RecipeError: naming the order that works.
@@ -226,7 +226,7 @@ def _keep_blocks(module: Any, edit: Edit) -> None:
     nn = require("torch", "build").nn
     if not isinstance(module, nn.ModuleList | nn.Sequential):
         kind = type(module).__name__
-        said = f"The blocks of '{edit.module}' ({kind}) cannot be chosen from: it is no nn.ModuleList or nn.Sequential."
+        said = f"The blocks of '{edit.module}' ({kind}) cannot be chosen: it is not an nn.ModuleList or nn.Sequential."
         raise SourceError(said, AGAIN)
     blocks = list(module._modules.items())
     if max(edit.keep) >= len(blocks):
@@ -286,9 +286,9 @@ def save_tensors(path: Path, tensors: Mapping[str, Any], about: Mapping[str, str
     """Write a safetensors file.
 
     Args:
-        path: A new file.
-        tensors: Name -> tensor.
-        about: Texts that go with them.
+        path: path of the new file.
+        tensors: name -> tensor.
+        about: texts that go with them.
 
     Raises:
         OSError: when it cannot be written; what there is of it stays.
@@ -309,10 +309,10 @@ def stream_tensors(
     """Write a safetensors file of tensors that come one after the other, so that one is in memory at a time.
 
     Args:
-        path: A new file.
-        forms: Name -> dtype and shape, in the order in which they come.
-        tensors: The tensors.
-        about: Texts that go with them.
+        path: path of the new file.
+        forms: name -> dtype and shape, in the order in which they come.
+        tensors: the tensors.
+        about: texts that go with them.
 
     Raises:
         OSError: when it cannot be written; what there is of it stays.

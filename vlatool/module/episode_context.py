@@ -1,4 +1,4 @@
-"""Recorded observations in torch, each with what a policy kept of those before it in its episode."""
+"""Recorded observations as torch tensors, each with the values that the policy kept of earlier ones in its episode."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Passage:
     """An observation, and those that lead to it.
 
     Args:
-        kept: What the policy kept before the first of them, as ``BatchedProgram`` takes it; nothing at the beginning.
-        inputs: Of each, as modules are given them: value name -> (1, ...). The last one counts.
+        kept: what the policy kept before the first of them, as ``BatchedProgram`` takes it; nothing at the beginning.
+        inputs: inputs of each, as modules are given them: value name -> (1, ...). The last one counts.
     """
 
     kept: Values
@@ -51,11 +51,11 @@ def passages(bundle: Bundle, program: BatchedProgram, noise: Values, count: int,
     begins is exact.
 
     Args:
-        bundle: Of the policy.
-        program: The policy as it is.
-        noise: What it draws, each time.
-        count: Of observations at most.
-        leading: Length of a passage at most; 1 for a policy that keeps nothing.
+        bundle: bundle of the policy.
+        program: the policy as it is.
+        noise: what it draws, each time.
+        count: count of observations at most.
+        leading: length of a passage at most; 1 for a policy that keeps nothing.
     """
     if not program.kept:
         return [Passage({}, (inputs,)) for inputs in recorded_inputs(bundle, count)]

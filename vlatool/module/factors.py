@@ -21,11 +21,11 @@ class Atom:
     """One place in an axis that a factor has, which is neither divided nor a concatenation.
 
     Args:
-        leaf: The factor.
-        path: Number of the factor in the axis; where that one is a concatenation, number of the segment and of the
+        leaf: the factor.
+        path: number of the factor in the axis; where that one is a concatenation, number of the segment and of the
             factor in it, and so on.
-        slower: Factors that it lies within, as the elements of a head lie within the heads.
-        is_fastest: Whether no factor lies within it.
+        slower: factors that it lies within, as the elements of a head lie within the heads.
+        is_fastest: whether no factor lies within it.
     """
 
     leaf: int
@@ -42,8 +42,8 @@ class Factors:
     occurs.
 
     Attributes:
-        sizes: Of each factor.
-        operator: What is being looked at; it is noted as a reason for what it freezes.
+        sizes: sizes of each factor.
+        operator: what is being looked at; it is noted as a reason for what it freezes.
     """
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class Factors:
         return tuple(found)
 
     def inside(self, leaf: int) -> tuple[Axis, ...]:
-        """Return the segments of a leaf; none for one that is no concatenation."""
+        """Return the segments of a leaf; none for one that is not a concatenation."""
         return self._segments.get(leaf, ())
 
     def segments(self, axis: Iterable[int]) -> list[Axis]:
@@ -103,8 +103,8 @@ class Factors:
         """Return for each element of an axis which element of a factor it belongs to; -1 for none.
 
         Args:
-            axis: Of so many elements.
-            path: Place of the factor.
+            axis: axis of so many elements.
+            path: place of the factor.
         """
         leaves = self.leaves(axis)
         leaf = leaves[path[0]]
@@ -120,8 +120,8 @@ class Factors:
         """Return the elements of an axis that stay.
 
         Args:
-            axis: Of so many elements.
-            keep: Factor -> its elements that stay; all of the others stay.
+            axis: axis of so many elements.
+            keep: factor -> its elements that stay; all of the others stay.
         """
         found = np.zeros(1, dtype=np.int64)
         for leaf in self.leaves(axis):
@@ -172,11 +172,11 @@ class Factors:
         """Return a part of size ``slow`` and the rest, which turns faster; frozen where an axis is divided otherwise.
 
         Raises:
-            ValueError: when its size is no multiple of that.
+            ValueError: when its size is not a multiple of that.
         """
         size, leaves = self.size(axis), list(self.leaves(axis))
         if size % slow:
-            raise ValueError(f"{size} elements are no multiple of {slow}")
+            raise ValueError(f"{size} elements are not a multiple of {slow}")
         first = self.take_front(leaves, slow)
         if first is not None:
             return first, tuple(leaves)

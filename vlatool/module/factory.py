@@ -1,4 +1,4 @@
-"""Import what ``path.py:make`` or ``package.module:make`` names."""
+"""Import of the function that ``path.py:make`` or ``package.module:make`` names."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from vlatool.module.bytecode import ignore_bytecode
 from vlatool.user_code.children import exit_error
 
 CORRECT_CODE = "correct what fails; VLATOOL_DEBUG=1 shows where it was raised"
-"""What is done about code of a user that raises, where no more is known of it."""
+"""Fix for code of a user that raises, where nothing more is known."""
 
 OWN_NAME = "vlatool_source_"
-"""How the names begin that files of a policy are imported under."""
+"""Prefix of the module names under which a policy's files are imported."""
 _END = object()
-"""What comes after the last value of an iterator."""
+"""Marks the end of an iterator."""
 
 
 def split_factory(factory: str) -> tuple[str, str]:
@@ -121,9 +121,9 @@ def iterate_function(function: str, folder: Path, arguments: dict[str, Any]) -> 
     """Import a function that yields, call it, and yield what it does.
 
     Args:
-        function: As a factory is named.
-        folder: Where its file lies.
-        arguments: Of the call.
+        function: name of the function, in the form of a factory.
+        folder: where its file lies.
+        arguments: arguments of the call.
 
     Raises:
         SourceError: when it raises, or gives nothing to go through.

@@ -28,9 +28,9 @@ class Cause:
     """A reason for which torch gives up.
 
     Args:
-        name: In words.
-        pattern: Found in ``TypeName: message`` of one of the chained errors, across its lines; None: not by its text.
-        remedy: What helps.
+        name: name in words.
+        pattern: found in ``TypeName: message`` of one of the chained errors, across its lines; None: not by its text.
+        remedy: what helps.
     """
 
     name: str
@@ -93,7 +93,7 @@ CAUSES = (
         "call the operator with explicit arguments, or write it with simpler operators",
     ),
     Cause(
-        "an output that is no tensor", r"translating node return",
+        "an output that is not a tensor", r"translating node return",
         "return a tensor, or a tuple of tensors in the order of 'gives'",
     ),
     Cause(
@@ -136,9 +136,9 @@ def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
     """Return the error for an export that failed.
 
     Args:
-        error: What ``torch.onnx.export`` raised.
-        graph: Name of the graph.
-        module: The torch module that was exported.
+        error: what ``torch.onnx.export`` raised.
+        graph: name of the graph.
+        module: the torch module that was exported.
     """
     chain = list(_chain(error))
     cause = _cause(chain, module)

@@ -1,4 +1,4 @@
-"""Run a policy's program without the bytes of its weights: what its graphs do, at any size, in little memory."""
+"""Run a policy's program on fake weights, without their memory, to see what its graphs do at any size."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class MetaModules:
     """A policy's modules with every parameter on torch's meta device, changed by the edits of its bundle.
 
     Args:
-        modules: Graph name -> module.
-        made: Graph name -> each parameter and buffer with the name that it had in what the factory made, one that is
+        modules: graph name -> module.
+        made: graph name -> each parameter and buffer with the name that it had in what the factory made, one that is
             shared with each of its names; empty where a module must be traced.
     """
 
@@ -129,7 +129,7 @@ def _parameters_on_meta(torch: Any) -> Iterator[None]:
 
 
 def _skip_drawing(torch: Any) -> Any:
-    """Return a context in which random numbers are not drawn into tensors on the meta device: there is no place."""
+    """Return a context in which random numbers are not drawn into tensors on the meta device, which have no storage."""
     from torch.overrides import TorchFunctionMode
 
     drawing = {torch.Tensor.normal_, torch.Tensor.uniform_, torch.Tensor.random_, torch.Tensor.exponential_}

@@ -1,4 +1,4 @@
-"""What each module of a policy is given, as an example."""
+"""Example inputs of each module of a policy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weights that a policy cuts or turns before it multiplies by them: done once at export."""
+"""Constant folding at export: splits and transposes of weights are computed once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def fold_weights(model: Any) -> int:
     the graph. A product whose weight is computed is not a layer to what quantizes or counts.
 
     Args:
-        model: An ``onnx_ir.Model`` whose weights are in memory.
+        model: an ``onnx_ir.Model`` whose weights are in memory.
     """
     ir = require("onnx_ir", "build")
     folded = 0

@@ -1,4 +1,4 @@
-"""Which files of a policy's folder its code imports, as its import statements say."""
+"""Files of a policy's folder that its code imports, according to its import statements."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def imported_files(roots: Iterable[Path], folder: Path) -> set[Path]:
     ``spec_from_file_location(..., HERE / "name.py")``, every Python file of the folder counts.
 
     Args:
-        roots: Files of code in the folder.
-        folder: Where imports begin; packages below it are followed.
+        roots: files of code in the folder.
+        folder: where imports begin; packages below it are followed.
     """
     files: set[Path] = set()
     waiting = [root for root in roots if root.is_file()]

@@ -1,6 +1,6 @@
 """What a module remembers from call to call, and whether its outputs depend on it: an exported graph remembers nothing.
 
-A buffer that ``forward()`` changes is found in what torch.export traced (``changed_buffers``). Attributes that are no
+A buffer that ``forward()`` changes is found in what torch.export traced (``changed_buffers``). Attributes that are not
 buffers (a counter, a list of past observations) leave no trace there: they are found by running the module, and by
 putting other values into those that changed.
 """
@@ -43,8 +43,8 @@ def refuse_hidden_state(bundle: Bundle, modules: Mapping[str, nn.Module]) -> Non
     observations learns nothing of it.
 
     Args:
-        bundle: Of the policy.
-        modules: Graph name -> module.
+        bundle: bundle of the policy.
+        modules: graph name -> module.
 
     Raises:
         SourceError: naming the attribute.
@@ -64,9 +64,9 @@ def refuse_kept_values(module: nn.Module, step: ProgramStep, feeds: Sequence[Map
     """Run a module on different inputs and see whether it changes an attribute that its outputs depend on.
 
     Args:
-        module: A module of a policy.
-        step: What it is fed and gives.
-        feeds: Two inputs or more, arrays by name; of one alone nothing is learnt.
+        module: a module of a policy.
+        step: what it is fed and gives.
+        feeds: two inputs or more, arrays by name; of one alone nothing is learnt.
 
     Raises:
         SourceError: naming the attribute.
@@ -98,7 +98,7 @@ def _attributes(module: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value that can be compared later, None for what is no number, text or tensor, or a container of them."""
+    """Return a value that can be compared later, None unless it consists of numbers, texts and tensors."""
     torch = require("torch", "build")
     if isinstance(value, torch.Tensor):
         return value.detach().clone()

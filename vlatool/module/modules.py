@@ -1,4 +1,4 @@
-"""What a factory gave, as torch modules in evaluation mode."""
+"""The product of a factory as torch modules in evaluation mode."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
     """Return the modules that a program runs: graph name -> torch module in evaluation mode.
 
     Args:
-        product: A module, a program of ``torch.export``, or a mapping of graph names to them.
-        graphs: Names of the program's graphs.
+        product: a module, a program of ``torch.export``, or a mapping of graph names to them.
+        graphs: names of the program's graphs.
 
     Raises:
         SourceError: when one is missing or is something else.

@@ -25,13 +25,13 @@ class Origin:
     """Where a policy's modules come from.
 
     Args:
-        folder: The policy's folder, which the user named or trusted.
+        folder: the policy's folder, which the user named or trusted.
         factory: ``path.py:make`` or ``package.module:make``.
-        arguments: Of the factory.
-        weights: Glob of the shards that vlatool loads; empty when the factory does.
-        code: File beside the factory -> its SHA-256 when the source bundle was made.
+        arguments: arguments of the factory.
+        weights: glob of the shards that vlatool loads; empty when the factory does.
+        code: file beside the factory -> its SHA-256 when the source bundle was made.
         environment: ``make`` and ``tasks`` of the environment that the policy's description names.
-        program: How the description lets its graphs run.
+        program: how the description lets its graphs run.
         training: ``FILE.py:FUNCTION`` that yields batches to train on, as the description has it; empty for none.
     """
 

@@ -1,4 +1,4 @@
-"""Modules whose weights stay in the policy's shards, whatever blocks are gone: where each is, and how to run with it.
+"""Modules whose weights stay in the policy's shards even after blocks are removed: their location, and how to run them.
 
 The shards are named after what the factory makes. An edit that keeps blocks moves modules and makes no tensor, so each
 tensor of the edited module is found under the name that it had before.
@@ -34,8 +34,8 @@ class StoredModules:
     """Modules without weights, and where these are.
 
     Args:
-        modules: Graph name -> module, parameters on torch's meta device.
-        locations: Where each parameter and saved buffer is.
+        modules: graph name -> module, parameters on torch's meta device.
+        locations: where each parameter and saved buffer is.
     """
 
     modules: dict[str, nn.Module]
@@ -160,7 +160,7 @@ def _read(values: Iterable[tuple[Tensor, StoredTensor]]) -> dict[int, tuple[Tens
 
 
 def _replace(stored: StoredModules, graphs: Iterable[str], weights: Mapping[int, tuple[Tensor, Tensor]]) -> None:
-    """Put other weights in the place of those that are named by ``id``, in every module that holds them."""
+    """Replace the weights that are identified by ``id`` in every module that has them."""
     for graph in graphs:
         for part in stored.modules[graph].modules():
             for name, value in list(part._parameters.items()):

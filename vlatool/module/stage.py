@@ -45,13 +45,13 @@ class ModuleChanges:
     """What a stage did to modules, beside the weights that it changed in place.
 
     Args:
-        edits: What is kept of the structure; the caller cuts the modules.
-        training: How they were trained, as JSON values: ``losses`` of the steps, ``rounds`` of data; None when not.
-        program: How the graphs run from now on; as before when None.
-        played: Observations that they were trained on, for the ranges of activations, name -> (N, ...); none when None.
-        options: What the stage found out on this machine, under names of options of its own, so that it is made again
+        edits: what is kept of the structure; the caller cuts the modules.
+        training: how they were trained, as JSON values: ``losses`` of the steps, ``rounds`` of data; None when not.
+        program: how the graphs run from now on; as before when None.
+        played: observations that they were trained on, for the ranges of activations, name -> (N, ...); none when None.
+        options: what the stage found out on this machine, under names of options of its own, so that it is made again
             in the same way wherever that is done.
-        record: What it came to, for the record of the bundle, as JSON values.
+        record: what it came to, for the record of the bundle, as JSON values.
     """
 
     edits: tuple[Edit, ...] = ()
@@ -88,9 +88,9 @@ class ModuleStage(Transform):
         """Change weights in place, and return what else is to be changed.
 
         Args:
-            modules: Graph name -> module, as the source has it.
-            source: For recordings.
-            context: For progress.
+            modules: graph name -> module, as the source has it.
+            source: bundle with the recordings.
+            context: context of the run, for progress.
         """
         raise NotImplementedError(self.name())
 
@@ -217,14 +217,14 @@ def write_modules(
     """Write a source bundle with other modules.
 
     Args:
-        source: What it is made from.
-        out: An empty directory.
-        edits: All edits since the factory.
-        modules: Graph name -> module after the edits; none where the weights are those of the policy's shards.
-        made_by: Stage, options and versions.
-        training: How they were trained, if they were.
-        program: How they run; as in the source when None.
-        played: Observations that they were trained on, which the bundle keeps.
+        source: what it is made from.
+        out: an empty directory.
+        edits: all edits since the factory.
+        modules: graph name -> module after the edits; none where the weights are those of the policy's shards.
+        made_by: stage, options and versions.
+        training: how they were trained, if they were.
+        program: how they run; as in the source when None.
+        played: observations that they were trained on, which the bundle keeps.
     """
     write_module(out, edits, modules)
     if training is not None:

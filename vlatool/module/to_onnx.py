@@ -40,8 +40,8 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     """Export a module with torch's dynamo exporter; return its ``ONNXProgram``.
 
     Args:
-        arguments: One tensor for each feed of the step, real or fake.
-        options: For ``torch.onnx.export``.
+        arguments: one tensor for each feed of the step, real or fake.
+        options: options of ``torch.onnx.export``.
 
     Raises:
         GraphError: when torch cannot, or the graph would draw random numbers.

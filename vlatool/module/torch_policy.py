@@ -73,8 +73,8 @@ def torch_policy(source: Bundle, seed: int | None = None) -> Policy:
     """Open a source bundle in eager torch behind the interface of the runtime's policy.
 
     Args:
-        source: Of a torch policy.
-        seed: Of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
+        source: source of a torch policy.
+        seed: seed of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
     """
     return policy_of(source, load_modules(source), seed)
 
@@ -89,8 +89,8 @@ class TorchSession:
     """One torch module behind the session interface; remembers the feeds of its first run and of the last two.
 
     Args:
-        module: The module; takes the feeds positionally in the order of ``step.feeds``.
-        step: The program step that runs it.
+        module: the module; takes the feeds positionally in the order of ``step.feeds``.
+        step: the program step that runs it.
     """
 
     def __init__(self, module: nn.Module, step: ProgramStep) -> None:

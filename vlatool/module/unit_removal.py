@@ -1,4 +1,4 @@
-"""A module with fewer heads, neurons and channels: traced, its weights cut, and the sizes in its reshapes with them."""
+"""Removal of heads, neurons and channels from a traced module: its weights, and the sizes in its reshapes, are cut."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def trace_module(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
     """Trace a module with torch.export.
 
     Args:
-        module: Whose forward takes the feeds.
-        feeds: Tensors, the batch in front: free where it is larger than 1, and the module allows that.
+        module: module whose ``forward`` takes the feeds.
+        feeds: tensors, the batch in front: free where it is larger than 1, and the module allows that.
 
     Raises:
         SourceError: when torch.export cannot trace it.
@@ -65,9 +65,9 @@ def remove_units(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edi
     """Return a module without the elements that edits do not keep.
 
     Args:
-        module: As the factory, and the edits before these, made it.
-        feeds: Example inputs, a batch of 1.
-        edits: Each names a weight, and ``units AXIS.PLACE``: which factor of which of its axes; in a concatenation,
+        module: module after the factory and the edits before these.
+        feeds: example inputs, a batch of 1.
+        edits: edits of weights, each with ``units AXIS.PLACE``: which factor of which of its axes; in a concatenation,
             ``.SEGMENT.PLACE`` follows.
 
     Raises:

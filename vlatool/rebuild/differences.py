@@ -24,10 +24,10 @@ class FileMatch:
     """One file of a bundle beside the same file of another.
 
     Args:
-        file: Path inside the bundles.
-        bytes: Size in the first bundle; in the second where the first lacks the file.
-        identical: Whether every byte is the same (of the manifest: every field that is compared).
-        why: How the files differ, a sentence part; empty when they are identical.
+        file: path inside the bundles.
+        bytes: size in the first bundle; in the second where the first lacks the file.
+        identical: whether every byte is the same (of the manifest: every field that is compared).
+        why: how the files differ, a sentence part; empty when they are identical.
     """
 
     file: str
@@ -40,9 +40,9 @@ def compare_bundles(first: Bundle, second: Bundle, leave_out: Iterable[str] = ()
     """Compare every file that one of the manifests records, then the manifests themselves.
 
     Args:
-        first: The bundle that is checked; sentences call it ``recorded``.
-        second: The bundle that was made again; sentences call it ``rebuilt``.
-        leave_out: Top-level fields of the manifest that are not compared.
+        first: bundle that is checked; sentences call it ``recorded``.
+        second: bundle that was made again; sentences call it ``rebuilt``.
+        leave_out: top-level fields of the manifest that are not compared.
 
     Returns:
         One entry for each file, sorted by name, the manifest last.

@@ -40,12 +40,12 @@ class Rebuilt:
     """What came of making a bundle again.
 
     Args:
-        bundle: The bundle that was checked.
+        bundle: the bundle that was checked.
         hash: ``sha256:...`` of the bundle that was made again.
-        source: What it was made from.
-        files: Every hashed file and the manifest, compared byte by byte.
-        stages: Each stage that ran, in order, and whether its graphs are the recorded ones.
-        left_out: Fields of the manifest that were not compared, because they were measured.
+        source: what it was made from.
+        files: every hashed file and the manifest, compared byte by byte.
+        stages: each stage that ran, in order, and whether its graphs are the recorded ones.
+        left_out: fields of the manifest that were not compared, because they were measured.
     """
 
     bundle: Bundle
@@ -178,14 +178,14 @@ def rebuild(
     """Run the recorded stages again in a fresh directory and compare what they make with the bundle.
 
     Args:
-        bundle: The bundle to make again; verified.
-        context: For progress.
-        source: Policy directory, ``path.py:make``, ONNX file, or a bundle that is the input of a recorded stage; where
+        bundle: the bundle to make again; verified.
+        context: context of the run, for progress.
+        source: policy directory, ``path.py:make``, ONNX file, or a bundle that is the input of a recorded stage; where
             the policy was when the bundle was made, if not given.
-        files: Files that options name and that are not beside the source.
-        cache: Where to look for the place of the source; no output of a stage is taken from it.
-        out: Where to write the bundle that was made again.
-        force: Replace ``out``.
+        files: files that options name and that are not beside the source.
+        cache: where to look for the place of the source; no output of a stage is taken from it.
+        out: where to write the bundle that was made again.
+        force: whether to replace ``out``.
 
     Raises:
         SourceError: when the source is not found, or a file of it is not the recorded one.

@@ -77,7 +77,7 @@ class Line:
                 try:
                     message: dict[str, Any] = json.loads(line)
                 except ValueError as error:
-                    raise Refused("corrupt", "a line that is no message") from error
+                    raise Refused("corrupt", "a line that is not a message") from error
                 return message
 
     def listen(self) -> None:

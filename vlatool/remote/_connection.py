@@ -76,9 +76,9 @@ class Connection:
     """One ``ssh TARGET sh``: messages there as lines of JSON and bytes, messages back as marked lines of JSON.
 
     Args:
-        target: As ``ssh`` takes it.
-        options: Of ssh, before vlatool's own.
-        connect_timeout_s: For ssh to connect.
+        target: target, as ``ssh`` takes it.
+        options: options of ssh, before vlatool's own.
+        connect_timeout_s: seconds for ssh to connect.
 
     Raises:
         MissingExtra: when there is no ssh.
@@ -174,7 +174,7 @@ class Connection:
                 raise TargetError(f"{self._target} said nothing for {timeout_s:g} s {self.doing}.", self._try())
 
     def end_error(self) -> TargetError:
-        """Return the error for a connection that is no more: what ssh said, and what it means."""
+        """Return the error of a connection that has ended: what ssh reported, and what that means."""
         code = self.close()
         text = printable(self._said.decode("utf-8", "replace"))
         last = one_line(next((line for line in reversed(text.splitlines()) if line.strip()), f"exit code {code}"))

@@ -1,4 +1,4 @@
-"""Which Python of the target can measure: asked through ``sh``, without a trace on the target."""
+"""Find a Python on the target that can measure, through ``sh``, without leaving files there."""
 
 from __future__ import annotations
 
@@ -113,11 +113,11 @@ def refusal(
     """Return the error for a target none of whose Pythons can measure.
 
     Args:
-        target: As ``ssh`` takes it.
-        python: The one that the user named, or empty.
-        pythons: Those that answered.
-        codes: With what those ended that broke.
-        packages: What must be importable.
+        target: target, as ``ssh`` takes it.
+        python: the one that the user named, or empty.
+        pythons: Pythons that answered.
+        codes: exit codes of those that failed.
+        packages: what must be importable.
     """
     new = [other for other in pythons if other.version[:2] >= OLDEST]
     if new:

@@ -1,4 +1,4 @@
-"""What goes to the target: vlatool's own files and what the manifests name, as a stream of small tars."""
+"""Upload to the target: vlatool's own files and those of the manifests, as a stream of small tar archives."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Item:
     """One file to push.
 
     Args:
-        name: Relative path on the target.
-        size: In bytes.
-        path: The local file; None when ``content`` is it.
-        content: The content of a file that is not read from ``path``.
-        sha256: What the content must hash to; not checked when empty.
+        name: relative path on the target.
+        size: size in bytes.
+        path: the local file; None when ``content`` is it.
+        content: the content of a file that is not read from ``path``.
+        sha256: what the content must hash to; not checked when empty.
     """
 
     name: str
@@ -66,8 +66,8 @@ class Payload:
     """All that is pushed for one run.
 
     Args:
-        items: The files.
-        bundles: For each bundle in order, its directory on the target.
+        items: the files.
+        bundles: directory of each bundle on the target, in order.
     """
 
     items: tuple[Item, ...]

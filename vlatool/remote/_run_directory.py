@@ -1,4 +1,4 @@
-"""A private directory on the target for one run, which is gone afterwards: part of what ``_bootstrap`` does there."""
+"""A private directory on the target for one run, which is removed afterwards: used by ``_bootstrap`` there."""
 
 from __future__ import annotations
 

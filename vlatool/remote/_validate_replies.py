@@ -1,4 +1,4 @@
-"""What a target says is checked before it is used (types, depth, numbers), and is printable from there on."""
+"""Validation of replies from a target (types, depth, numbers) before they are used; their text becomes printable."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlatool.files.printable import one_line, printable
 T = TypeVar("T")
 MAX_DEPTH = 32
 MAX_NUMBER = 1e18
-"""Largest number that a measurement can be; bytes and nanoseconds of a day are far below."""
+"""Largest plausible number in a measurement; bytes and nanoseconds of a day are far below it."""
 MAX_PACKAGES = 64
 
 
@@ -24,13 +24,13 @@ class Python:
     """What a Python of the target says of itself.
 
     Args:
-        command: As ``sh`` there finds it.
-        version: Major, minor, micro.
-        packages: Name -> version, of those asked for that it can import.
-        errors: Name -> why it cannot.
-        architecture, kernel: Of the machine.
-        free: Bytes where its cache directory is; None when it cannot tell.
-        managed: Whether it is one that pip must not change (PEP 668).
+        command: command, as ``sh`` on the target finds it.
+        version: major, minor, micro.
+        packages: name -> version, of those asked for that it can import.
+        errors: name -> why it cannot.
+        architecture, kernel: architecture and kernel of the machine.
+        free: bytes where its cache directory is; None when it cannot tell.
+        managed: whether it is one that pip must not change (PEP 668).
     """
 
     command: str
@@ -64,7 +64,7 @@ def parse_message(text: bytes | str, target: str) -> dict[str, Any]:
     """Return a message of the target.
 
     Raises:
-        TargetError: when it is no mapping of plain values with finite numbers.
+        TargetError: when it is not a mapping of plain values with finite numbers.
     """
     try:
         message = json.loads(text, parse_constant=_refuse_constant)
@@ -96,7 +96,7 @@ def sane(value: Any, target: str, depth: int = 0) -> Any:
 
 
 def read_reply(kind: type[T], value: Any, target: str, where: str) -> T:
-    """Return what the target says, as an object of a type.
+    """Return a reply of the target as an object of a type.
 
     Raises:
         TargetError: when it is not of that type.
@@ -129,9 +129,9 @@ def _on_one_line(texts: Mapping[str, str]) -> dict[str, str]:
 
 
 def invalid_reply(target: str, what: str) -> TargetError:
-    """Return the error for a target that does not say what vlatool's own program there would."""
+    """Return the error for a reply that vlatool's program on the target would not send."""
     return TargetError(
-        f"What {target} answered makes no sense: {what}.",
+        f"Invalid reply from {target}: {what}.",
         "look at that machine: what its login shell prints and runs, and whether it is the one that you mean",
     )
 

@@ -59,13 +59,13 @@ def measure_on(
 
     Args:
         target: ``user@host`` or a Host of ``~/.ssh/config``, as ``ssh`` takes it.
-        job: What the agent does, as JSON values; its ``bundles`` are replaced by those on the target.
+        job: what the agent does, as JSON values; its ``bundles`` are replaced by those on the target.
         bundles: Bundle directories, in the order of the job.
-        tell: Called with what is being done and the share that is done (0-1, or None when it is not known).
+        tell: function called with what is being done and the share that is done (0-1, or None when it is not known).
         python: Python to use on the target; ``~/`` is the home directory there. When empty, the first of python3 and
             python3.13 to python3.10 that is new enough and imports numpy and the engine.
-        ssh_options: For ssh, before vlatool's own.
-        connect_timeout_s: For ssh to connect.
+        ssh_options: options of ssh, before vlatool's own.
+        connect_timeout_s: seconds for ssh to connect.
 
     Returns:
         The agent's result, ``target``: python, architecture, kernel and packages there; no host, user or address; and
@@ -186,9 +186,9 @@ def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell:
     """Pass on what the agent tells until it has ended, and return its result.
 
     Args:
-        connection, target: To whom.
-        paths: Directory there -> the bundle's directory here, which messages name in its place.
-        tell: For progress.
+        connection, target: connection, and name of the target.
+        paths: directory there -> the bundle's directory here, which messages name in its place.
+        tell: callback for progress.
     """
     answer: Result | Raised | None = None
     while True:

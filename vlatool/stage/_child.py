@@ -1,4 +1,4 @@
-"""A stage in a child process: both sides of the call.
+"""Stages in child processes: both sides of the call.
 
 It runs a user's code, needs an environment of its own, or lets an engine open graphs that may end the process.
 """

@@ -38,7 +38,7 @@ RECORD_VERSION = 2
 
 
 def _silent(_what: str, _share: float | None) -> None:
-    """Report nothing."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
@@ -148,10 +148,10 @@ class Stage(Numeric):
         return self.model_dump(mode="json", exclude_unset=True)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Raise a user error when this stage cannot run on that source; cheap."""
+        """Raise a user error when this stage cannot run on that source; a cheap check."""
 
     def named(self) -> Self:
-        """Allow the code of policies that the options name to run: the user typed them. Not of a file's options."""
+        """Allow the code of policies that the options name to run: the user typed them (not for options in a file)."""
         return self
 
     def inputs(self) -> tuple[Path, ...]:
@@ -218,15 +218,15 @@ class Transform(Stage):
         return ()
 
     def summary(self, bundle: Bundle) -> tuple[str, ...]:
-        """Return what is worth telling of the new bundle even where other stages follow at once."""
+        """Return a summary of the new bundle, which is printed even where other stages follow."""
         return ()
 
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Return what else a person wants to know about the new bundle, a sentence for each line."""
+        """Return further sentences on the new bundle, one for each line."""
         return ()
 
     def accept(self, bundle: Bundle) -> None:
-        """Raise when what was made is not what was asked for: its output does not appear then."""
+        """Raise when the result does not meet the request; its output is then discarded."""
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the new bundle into the empty directory ``out`` and return it."""
@@ -245,8 +245,8 @@ class Transform(Stage):
         """Return the ``made_by`` entry of the manifest.
 
         Args:
-            seed: Seed of what the stage draws itself; ``finish`` notes the seed of noise and golden inputs otherwise.
-            calibration: The samples that the stage calibrated on, after the last one was used.
+            seed: seed of what the stage draws itself; ``finish`` notes the seed of noise and golden inputs otherwise.
+            calibration: the samples that the stage calibrated on, after the last one was used.
 
         Returns:
             ``vlatool``, ``stage``, ``options`` that differ from their defaults, ``versions``, and where there are any

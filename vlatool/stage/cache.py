@@ -1,4 +1,4 @@
-"""What the cache holds, how large it is, and how it is made smaller.
+"""The content and size of the cache, and how it is pruned.
 
 Only what is recognisably vlatool's own is counted as an entry and ever removed: a finished stage by its name and the
 list of its files, so what another machine sent, unfinished work by its lock, a count by its content, a shared
@@ -53,11 +53,11 @@ class Entry:
     """One thing that the cache keeps.
 
     Args:
-        name: Below the cache.
-        what: The stage's name; ``unfinished work``, ``count of a policy`` or ``files of another machine`` where it is
+        name: below the cache.
+        what: the stage's name; ``unfinished work``, ``count of a policy`` or ``files of another machine`` where it is
             not a stage.
-        used: When it was last made or used, in seconds since 1970.
-        files: Relative name -> inode and bytes of the files that vlatool wrote.
+        used: when it was last made or used, in seconds since 1970.
+        files: relative name -> inode and bytes of the files that vlatool wrote.
     """
 
     name: str
@@ -71,10 +71,10 @@ class Contents:
     """What a cache holds.
 
     Args:
-        cache: Where it is.
-        entries: The least recently used one first.
-        kept: Shared files: name below the cache -> inode and bytes.
-        unknown: Names below the cache of what vlatool did not write, as far as it is beside entries.
+        cache: where it is.
+        entries: the least recently used one first.
+        kept: shared files: name below the cache -> inode and bytes.
+        unknown: names below the cache of what vlatool did not write, as far as it is beside entries.
     """
 
     cache: Path
@@ -164,10 +164,10 @@ def prune(
     """Remove entries, the least recently used first, and then the recordings that no entry holds any more.
 
     Args:
-        cache: The cache.
-        older_than_s: Remove what was not used for this many seconds; 0 for everything.
-        most_bytes: Remove until no more than that is left.
-        dry_run: Only say what would be removed.
+        cache: the cache.
+        older_than_s: age in seconds, since the last use, from which entries are removed; 0 for everything.
+        most_bytes: size that the rest may have.
+        dry_run: whether only to report what would be removed.
     """
     held = contents(cache)
     uses = Counter(held.uses)

@@ -1,4 +1,4 @@
-"""The last steps of every stage that makes a bundle: carry over what stays, golden inputs and outputs, hashes."""
+"""The last steps of every stage that writes a bundle: copied folders, golden inputs and outputs, hashes."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ class Golden:
     """What the golden file was written from.
 
     Args:
-        samples: Observations with the noise of each.
-        expected: What the graphs say.
-        difference: Largest relative L2 difference of the engine's actions from those of the graphs, as they give them.
-        of_chunk: The same of the chunks in physical units.
+        samples: observations with the noise of each.
+        expected: what the graphs say.
+        difference: largest relative L2 difference of the engine's actions from those of the graphs, as they give them.
+        of_chunk: the same of the chunks in physical units.
     """
 
     samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]
@@ -89,9 +89,9 @@ class Difference:
     """How far the actions that an engine gives are from those of the graphs that a bundle was made from.
 
     Args:
-        mean, worst: Of the relative L2 differences of an output; the share of actions that are others, if discrete.
-        samples: Observations.
-        recorded: Whether they were recorded.
+        mean, worst: mean and maximum of the relative L2 differences of an output; the share of others if discrete.
+        samples: observations.
+        recorded: whether they were recorded.
     """
 
     mean: float
@@ -125,13 +125,13 @@ def finish(
     """Write golden file and manifest of a bundle whose graphs and carried folders are in ``out`` already.
 
     Args:
-        source: What the bundle was made from.
-        made_by: Stage, options and versions.
-        graphs: Graph name -> graph.
-        observations: Raw observations; the first two become golden. On ``MAX_COMPARED`` of them the bundle is compared
+        source: what the bundle was made from.
+        made_by: stage, options and versions.
+        graphs: graph name -> graph.
+        observations: raw observations; the first two become golden. On ``MAX_COMPARED`` of them the bundle is compared
             with the source, where that has graphs.
-        changes: Other fields of the manifest that the stage changes, such as program and engine.
-        recorded: Whether the observations were recorded.
+        changes: other fields of the manifest that the stage changes, such as program and engine.
+        recorded: whether the observations were recorded.
 
     Raises:
         GraphError: when the engine refuses a graph or gives an action that is not finite.
@@ -162,7 +162,7 @@ def finish(
 def _tolerance(seen: float, bundle: Bundle, redrawn: bool) -> float:
     """Return what a machine may differ where the engine was seen to differ so much, in three decimals; at most 1.
 
-    What differs in rounding here may do so twice as much elsewhere; a larger difference is no rounding, or one that is
+    What differs in rounding here may do so twice as much elsewhere; a larger difference is not rounding, or one that is
     drawn again on each machine.
     """
     computed = {name for graph in bundle.manifest.graphs.values() for name in graph.precision}
@@ -175,8 +175,8 @@ class _EngineCheck:
     """What the engine of a bundle gives for observations, beside what the graphs say that it was made from.
 
     Args:
-        source, bundle: Both with graphs.
-        observations: Raw ones, at least one.
+        source, bundle: both with graphs.
+        observations: raw ones, at least one.
     """
 
     def __init__(self, source: Bundle, bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> None:
@@ -307,9 +307,9 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     second. The chunk is the action in physical units: it shows other statistics, too.
 
     Args:
-        draft: The bundle as written so far; its graphs are what runs.
-        observations: Raw observations without the batch axis.
-        out: The bundle's directory.
+        draft: the bundle as written so far; its graphs are what runs.
+        observations: raw observations without the batch axis.
+        out: the bundle's directory.
     """
     samples = _samples(draft.manifest, observations, GOLDEN_COUNT)
     name = draft.manifest.spec.action.name

@@ -31,8 +31,8 @@ def count_shares(path: Path, context: Context) -> dict[str, float]:
     that shows is noted in its file, for all who count it later. What nobody knows after that is said.
 
     Args:
-        path: Written by a stage that runs where its engine may crash; no other name of the file is in use.
-        context: Gets the sentence.
+        path: written by a stage that runs where its engine may crash; no other name of the file is in use.
+        context: context that receives the sentence.
     """
     shares, unknown = shares_and_unknown(path)
     seen = _run(path) if unknown else {}

@@ -17,7 +17,7 @@ def int8_arithmetic(engine: str = "") -> str:
     """Return what ``Engine.arithmetic`` of an engine gives, asked once in a process.
 
     Args:
-        engine: Its name; the default engine when empty.
+        engine: its name; the default engine when empty.
 
     Raises:
         VlatoolError: what it raises; GraphError when the engine ends the child, or hangs.

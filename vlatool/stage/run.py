@@ -1,4 +1,4 @@
-"""Run one stage somewhere: input directory, stage, output directory."""
+"""Run a stage: input directory, stage, output directory."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def run_transform(
     A stage that runs a user's code, or a graph that nobody has run yet, does so in a child process.
 
     Args:
-        stage: What runs.
-        source: Its input; None for a stage that starts a chain.
-        out: The new bundle.
-        context: For progress.
-        force: Replace a directory that vlatool wrote.
-        damaged: See ``vlatool.files.directory_writer.write_directory``.
-        reports: Directory of reports of a stage before it, which come along where this one writes none.
+        stage: what runs.
+        source: its input; None for a stage that starts a chain.
+        out: the new bundle.
+        context: context of the run, for progress.
+        force: whether to replace a directory that vlatool wrote.
+        damaged: see ``vlatool.files.directory_writer.write_directory``.
+        reports: directory of reports of a stage before it, which come along where this one writes none.
 
     Raises:
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.

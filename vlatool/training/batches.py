@@ -1,4 +1,4 @@
-"""Which rows a step learns from, and which of them this process takes."""
+"""The batches of a training step, and the share of this process."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Batches:
     """Draws the rows of a step: the same batch, however many processes share it and in however many parts.
 
     Args:
-        loss: Rows, name -> (B, ...) -> the mean of their losses.
-        frames: All rows.
-        size: Rows of a batch.
-        accumulate: Parts that a process computes one after the other.
-        group: Which process this is.
+        loss: rows, name -> (B, ...) -> the mean of their losses.
+        frames: all rows.
+        size: rows of a batch.
+        accumulate: parts that a process computes one after the other.
+        group: group of processes, and this one's rank.
     """
 
     def __init__(
@@ -62,11 +62,11 @@ def mean_loss(frames: Frames, indices: NDArray[Any], loss: Loss, rows: int, devi
     """Return the mean loss of rows, without gradients.
 
     Args:
-        frames: Where they are.
-        indices: Of them, as ``Frames.sample`` gives.
-        loss: Of a batch.
-        rows: At a time.
-        device: As in training.
+        frames: where they are.
+        indices: indices of them, as ``Frames.sample`` gives.
+        loss: loss of a batch.
+        rows: number of rows at a time.
+        device: device of the training.
     """
     total, count = 0.0, frames.row_count(indices)
     with require("torch", "build").no_grad(), device.computing(), device.casting():
@@ -79,10 +79,10 @@ def draw_of(taught: Batches, alpha: float, loss: Loss | None, shown: Frames) -> 
     """Return what draws the batches of a training; the teacher's are the same whether there is an expert or not.
 
     Args:
-        taught: Of what the teacher labelled.
-        alpha: Share of the teacher in the loss.
-        loss: Against an expert's actions; None where no expert is asked.
-        shown: Rows with what the expert did.
+        taught: taught of what the teacher labelled.
+        alpha: share of the teacher in the loss.
+        loss: loss against an expert's actions; None without an expert.
+        shown: rows with what the expert did.
     """
     if loss is None:
         return taught

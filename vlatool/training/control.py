@@ -1,4 +1,4 @@
-"""A control of a training: labels that look like a teacher's, and say nothing of what they stand beside."""
+"""A control experiment: labels that are distributed like a teacher's, but belong to other observations."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def exchange_labels(frames: Path, labels: Sequence[str], seed: Sequence[int]) ->
     Inputs and noise stay where they are, and the labels have the distribution that they had.
 
     Args:
-        frames: Folder of the round, labelled.
-        labels: Names of what the teacher said.
-        seed: Of the exchange.
+        frames: folder of the round, labelled.
+        labels: names of what the teacher said.
+        seed: seed of the exchange.
 
     Raises:
         DataError: when there is no other row.

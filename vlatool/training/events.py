@@ -13,8 +13,8 @@ class Events:
     """Writes scalars into a folder; does nothing without one.
 
     Args:
-        folder: Where the events are; empty for none.
-        step: From which on they are written; what an earlier run wrote of later steps does not count any more.
+        folder: where the events are; empty for none.
+        step: step from which events are written; what an earlier run wrote for later steps is discarded.
 
     Raises:
         MissingExtra: when tensorboard is not installed.

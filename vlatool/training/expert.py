@@ -1,4 +1,4 @@
-"""What an expert did, where that was recorded: a second term of the loss, with rows of its own."""
+"""Recorded actions of an expert: a second term of the loss, with its own rows."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Expert:
     """Recorded observations with the expert's actions, encoded, in a folder of their own.
 
     Args:
-        folder: Folder of the training, or of what it holds out.
-        frames: Folder -> the rounds in it, as the lesson takes them.
+        folder: folder of the training, or of what it holds out.
+        frames: folder -> the rounds in it, as the objective takes them.
     """
 
     def __init__(self, folder: Path, frames: Callable[[Path], Frames] = Frames) -> None:
@@ -51,14 +51,14 @@ class Expert:
         """Choose observations, and write them with the expert's actions unless an earlier run did.
 
         Args:
-            recording: Recorded observations to choose from.
-            source: The student's bundle.
-            share: Of them, at least one.
-            seed: Of the choice; a smaller share is a part of a larger one.
-            encode: Observation -> what the policy takes.
+            recording: recorded observations to choose from.
+            source: the student's bundle.
+            share: share of them, at least one.
+            seed: seed of the choice; a smaller share is a part of a larger one.
+            encode: observation -> what the policy takes.
 
         Raises:
-            DataError: when there are no actions of an expert.
+            DataError: when an expert's actions are missing.
         """
         if not isinstance(recording, Recording) or recording.actions is None:
             where = recording.path if isinstance(recording, Recording) else source.path
@@ -95,9 +95,9 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
     """Return so many recorded observations of a bundle, spread over its recording; None when it has none.
 
     Args:
-        source: The bundle.
-        most: Observations.
-        whole: Whether these are whole episodes.
+        source: the bundle.
+        most: observations.
+        whole: whether these are whole episodes.
 
     Raises:
         DataError: as ``episode_begins`` does, where they are.
@@ -142,9 +142,9 @@ def expert_loss(
     Continuous ones: ``distance``, over the leading steps that were recorded.
 
     Args:
-        modules: The student's.
-        source: Its bundle.
-        distance: Student's and expert's actions, (B, T, A) each -> the mean over them.
+        modules: the student's.
+        source: its bundle.
+        distance: student's and expert's actions, (B, T, A) each -> the mean over them.
     """
     action = source.manifest.spec.action
     student = BatchedProgram(source.manifest.program, modules)

@@ -31,10 +31,10 @@ class Product:
     """How a function of torch takes the two values that it multiplies.
 
     Args:
-        first: Place of the first one; the second one follows it.
-        names: Of both.
-        outputs: Axis of the weight that has an output in each entry; -1 for matrices, which may be no weights.
-        blocks: Whether int4 rounds the weight.
+        first: place of the first one; the second one follows it.
+        names: names of both.
+        outputs: axis of the weight that has an output in each entry; -1 for matrices, which may be no weights.
+        blocks: whether int4 rounds the weight.
     """
 
     first: int

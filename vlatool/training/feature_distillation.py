@@ -1,4 +1,4 @@
-"""A lesson that compares what blocks of student and teacher give, beside their actions."""
+"""Feature distillation: an objective that also compares the outputs of blocks of student and teacher."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Hint:
     """A term of the loss.
 
     Args:
-        name: Of the option that gives its weight.
-        weight: In the sum.
-        distance: Features of the student and of the teacher, (N, ..., D) -> their distance, a mean over rows.
-        pairs: Blocks that are compared.
-        left_out: Stack -> why it is not compared.
-        projections: Number of a pair -> what brings the student's features to the teacher's width.
+        name: name of the option that gives its weight.
+        weight: weight in the sum.
+        distance: features of the student and of the teacher, (N, ..., D) -> their distance, a mean over rows.
+        pairs: blocks that are compared.
+        left_out: stack -> why it is not compared.
+        projections: number of a pair -> what brings the student's features to the teacher's width.
     """
 
     name: str
@@ -76,17 +76,17 @@ class Hint:
 def with_hints(
     base: Objective, weights: Mapping[str, float], student: BatchedProgram, source: Bundle, teacher: Teacher, seed: int
 ) -> Objective:
-    """Return a lesson with further terms; the lesson itself where all weights are 0.
+    """Return an objective with further terms; the objective itself where all weights are 0.
 
     The teacher runs on the same rows and the same noise as the student, in the same precision, without gradients.
 
     Args:
-        base: Its loss runs the student once on the rows that it is given.
-        weights: Name of a hint -> its weight in the loss.
-        student: What the lesson runs.
-        source: The student's bundle.
-        teacher: The teacher.
-        seed: Of the projections.
+        base: its loss runs the student once on the rows that it is given.
+        weights: name of a hint -> its weight in the loss.
+        student: program that the objective runs.
+        source: the student's bundle.
+        teacher: the teacher.
+        seed: seed of the projections.
 
     Raises:
         RecipeError: when there is nothing to compare.

@@ -1,4 +1,4 @@
-"""What a student is trained on: encoded observations and what the teacher says of them, in rounds on the disk."""
+"""Training data: encoded observations and the teacher's labels, in rounds on the disk."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from vlatool.errors import DataError
 
 Array = NDArray[Any]
 BLOCK_ROWS = 256
-"""Rows that are copied at a time."""
+"""Number of rows that are copied at a time."""
 
 
 class Frames:
     """Rounds of rows, each round a folder with ``NAME.npy`` of (N, ...) that stays on the disk.
 
     Args:
-        folder: Where the rounds are.
+        folder: where the rounds are.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -36,11 +36,11 @@ class Frames:
 
     @property
     def count(self) -> int:
-        """How many rounds are used."""
+        """Number of rounds in use."""
         return len(self._rounds)
 
     def has(self, number: int) -> bool:
-        """Say whether a round was written whole, by an earlier run too."""
+        """Return whether a round was written completely, also by an earlier run."""
         return self._round_folder(number).is_dir()
 
     def read(self, number: int) -> None:
@@ -65,24 +65,24 @@ class Frames:
         return np.arange(sizes[number]) + sum(sizes[:number])
 
     def draw(self, random: np.random.Generator, size: int) -> Array:
-        """Draw the places of a batch of so many rows."""
+        """Draw the indices of a batch of a number of rows."""
         return random.integers(len(self), size=size)
 
     def row_count(self, indices: Array) -> int:
-        """Return how many rows are at places."""
+        """Return the number of rows at indices."""
         return len(indices)
 
     def sample(self, numbers: Sequence[int], most: int) -> Array:
-        """Return the places of so many rows of some rounds, or of all, evenly spaced."""
+        """Return the indices of a number of rows of some rounds, or of all their rows, evenly spaced."""
         rows = np.concatenate([self.row_indices(number) for number in numbers])
         return rows[evenly_spaced(len(rows), most)]
 
     def batch(self, indices: Array) -> Any:
-        """Return what a loss takes of places: name -> (B, ...)."""
+        """Return the argument of a loss for indices: name -> (B, ...)."""
         return self.rows(indices)
 
     def sample_rows(self, most: int) -> dict[str, Array]:
-        """Return so many rows, spread over all rounds: name -> (N, ...)."""
+        """Return a number of rows, spread over all rounds: name -> (N, ...)."""
         return self.rows(evenly_spaced(len(self), most))
 
     def rows(self, rows: Array) -> dict[str, Array]:
@@ -110,12 +110,12 @@ def begins_file(folder: Path) -> Path:
 
 
 def evenly_spaced(count: int, most: int) -> Array:
-    """Return the places of ``most`` of so many rows, or of all, evenly spaced."""
+    """Return the indices of ``most`` of a number of rows, or of all, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
 
 
 def new_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> Array:
-    """Return an array in a new ``.npy`` file, whose place on the disk is taken: a full disk would kill a later write.
+    """Return an array in a new ``.npy`` file, whose space is allocated: on a full disk a later write would crash.
 
     Raises:
         OSError: when there is no room for it.

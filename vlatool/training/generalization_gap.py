@@ -1,4 +1,4 @@
-"""How far a student is from its teacher in episodes that it has not trained on: whether more of them would help."""
+"""The generalization gap: the student's loss on episodes that it has not trained on, and whether more would help."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from vlatool.training.device import Device
 from vlatool.training.frames import Frames
 
 MAX_ROWS = 1024
-"""Rows of a round that are looked at."""
+"""Largest number of rows of a round that are used."""
 ADVICE_RATIO = 1.5
-"""Times the loss on rows that were trained on, above which more episodes are advised."""
+"""Ratio to the loss on rows that were trained on, above which more episodes are advised."""
 LOSS_KEY = "loss"
 NEW_ROUND, PREVIOUS_ROUND = "new", "before"
-"""Of a round that the student has just played, and of its round before, on which it has trained since."""
+"""Loss on the round that the student has just played, and on the round before, on which it has since trained."""
 
 
 def last_round_losses(frames: Frames, number: int, loss: Loss, rows: int, device: Device) -> dict[str, float]:
     """Return the mean losses of rows of the student's last two rounds; of the last one alone where it is the first.
 
     Args:
-        frames: All rounds, the last one not trained on yet.
-        number: Of the last round.
-        loss: Of a batch.
-        rows: At a time.
-        device: As in training.
+        frames: all rounds, the last one not trained on yet.
+        number: number of the last round.
+        loss: loss of a batch.
+        rows: number of rows at a time.
+        device: device of the training.
     """
     played = {NEW_ROUND: number} | ({PREVIOUS_ROUND: number - 1} if number > 1 else {})
     indices = {name: frames.sample((round_,), MAX_ROWS) for name, round_ in played.items()}
@@ -33,7 +33,7 @@ def last_round_losses(frames: Frames, number: int, loss: Loss, rows: int, device
 
 
 def gap_lines(rounds: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Say how the last losses differ, and what to do about it."""
+    """Return a sentence on how the last losses differ, and what to do about it."""
     losses = [about[LOSS_KEY] for about in rounds if PREVIOUS_ROUND in about.get(LOSS_KEY, {})]
     if not losses:
         return ()

@@ -32,8 +32,8 @@ class Group:
     """Which of the processes this one is.
 
     Args:
-        rank: Its number; the first one, 0, plays, labels and writes.
-        size: How many there are.
+        rank: its number; the first one, 0, plays, labels and writes.
+        size: how many there are.
     """
 
     rank: int = 0
@@ -98,10 +98,10 @@ def join_group(store: Callable[[], Any], group: Group, device: str = "cpu", *, h
     """Be one of the processes of a group within the block; all of them must come.
 
     Args:
-        store: Opens a store of ``torch.distributed`` through which they find each other; a new one for each group.
-        group: Which one this is.
+        store: opens a store of ``torch.distributed`` through which they find each other; a new one for each group.
+        group: group, and this process's rank.
         device: ``cpu`` or ``cuda``, of what is added up.
-        here: Whether all of them are on this machine, so that no other one needs to reach them.
+        here: whether all of them are on this machine, so that no other one needs to reach them.
 
     Raises:
         SourceError: when they do not find each other.

@@ -1,4 +1,4 @@
-"""Recorded observations that a training does not learn from: where nobody plays, their loss says when to stop."""
+"""Held-out recorded observations: without episodes, their loss decides when to stop."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class HeldOut:
     """The recorded observations in two: one part to learn from, one to judge with.
 
     Args:
-        folder: Folder of the training.
-        frames: Folder -> the rounds in it, as the lesson takes them.
+        folder: folder of the training.
+        frames: folder -> the rounds in it, as the objective takes them.
     """
 
     def __init__(self, folder: Path, frames: Callable[[Path], Frames] = Frames) -> None:
@@ -56,9 +56,9 @@ class HeldOut:
         """Split the recording, and write what is held out unless an earlier run did.
 
         Args:
-            recording: Of the student's bundle.
-            write: Called with observations and the folder for them.
-            other: Called with the folder where there are not two observations to split; says whether it wrote others.
+            recording: recording of the student's bundle.
+            write: function called with observations and the folder for them.
+            other: called with the folder where there are not two observations to split; says whether it wrote others.
 
         Raises:
             DataError: when there are not two observations to split.
@@ -81,9 +81,9 @@ class HeldOut:
         """Return the mean loss of what is held out.
 
         Args:
-            loss: Of a batch.
-            rows: At a time.
-            device: As in training.
+            loss: loss of a batch.
+            rows: number of rows at a time.
+            device: device of the training.
         """
         return mean_loss(self._frames, self._frames.sample((0,), len(self._frames)), loss, rows, device)
 
@@ -91,10 +91,10 @@ class HeldOut:
         """Return the same as a mixture of both terms.
 
         Args:
-            alpha: Share of the teacher.
-            loss: Of a batch, against the teacher.
-            expert: Of a batch, against the expert's actions; None where no expert is asked.
-            rows, device: As of ``loss``.
+            alpha: share of the teacher.
+            loss: loss of a batch, against the teacher.
+            expert: expert of a batch, against the expert's actions; None where no expert is asked.
+            rows, device: as in ``loss``.
         """
         total = alpha * self.loss(loss, rows, device) if alpha else 0.0
         if expert is None:

@@ -46,7 +46,7 @@ def side_by_side(begins: Array, count: int) -> Iterator[Lanes]:
 
     Args:
         begins: (N,) whether an episode begins with a row.
-        count: Of lanes.
+        count: count of lanes.
     """
     firsts = np.flatnonzero(begins)
     ends = np.array([*firsts[1:], len(begins)])

@@ -1,4 +1,4 @@
-"""The other processes of a training: started (by torchrun, or here), told what to do, and ended by the first one."""
+"""The other processes of a training: launched (by torchrun, or here), called, and ended by the first one."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from vlatool.user_code.children import Child
 
 MODULE = "vlatool.training.rank_process"
 GRACE_S = 5.0
-"""Seconds in which a process that was lost says how, before the others are ended."""
+"""Seconds in which a lost process may report its error, before the others are ended."""
 
 
 class RankProcesses:
-    """Other processes that take the same steps with other rows; none where the training is one process.
+    """The other processes of a training, which take the same steps on other rows; none where it is one process.
 
     Args:
-        children: Processes with the ranks from 1 on.
-        threads: One for each, which waits for it.
+        children: processes with the ranks from 1 on.
+        threads: one for each, which waits for it.
     """
 
     def __init__(self, children: Sequence[Child | Follower] = (), threads: ThreadPoolExecutor | None = None) -> None:
@@ -42,22 +42,22 @@ class RankProcesses:
 
     @contextlib.contextmanager
     def training(self, rounds: int, rows: int, until: int) -> Iterator[None]:
-        """Let the others train, too, while the block does.
+        """Let the others train while the block runs.
 
         Args:
-            rounds: How many rounds of rows there are.
-            rows: How many rows in all of them.
-            until: Number of the step to stop before.
+            rounds: how many rounds of rows there are.
+            rows: how many rows in all of them.
+            until: number of the step to stop before.
 
         Raises:
-            VlatoolError: what one of them met, or how it ended.
+            VlatoolError: the error of one of them, or how it ended.
         """
         with self.calling("train", {"rounds": rounds, "rows": rows, "until": until}):
             yield
 
     @contextlib.contextmanager
     def calling(self, function: str, job: Mapping[str, Any]) -> Iterator[None]:
-        """Call a function of ``peer`` in all others while the block runs.
+        """Call a function of ``rank_process`` in all others while the block runs.
 
         Raises:
             VlatoolError: as ``training``.
@@ -75,19 +75,19 @@ class RankProcesses:
 
     def _submit(self, child: Child | Follower, function: str, job: Mapping[str, Any]) -> Future[None]:
         if self._threads is None:
-            raise RuntimeError("a crew of several has threads")
+            raise RuntimeError("several processes need threads")
         return self._threads.submit(self._call, child, function, job)
 
     def _call(self, child: Child | Follower, function: str, job: Mapping[str, Any]) -> None:
         try:
             child.call(f"{MODULE}:{function}", job, lambda _what, _share: None)
-        except BaseException as error:  # told in the first process; the others wait for this one in vain
+        except BaseException as error:  # reported in the first process; the others would wait for this one forever
             self._errors.append(error)
             child.end()
 
     def _end(self, calls: Sequence[Future[None]], *, wait: bool = False) -> bool:
         """Wait for all calls, ending the processes first unless they shall come to an end; say whether any failed."""
-        if not wait:  # the one that was lost is about to say how it ended
+        if not wait:  # the lost process is about to report how it ended
             futures.wait(calls, timeout=GRACE_S, return_when=futures.FIRST_COMPLETED)
         for child in () if wait else self._children:
             child.end()
@@ -107,14 +107,14 @@ class RankProcesses:
 def launch_processes(
     job: Mapping[str, Any], size: int, folder: Path, about: str, device: str = "cpu"
 ) -> Iterator[RankProcesses]:
-    """Yield the crew of a training, each process with the student loaded, and this one among them.
+    """Yield the processes of a training, including this one, with the student loaded in each.
 
     Args:
-        job: What ``peer.load`` needs to know.
-        size: How many processes there are with this one.
-        folder: Folder of the training.
-        about: Whose code they run.
-        device: On which they train.
+        job: argument of ``rank_process.load``.
+        size: how many processes there are with this one.
+        folder: folder of the training.
+        about: name of the code that they run.
+        device: device on which they train.
 
     Raises:
         RecipeError: when torchrun started another number of processes.

@@ -48,14 +48,14 @@ class Settings:
     """How long and how fast is trained.
 
     Args:
-        steps: Updates of the weights.
-        learning_rate: Its highest value.
-        weight_decay: Of weights with two axes or more, decoupled (AdamW).
-        average: Decay of the exponential moving average of the weights, which is the result.
-        seed: Of the batches.
-        device: On what, and in which precision.
-        checkpoint_s: Seconds between checkpoints.
-        shard: Whether each process holds a part of the weights alone.
+        steps: updates of the weights.
+        learning_rate: its highest value.
+        weight_decay: weight decay of weights with two axes or more, decoupled (AdamW).
+        average: decay of the exponential moving average of the weights, which is the result.
+        seed: seed of the batches.
+        device: device and precision.
+        checkpoint_s: seconds between checkpoints.
+        shard: whether each process holds a part of the weights alone.
     """
 
     steps: int
@@ -83,11 +83,11 @@ class Trainer:
     trained is what runs on the robot.
 
     Args:
-        modules: Graph name -> module.
-        settings: How long and how fast.
-        folder: For checkpoints.
-        group: The processes that train together; the first one writes checkpoints.
-        constraint: What holds of the weights after each step.
+        modules: graph name -> module.
+        settings: how long and how fast.
+        folder: folder for checkpoints.
+        group: the processes that train together; the first one writes checkpoints.
+        constraint: what holds of the weights after each step.
     """
 
     def __init__(
@@ -126,9 +126,9 @@ class Trainer:
         """Take steps until so many are done.
 
         Args:
-            until: Number of the step to stop before.
-            draw: Gives the loss of a batch that the random numbers choose.
-            progress: Called with the number of steps and the mean of the last losses.
+            until: number of the step to stop before.
+            draw: function that returns the loss of a randomly drawn batch.
+            progress: function called with the number of steps and the mean of the last losses.
 
         Raises:
             DataError: when the loss is not finite.
@@ -238,7 +238,7 @@ class Trainer:
                 look()
 
     def finish(self) -> None:
-        """Put the average in the place of the weights, the best one where that is known; ask for no gradients more.
+        """Replace the weights by their average, the best one where that is known, and stop tracking gradients.
 
         The modules of the first process hold all of them from now on; all processes must come.
         """

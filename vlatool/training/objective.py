@@ -1,4 +1,4 @@
-"""What a student is trained to make small."""
+"""The objective of a training: what a student minimizes."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Objective:
-    """What a student is trained to make small.
+    """The objective of a training.
 
     Args:
-        name: Of the loss.
-        modules: The student's, which are trained in place.
-        loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
+        name: name of the loss.
+        modules: the student's, which are trained in place.
+        loss: rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
             computed in parts.
-        judged: What of it says how good the student is on rows that it has not seen; all of it when None.
-        along: Name -> module that is trained along, and no part of the student.
-        about: What else is to be known of the training, as JSON values.
-        constraint: What holds of the weights after each step.
-        expert: The same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
-        unroll: How far the training goes back in time, where the student keeps values; ``loss`` then takes stretches
-            of episodes in the place of rows.
-        turns: Whether the teacher also shows single turns of its loop (``rounds.label``).
+        judged: what of it says how good the student is on rows that it has not seen; all of it when None.
+        along: name -> module that is trained along, and no part of the student.
+        about: what else is to be known of the training, as JSON values.
+        constraint: what holds of the weights after each step.
+        expert: the same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
+        unroll: how far the training goes back in time, where the student keeps values; ``loss`` then takes stretches
+            of episodes instead of rows.
+        turns: whether the teacher also shows single turns of its loop (``rounds.label``).
     """
 
     name: str
@@ -65,8 +65,8 @@ class Objective:
         """Let the programs find out whether their modules take batches, with rows that all processes agree on.
 
         Args:
-            frames: What the teacher labelled.
-            shown: What the expert did.
+            frames: what the teacher labelled.
+            shown: what the expert did.
         """
         for loss, rows in ((self.loss, frames), (self.expert, shown)):
             if loss is not None and len(rows):

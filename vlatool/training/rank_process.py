@@ -1,4 +1,4 @@
-"""One of the other processes of a training: what the first one calls in it, see ``crew``."""
+"""The functions that the first process of a training calls in the others; see ``launcher``."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from vlatool.training.torchrun import check_shared, current_launch, rendezvous_s
 
 OnProgress = Callable[[str, float | None], None]
 FILE_SYSTEM_TIMEOUT_S = 120.0
-"""Seconds in which a shared file system shows what the first process wrote."""
+"""Seconds until a shared file system must show what the first process wrote."""
 
 
 @dataclass
 class RankState:
-    """What a process has loaded, and keeps between calls."""
+    """What a process has loaded and keeps between calls."""
 
     stage: TrainingStage
     folder: Path
@@ -45,7 +45,7 @@ class RankState:
 
     @property
     def training(self) -> Trainer:
-        """Return what trains, after ``prepare``."""
+        """Return the trainer, after ``prepare``."""
         if self.trainer is None:
             raise RuntimeError("prepare() comes first")
         return self.trainer
@@ -65,7 +65,7 @@ def load(job: Mapping[str, Any], _tell: OnProgress) -> None:
     group, frames, expert = Group(job["rank"], job["size"]), Frames(folder), Expert(folder)
     teacher, objective = stage.prepare_objective(load_modules(source), source)
     device, launch = stage.settings().device, current_launch()
-    if device.name != "cpu":  # else nothing keeps the teacher, unless the lesson does
+    if device.name != "cpu":  # else nothing keeps the teacher, unless the objective does
         device.choose(launch.local_rank if launch else job["rank"])
         opened.enter_context(device.holding(objective.trainable, teacher.program.modules))
     batches = Batches(objective.loss, frames, stage.batch, stage.accumulate, group)
@@ -74,20 +74,20 @@ def load(job: Mapping[str, Any], _tell: OnProgress) -> None:
 
 
 def join(job: Mapping[str, Any], _tell: OnProgress) -> None:
-    """Become one of the group, whose other processes do so at the same time."""
+    """Join the group, at the same time as its other processes."""
     peer, (store, here) = _state[0], rendezvous_store(job)
     peer.opened.enter_context(join_group(store, peer.group, peer.stage.settings().device.name, here=here))
 
 
 def prepare(_job: Mapping[str, Any], _tell: OnProgress) -> None:
-    """Find out where the training stands, and hold a part of the weights where that is asked for."""
+    """Resume the training, and hold a part of the weights where they are sharded."""
     peer, objective = _state[0], _state[0].objective
     settings = peer.stage.settings()
     peer.trainer = Trainer(objective.trainable, settings, peer.folder, peer.group, objective.constraint)
 
 
 def train(job: Mapping[str, Any], _tell: OnProgress) -> None:
-    """Take the steps until one of them, on so many rounds of rows."""
+    """Take steps up to a number, on a number of rounds of rows."""
     peer = _state[0]
     for number in range(peer.frames.count, job["rounds"]):
         if _wait_for_round(peer.frames, number):
@@ -105,7 +105,7 @@ def train(job: Mapping[str, Any], _tell: OnProgress) -> None:
 
 
 def _wait_for_round(frames: Frames, number: int) -> bool:
-    """Wait until a round is seen that the first process has written; say whether it is."""
+    """Wait until a round that the first process has written is visible; return whether it is."""
     end = time.monotonic() + FILE_SYSTEM_TIMEOUT_S
     while not frames.has(number) and time.monotonic() < end:
         time.sleep(0.1)
@@ -113,7 +113,7 @@ def _wait_for_round(frames: Frames, number: int) -> bool:
 
 
 def show(_job: Mapping[str, Any], _tell: OnProgress) -> None:
-    """Give this process's part of the averaged weights, which are about to act."""
+    """Contribute this process's part of the averaged weights, which are about to act."""
     with _state[0].training.averaged_weights(), _state[0].training.whole():
         pass
 
@@ -128,11 +128,11 @@ def examine(_job: Mapping[str, Any], _tell: OnProgress) -> None:
 
 
 def judge(job: Mapping[str, Any], _tell: OnProgress) -> None:
-    """Remember how well the averaged weights did."""
+    """Record the score of the averaged weights."""
     _state[0].training.judge(job["score"])
     _state[0].training.save()
 
 
 def finish(_job: Mapping[str, Any], _tell: OnProgress) -> None:
-    """Give this process's part of the result."""
+    """Contribute this process's part of the result."""
     _state[0].training.finish()

@@ -1,4 +1,4 @@
-"""How a training went, as a report beside the bundle: it holds times, and is no part of the bundle's identity."""
+"""The report of a training, beside the bundle: it has times, and is not part of the bundle's identity."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
     """Write ``reports/`` of a bundle that was trained.
 
     Args:
-        made: With ``module/training.json``.
-        seconds: What the training took, on the wall clock.
-        command: The command line.
+        made: bundle with ``module/training.json``.
+        seconds: what the training took, on the wall clock.
+        command: the command line.
 
     Raises:
         OSError: when it cannot be written.

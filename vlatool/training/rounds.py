@@ -56,9 +56,9 @@ def write_observations(
     """Write encoded observations as a part of a round, one after the other: they need not fit into the memory.
 
     Args:
-        encode: Observation -> what the policy takes.
-        observations: In the order of their episodes, where these matter.
-        target: Folder of the part.
+        encode: observation -> what the policy takes.
+        observations: observations in the order of their episodes, where these matter.
+        target: folder of the part.
         begins: (N,) whether an episode begins with an observation; None where that does not matter.
     """
     if begins is not None and len(begins):
@@ -80,13 +80,13 @@ def write_labels(frames: Path, names: Sequence[str], outputs: Sequence[str], tea
     A teacher that keeps values is run along the episodes.
 
     Args:
-        frames: Folder of the round.
-        names: Inputs of the policy.
-        outputs: Outputs of the policy.
-        teacher: Its program.
-        seed: Of the noise.
-        context: For progress.
-        turns: Also write one turn of the teacher's loop for each row, drawn at random.
+        frames: folder of the round.
+        names: inputs of the policy.
+        outputs: outputs of the policy.
+        teacher: its program.
+        seed: seed of the noise.
+        context: context of the run, for progress.
+        turns: whether to write also one random turn of the teacher's loop for each row.
 
     Returns:
         Names of the labels.
@@ -122,11 +122,11 @@ def _teacher_batches(
     """Yield what the teacher was shown: seed, rows (B,), which of them to write, its values, and the noise.
 
     Args:
-        teacher: Its program.
-        inputs: Name -> (N, ...).
+        teacher: its program.
+        inputs: name -> (N, ...).
         begins: (N,) whether an episode begins with a row; None for a teacher that keeps nothing.
-        seed: Of the noise.
-        turns: Whether what a loop carries is among the values.
+        seed: seed of the noise.
+        turns: whether what a loop carries is among the values.
     """
     run = teacher.path if turns else teacher.run
     if begins is None:
@@ -176,9 +176,9 @@ def next_round(frames: Frames, number: int, fill: Any) -> None:
     """Use a round; write it first when no earlier run did.
 
     Args:
-        frames: All rounds.
-        number: Of the round.
-        fill: Called with the folder to write into.
+        frames: all rounds.
+        number: number of the round.
+        fill: function called with the folder to write into.
     """
     if not frames.has(number):
         draft = frames.draft(number)

@@ -29,9 +29,9 @@ class Unroll:
     """How far a training goes back in time.
 
     Args:
-        window: Consecutive observations that gradients pass through (truncated back-propagation through time: Williams
+        window: consecutive observations that gradients pass through (truncated back-propagation through time: Williams
             and Peng, 1990).
-        burn_in: Observations before a window that only bring what is kept up to date (Kapturowski et al., R2D2, ICLR
+        burn_in: observations before a window that only bring what is kept up to date (Kapturowski et al., R2D2, ICLR
             2019); all since the beginning of the episode when None.
     """
 
@@ -41,11 +41,11 @@ class Unroll:
 
 @dataclass(frozen=True)
 class EpisodeWindows:
-    """What a loss takes in the place of rows: where they are, and which ones.
+    """What a loss takes instead of rows: the rows, and the windows in them.
 
     Args:
-        frames: All rows.
-        lanes: Those that are run.
+        frames: all rows.
+        lanes: lanes that are run.
     """
 
     frames: Frames
@@ -58,8 +58,8 @@ class Sequences(Frames):
     Places are (N, 3): first row, first one that counts, and the one after the last.
 
     Args:
-        folder: Where the rounds are.
-        unroll: Length of what is drawn.
+        folder: where the rounds are.
+        unroll: length of what is drawn.
     """
 
     def __init__(self, folder: Path, unroll: Unroll) -> None:
@@ -119,11 +119,11 @@ def outputs_and_labels(
     """Run a student; return an output for each row that counts, and what was said of it.
 
     Args:
-        program: The student.
-        rows: Of a batch, name -> (B, ...); or stretches of episodes, along which it keeps its values.
-        name: Of the output.
-        label: Prefix of who said so.
-        computed: Gives the context in which the student computes.
+        program: the student.
+        rows: rows of a batch, name -> (B, ...); or stretches of episodes, along which it keeps its values.
+        name: name of the output.
+        label: prefix of who said so.
+        computed: function that returns the context in which the student computes.
     """
     if isinstance(rows, EpisodeWindows):
         return _outputs_along_episodes(program, rows, name, label, computed)
@@ -162,7 +162,7 @@ def episode_begins(recording: Recording) -> Array:
     """Say of each observation whether an episode begins with it: (N,).
 
     Raises:
-        DataError: when that is not recorded, or the observations are no whole episodes.
+        DataError: when that is not recorded, or the observations are not complete episodes.
     """
     whole = recording.whole or recording
     if recording.episodes is None:
@@ -192,8 +192,8 @@ def select_episodes(begins: Array, share: float, order: Callable[[int], Array]) 
 
     Args:
         begins: (N,) whether an episode begins with a row.
-        share: Of the rows.
-        order: Number of episodes -> in which order they are taken.
+        share: share of the rows.
+        order: number of episodes -> in which order they are taken.
     """
     episodes = np.cumsum(begins) - 1
     sizes = np.bincount(episodes)

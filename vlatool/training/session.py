@@ -53,16 +53,16 @@ class Plan:
     """What is played when.
 
     Args:
-        batch: Observations in a step.
-        episodes: That the teacher plays first, over all tasks.
-        student_episodes: That the student plays at each pause.
-        pauses: Numbers of the steps before which it does.
-        noise: What disturbs the actions in them, see ``EpisodesJob``.
-        first_seed: Of the first episode of each task; the others follow.
-        patience: Pauses in a row without an improvement after which training ends; 0 for never.
-        accumulate: Parts of a batch, computed one after the other.
-        user_rows: Rows that are taken from the function of the policy's that yields batches.
-        supervision: Who says what is right.
+        batch: observations in a step.
+        episodes: episodes that the teacher plays first, over all tasks.
+        student_episodes: student episodes that the student plays at each pause.
+        pauses: numbers of the steps before which it does.
+        noise: what disturbs the actions in them, see ``EpisodesJob``.
+        first_seed: first seed of the first episode of each task; the others follow.
+        patience: pauses in a row without an improvement after which training ends; 0 for never.
+        accumulate: parts of a batch, computed one after the other.
+        user_rows: rows that are taken from the function of the policy's that yields batches.
+        supervision: who says what is right.
     """
 
     batch: int
@@ -89,14 +89,14 @@ class Session:
     """Trains a student; what was done is kept in a folder, from which a run that was killed goes on.
 
     Args:
-        plan: What is played when.
-        settings: How long and how fast is trained.
-        objective: What is trained.
-        source: The student's bundle.
-        teacher: Who says what is right.
-        folder: The folder.
-        context: For progress.
-        processes: Other processes that train, too.
+        plan: what is played when.
+        settings: how long and how fast is trained.
+        objective: what is trained.
+        source: the student's bundle.
+        teacher: who says what is right.
+        folder: the folder.
+        context: context of the run, for progress.
+        processes: other processes that train, too.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ class Shards:
     """What a process holds of each weight: all of it here.
 
     Args:
-        parameters: Name -> weight, as the modules have it.
+        parameters: name -> weight, as the modules have it.
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter]) -> None:
@@ -70,7 +70,7 @@ class Shards:
         """Let modules hold whole weights; all processes must come.
 
         Args:
-            keep: Whether they do in this process; else it gives its parts alone.
+            keep: whether they do in this process; else it gives its parts alone.
         """
 
     @contextlib.contextmanager
@@ -93,8 +93,8 @@ class Parts(Shards):
     """What a process holds of each weight: its part.
 
     Args:
-        modules: Graph name -> module, which is changed in place.
-        group: The processes.
+        modules: graph name -> module, which is changed in place.
+        group: the processes.
 
     Raises:
         RecipeError: when no weight can be cut.
@@ -170,7 +170,7 @@ class Parts(Shards):
         return list(self._cut[name].shape if name in self._cut and part.dim() else part.shape)
 
     def gather(self, *, keep: bool) -> None:
-        """Gather one weight after the other; what is gathered is no part of the training."""
+        """Gather one weight after the other; gathered weights are not part of the training."""
         parameter = require("torch", "build").nn.Parameter
         _release_memory()
         for name, value in self._cut.items():

@@ -1,4 +1,4 @@
-"""What blocks of a policy give while it runs."""
+"""The outputs of blocks of a policy while it runs."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Form:
     """What a block gives for one observation.
 
     Args:
-        calls: How often it runs in an inference.
-        shape: Of what it gives each time; None when that is no tensor of floats, or differs from call to call.
-        channels_first: Whether the second axis, and not the last one, is that of the features.
+        calls: how often it runs in an inference.
+        shape: shape of what it gives each time; None when that is not a tensor of floats, or differs from call to call.
+        channels_first: whether the second axis, and not the last one, is that of the features.
     """
 
     calls: int
@@ -40,11 +40,11 @@ class Form:
 
 
 class Taps:
-    """Keeps what blocks give.
+    """Records the outputs of blocks.
 
     Args:
-        program: The policy.
-        blocks: Blocks of it.
+        program: the policy.
+        blocks: blocks of it.
     """
 
     def __init__(self, program: BatchedProgram, blocks: Iterable[BlockName]) -> None:

@@ -1,4 +1,4 @@
-"""Who says what a student should have done."""
+"""The teacher of a training."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ class Teacher:
     """A policy in torch that fits the student's.
 
     Args:
-        bundle: Its source bundle.
-        edits: What was done to its structure.
-        program: Its modules, and how they run.
+        bundle: its source bundle.
+        edits: what was done to its structure.
+        program: its modules, and how they run.
     """
 
     bundle: Bundle
@@ -89,9 +89,9 @@ class Teacher:
         """Open the teacher of a student.
 
         Args:
-            student: The student's bundle.
-            path: The teacher's bundle, or its policy; what the student was before any edit when None.
-            modules: The student's, which the teacher's must not share weights with.
+            student: the student's bundle.
+            path: the teacher's bundle, or its policy; what the student was before any edit when None.
+            modules: the student's, which the teacher's must not share weights with.
 
         Raises:
             RecipeError: when it is exported, takes or gives something else, or is the student.

@@ -1,8 +1,8 @@
 """A training whose processes torchrun started, on one machine or several: who this one is, and how they talk.
 
-The first process (``RANK`` 0) runs the whole command. The others follow it: they wait for calls of ``peer``, which the
-first one writes into torchrun's store (``MASTER_ADDR``, ``MASTER_PORT``), and write back how each ended. Rows, bundles
-and checkpoints are files of the first process's, which all must see under the same path.
+The first process (``RANK`` 0) runs the whole command. The others follow it: they wait for calls of ``rank_process``,
+which the first one writes into torchrun's store (``MASTER_ADDR``, ``MASTER_PORT``), and write back how each ended.
+Rows, bundles and checkpoints are files of the first process, which all must see under the same path.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from vlatool.machine.version import VERSION
 from vlatool.user_code.children import Child
 
 VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
-"""What torchrun tells each process."""
+"""Environment variables that torchrun sets for each process."""
 AGENT = "TORCHELASTIC_USE_AGENT_STORE"
 RENDEZVOUS_FILE = "meeting"
 """File in the folder of the training through which processes of one machine find each other; under torchrun it holds
 what shows that a process sees that folder."""
 PRELOAD = ("torch", "vlatool.training.rank_process")
 LEAVE_CALL = "leave"
-"""A call after which a process forgets the training."""
+"""Call after which a process discards the training."""
 START_S, LEFT_S, POLL_S = 300.0, 5.0, 0.05
 """Seconds in which another process comes, and goes; and between two looks at the store."""
 LOOPBACK = ("127.", "localhost", "::1")
@@ -48,9 +48,9 @@ class Launch:
     """Which of torchrun's processes this one is.
 
     Args:
-        rank, size: Its number of all processes.
-        local_rank, local_size: The same of those on its machine.
-        address, port: Of the store.
+        rank, size: its number of all processes.
+        local_rank, local_size: the same of those on its machine.
+        address, port: address and port of the store.
     """
 
     rank: int
@@ -69,8 +69,8 @@ class Launch:
         """Open the store.
 
         Args:
-            prefix: Of all names in it.
-            host: Whether this process serves it, unless torchrun does.
+            prefix: prefix of all names in it.
+            host: whether this process serves it, unless torchrun does.
 
         Raises:
             SourceError: when it does not answer.
@@ -88,10 +88,10 @@ class Launch:
 
 
 def current_launch() -> Launch | None:
-    """Return what torchrun says of this process; None where it was not started so, or alone.
+    """Return this process's place among those of torchrun; None without torchrun, or for a single process.
 
     Raises:
-        RecipeError: when that is incomplete, or no numbers.
+        RecipeError: when the variables are incomplete, or not numbers.
     """
     said = {name: os.environ.get(name, "") for name in VARIABLES}
     if not (said["RANK"] and said["WORLD_SIZE"]) or said["WORLD_SIZE"] == "1":
@@ -107,27 +107,27 @@ def current_launch() -> Launch | None:
     rank, size, local_rank, local_size = (int(said[name]) for name in VARIABLES[:4])
     if not (rank < size and local_rank < local_size <= size):
         raise RecipeError(
-            f"RANK={rank} of WORLD_SIZE={size} (LOCAL_RANK={local_rank} of LOCAL_WORLD_SIZE={local_size}) is no "
-            "process of torchrun's: each rank is below its size.",
+            f"RANK={rank} of WORLD_SIZE={size} (LOCAL_RANK={local_rank} of LOCAL_WORLD_SIZE={local_size}) is not "
+            "a process of torchrun's: each rank is below its size.",
             "unset RANK and WORLD_SIZE",
         )
     return Launch(rank, size, local_rank, local_size, said["MASTER_ADDR"], int(said["MASTER_PORT"]))
 
 
 def versions() -> dict[str, str]:
-    """Return what must be the same in all processes."""
+    """Return the versions that must be the same in all processes."""
     return {"vlatool": VERSION, "torch": str(require("torch", "build").__version__)}
 
 
 def write_rendezvous(folder: Path) -> dict[str, Any]:
-    """Return what lets other processes check that they see the folder of the training, and run the same code."""
+    """Write a token into the folder of the training; return it with the versions, for other processes to check."""
     token = secrets.token_hex(8)
     (folder / RENDEZVOUS_FILE).write_text(token)
     return {"token": token, "versions": versions()}
 
 
 def check_shared(job: Mapping[str, Any]) -> None:
-    """Refuse to train where the first process's folder is not seen, or other versions run.
+    """Refuse to train where the first process's folder is not visible, or versions differ.
 
     Raises:
         RecipeError: saying so.
@@ -148,7 +148,7 @@ def check_shared(job: Mapping[str, Any]) -> None:
 
 
 def rendezvous_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
-    """Return what opens the store of a training's group, and whether all processes are on this machine."""
+    """Return a function that opens the store of a training's group, and whether all processes are on this machine."""
     launch = current_launch()
     if launch is not None:
         return partial(launch.store, f"vlatool-{job['token']}"), launch.on_one_machine
@@ -157,11 +157,11 @@ def rendezvous_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
 
 
 class Follower:
-    """A process that follows this one, as ``Apart`` is one that it started: it calls functions of ``peer``.
+    """A process that follows this one, as ``Apart`` is one that it started: it calls functions of ``rank_process``.
 
     Args:
-        launch: This process.
-        rank: The other one.
+        launch: this process.
+        rank: the other one.
     """
 
     def __init__(self, launch: Launch, rank: int) -> None:
@@ -169,11 +169,11 @@ class Follower:
         self._who = f"Process {rank + 1} of {launch.size}"
 
     def __enter__(self) -> Follower:
-        """Wait until it is there.
+        """Wait until the process is ready.
 
         Raises:
-            SourceError: when it does not come.
-            VlatoolError: what it met before.
+            SourceError: when it does not start.
+            VlatoolError: an error that it raised before.
         """
         self._wait("here", time.monotonic() + START_S)
         return self
@@ -183,7 +183,7 @@ class Follower:
             self._send_call(LEAVE_CALL, {})
 
     def call(self, function: str, job: Mapping[str, Any], _tell: Any) -> None:
-        """Call a function there, and wait for its end.
+        """Call a function in the process, and wait until it returns.
 
         Raises:
             VlatoolError: what it raised; SourceError when the process is gone.
@@ -191,7 +191,7 @@ class Follower:
         self._wait(f"answer/{self._send_call(function, job)}")
 
     def end(self) -> None:
-        """Wait for it no longer, from any thread."""
+        """Stop waiting for the process; may be called from any thread."""
         self._lost.set()
 
     def _send_call(self, function: str, job: Mapping[str, Any]) -> int:
@@ -200,7 +200,7 @@ class Follower:
         return number
 
     def _wait(self, name: str, until: float = float("inf")) -> None:
-        """Wait for what it says, and raise what went wrong there."""
+        """Wait for a reply, and raise the error that it reports."""
         while not self._lost.is_set() and time.monotonic() < until:
             for key in (f"{self._rank}/failed", f"{self._rank}/{name}"):
                 if self._store.check([key]):
@@ -220,7 +220,7 @@ class Follower:
 
 @contextlib.contextmanager
 def lead(launch: Launch) -> Iterator[None]:
-    """Run a command as the first process; the others may end after the block."""
+    """Run a command as the first process; the others end after the block."""
     store = launch.store(host=True)
     try:
         yield
@@ -232,12 +232,12 @@ def lead(launch: Launch) -> Iterator[None]:
 
 
 def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
-    """Do what the first process asks for, until its command is over.
+    """Serve the calls of the first process until its command has ended.
 
     Args:
-        launch: This process.
-        about: Whose training it is, for messages.
-        ready: Called first: what the command line has to check or allow here.
+        launch: this process.
+        about: name of the training, for messages.
+        ready: called first: what the command line has to check or allow here.
 
     Raises:
         SourceError: when the first process is gone.
@@ -265,7 +265,7 @@ def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
 
 
 def _next_call(store: Any, name: str) -> Any:
-    """Wait for a call; return None when the first process's command is over."""
+    """Wait for a call; return None when the first process's command has ended."""
     try:
         while True:
             over = store.check(["over"])
@@ -279,7 +279,7 @@ def _next_call(store: Any, name: str) -> Any:
 
 
 def _run_call(child: Child, launch: Launch, call: Mapping[str, Any]) -> Any:
-    """Call what is asked for; return None, or what came instead."""
+    """Run a call; return None, or the record of its error."""
     try:
         child.call(call["function"], {**call["job"], "rank": launch.rank}, lambda _what, _share: None)
     except VlatoolError as error:

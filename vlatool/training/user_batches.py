@@ -1,6 +1,6 @@
-"""Observations to train on that a function of the user's yields: ``training: train.py:batches`` in policy.yaml.
+"""Training data from a function of the user: ``training: train.py:batches`` in policy.yaml.
 
-The function is a user's code, as an environment is: it runs in a child process, which writes what it yields.
+The function is user code, as an environment is: it runs in a child process, which writes what it yields.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from vlatool.user_code.children import call
 MODULE = "vlatool.training.user_batches"
 PRELOAD = ("numpy", MODULE)
 DEFAULT_ROWS = 8192
-"""That are taken where nobody says how many."""
+"""Default number of rows."""
 EPISODE = "episode"
 """Of a batch whose rows are steps: the number of the episode of each; where it changes, the policy is reset."""
 MAX_BATCH_ROWS = 256
@@ -38,9 +38,9 @@ def requested_rows(asked: int | None, source: Bundle, plays: bool) -> int:
     """Return how many rows are taken from the policy's function.
 
     Args:
-        asked: By the user; None when the user says nothing.
-        source: Of the policy.
-        plays: Whether the teacher plays episodes: then none are taken unless they are asked for.
+        asked: number that the user asked for; None when not given.
+        source: source of the policy.
+        plays: whether the teacher plays episodes: then none are taken unless they are asked for.
 
     Raises:
         RecipeError: when rows are asked for, and the policy's description names no function.
@@ -61,12 +61,12 @@ def write_user_batches(
     """Write encoded observations that the policy's function yields, as a part of a round.
 
     Args:
-        source: Of the policy.
-        count: How many.
-        seed: That the function is called with.
-        target: Folder for ``NAME.npy`` of each input, (count, ...).
-        context: For progress.
-        along: Whether rows are episodes, which the batches number under ``episode``.
+        source: source of the policy.
+        count: how many.
+        seed: seed that the function is called with.
+        target: folder for ``NAME.npy`` of each input, (count, ...).
+        context: context of the run, for progress.
+        along: whether rows are episodes, which the batches number under ``episode``.
 
     Raises:
         DataError: when it yields something else than batches of observations, or too few.
@@ -95,13 +95,13 @@ class _Rows:
     """The rows of batches, one after the other.
 
     Args:
-        batches: What the function yields.
-        function: Its name, for messages.
-        encode: The policy's own.
-        count: Rows in all.
-        size: Rows of a batch, at most.
-        tell: For progress.
-        along: Whether batches also hold the number of the episode of each row.
+        batches: what the function yields.
+        function: its name, for messages.
+        encode: the policy's own.
+        count: rows in all.
+        size: rows of a batch, at most.
+        tell: callback for progress.
+        along: whether batches also hold the number of the episode of each row.
     """
 
     def __init__(

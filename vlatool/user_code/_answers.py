@@ -1,4 +1,4 @@
-"""What a child that runs a user's code says, checked before it is believed: that code can write what it likes.
+"""Validation of the replies of a child that runs a user's code, which can write anything.
 
 A policy shares its process with the function of vlatool that answers, and can answer in its place. It decides neither
 the exit code nor what kind of error a person sees: an error of a child is one of its input, or of a package it lacks.
@@ -35,13 +35,13 @@ MAX_LAST_LINE = 240
 
 @dataclass
 class ChildState:
-    """What a child was seen to do before it ended.
+    """What is known of a child before it ended.
 
     Args:
-        own: It runs vlatool's code alone.
-        doing: What an engine does in it.
-        told: What it told as its progress.
-        said: The last line that it printed.
+        own: whether it runs vlatool's code alone.
+        doing: what an engine does in it.
+        told: what it told as its progress.
+        said: the last line that it printed.
     """
 
     own: bool = False
@@ -56,11 +56,11 @@ class ChildState:
 
 
 class ChildKilled(SourceError):
-    """The process that runs a user's code was killed: what it was asked for may be asked of another one."""
+    """The process that runs a user's code was killed: another one may repeat the request."""
 
 
 def read(line: bytes, about: str) -> dict[str, Any]:
-    """Return one thing that a child says.
+    """Parse a message of a child.
 
     Raises:
         SourceError: when it is none of those that ``vlatool.user_code._child`` says.
@@ -93,9 +93,9 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     """Return the result that an answer holds, or raise what it says that was raised.
 
     Args:
-        told: The answer.
-        about: Whose code the child runs.
-        own: The child runs vlatool's code alone: what fails in it is a bug of vlatool.
+        told: the answer.
+        about: name of the code that the child runs.
+        own: the child runs vlatool's code alone: what fails in it is a bug of vlatool.
 
     Raises:
         InputError, MissingExtra: of the class that is named; any VlatoolError where ``own``.
@@ -131,18 +131,18 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
 
 
 def invalid_reply(about: str) -> SourceError:
-    """Return the error for what no child of vlatool says."""
+    """Return the error for an invalid message of a child."""
     return SourceError(f"The process of the policy ({about}) answered nonsense.", "let it write to its own files alone")
 
 
 def plain(text: str) -> str:
-    """Return a text without what would steer a terminal, shortened where it is very long."""
+    """Return a text without control characters, truncated where it is very long."""
     text = truncate(text, MAX_MESSAGE)
     return "".join(character if unicodedata.category(character)[0] != "C" else " " for character in text).rstrip()
 
 
 def exit_error(about: str, name: str, text: str) -> SourceError:
-    """Return the error for code that raises what is no ``Exception``."""
+    """Return the error for code that raises something other than an ``Exception``."""
     if name == "SystemExit":
         return SourceError(f"{about} called sys.exit({text}).", "raise an exception that says what is wrong instead")
     return SourceError(f"{about} raised {name}{text and ': '}{text}.", "raise an Exception that says what is wrong")
@@ -152,9 +152,9 @@ def ending_error(status: bytes, about: str, last: ChildState) -> BaseException:
     """Return the error of a child that ended without an answer.
 
     Args:
-        status: Its exit code, as the server says it.
-        about: Whose code it ran.
-        last: What it did.
+        status: its exit code, as the server says it.
+        about: name of the code that it ran.
+        last: what it did.
     """
     text = status.decode("ascii", "replace").strip()
     if not text.lstrip("-").isdigit():
@@ -183,7 +183,7 @@ def ending_error(status: bytes, about: str, last: ChildState) -> BaseException:
 
 
 def _engine_error(code: int, doing: EngineCall, said: str) -> GraphError:
-    """Return the error of an engine that did not let its process live."""
+    """Return the error of an engine that ended its process."""
     if code == -signal.SIGALRM:
         seconds = limit("engine_seconds")
         error = engine_crash(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)

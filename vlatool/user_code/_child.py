@@ -56,7 +56,7 @@ def main() -> None:
             os.read(woken, MAX_MESSAGE_BYTES)
             _reap(children)
         for pid, status in children.items():
-            if status in ready:  # whoever asked for it wants it no more
+            if status in ready:  # the parent no longer needs it
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
         if control in ready:
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def _reap(children: dict[int, socket.socket]) -> None:
-    """Say of each child that has ended how it did."""
+    """Report the exit status of each child that has ended."""
     with contextlib.suppress(ChildProcessError):
         while (ended := os.waitpid(-1, os.WNOHANG))[0]:
             status = children.pop(ended[0], None)
@@ -88,7 +88,7 @@ def _end_strays(children: Mapping[int, socket.socket]) -> None:
 
 
 def _end_all(children: Mapping[int, socket.socket]) -> None:
-    """Kill all children and what they leave, which shows once they are gone; whoever waits for this has patience."""
+    """Kill all children and what they leave, which shows once they have ended; this may take a while."""
     for pid in children:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -157,7 +157,7 @@ def _serve_requests(talk: socket.socket) -> int:
 
 
 def _note_engine_call(answers: IO[str], doing: engine_calls.EngineCall | None) -> None:
-    """Say what an engine does, and let the kernel end this process when that takes too long.
+    """Report a call of an engine, and let the kernel end this process when it takes too long.
 
     No thread of Python could: a library that hangs may never let one run.
     """
@@ -167,7 +167,7 @@ def _note_engine_call(answers: IO[str], doing: engine_calls.EngineCall | None) -
 
 
 def _apply_environment(parent: dict[str, Any]) -> None:
-    """Be where the parent is: directory, variables, modules, processors."""
+    """Take over the parent's directory, variables, module path and processors."""
     os.chdir(parent["folder"])
     os.environ.clear()
     os.environ.update(parent["environment"])
@@ -180,7 +180,7 @@ def _apply_environment(parent: dict[str, Any]) -> None:
 
 
 def _answer(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
-    """Call what is asked for; return its result, or what came instead."""
+    """Run a call; return its result, or the record of its error."""
 
     def tell(what: str, share: float | None) -> None:
         _send(answers, {"progress": [what, share]})
@@ -227,7 +227,7 @@ def _function(name: str) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def _forward_warnings(answers: IO[str]) -> Iterator[None]:
-    """Hand warnings for a person on to the parent, who shows each once."""
+    """Forward warnings to the parent, which shows each once."""
     before = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
@@ -244,7 +244,7 @@ def _forward_warnings(answers: IO[str]) -> Iterator[None]:
 
 
 def _flush() -> None:
-    """Let what was printed arrive before the answer does."""
+    """Flush the output, so that it arrives before the answer."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):
             stream.flush()

@@ -1,4 +1,4 @@
-"""What a child prints, for whoever watches the command, and its last line for an error."""
+"""The output of a child, shown to the user, and its last line for errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BLOCK_BYTES = 1 << 16
 
 
 class ChildOutput:
-    """What a child prints, shown on standard error as the policy's, a limited number of lines."""
+    """Shows the output of a child on standard error, up to a number of lines."""
 
     def __init__(self, about: str, last: ChildState) -> None:
         self._about, self._last, self._rest, self._shown = about, last, b"", 0

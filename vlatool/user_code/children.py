@@ -120,9 +120,9 @@ class Child:
     """A child process that answers calls one after the other; what a call leaves in it, the next one finds.
 
     Args:
-        about: Whose code it runs, for messages: ``policy.py``.
-        preload: Modules that the server imports before it forks.
-        environment: Variables that it has beside those of this process.
+        about: name of the code that it runs, for messages: ``policy.py``.
+        preload: modules that the server imports before it forks.
+        environment: variables that it has beside those of this process.
     """
 
     def __init__(self, about: str, preload: Sequence[str] = (), environment: Mapping[str, str] | None = None) -> None:
@@ -175,10 +175,10 @@ class Child:
         """Call ``module:function`` of vlatool with a job and ``tell``; return its result. All are JSON values.
 
         Args:
-            function: What is called, with ``job`` and ``tell``.
-            job: Its argument.
-            tell: Gets the child's progress.
-            own: It runs vlatool's code alone, and a policy's in children of its own.
+            function: what is called, with ``job`` and ``tell``.
+            job: its argument.
+            tell: callback for the child's progress.
+            own: whether it runs vlatool's code alone, and a policy's in its own children.
 
         Raises:
             VlatoolError: what it raises, of the same class; SourceError when the child ends without an answer.
@@ -306,8 +306,8 @@ def map_jobs(
     """Yield the result of every job, in order, computed in several children; close the iterator to end them.
 
     Args:
-        last: Called in every child when all is done, with an empty job.
-        done: Called with the number of a job and its result as soon as it is there, in a thread of its own.
+        last: called in every child when all is done, with an empty job.
+        done: function called with the number of a job and its result as soon as it is there, in a thread of its own.
     """  # fmt: skip
     idle: SimpleQueue[Child] = SimpleQueue()
 

@@ -1,4 +1,4 @@
-"""Whose code may run: that of the folders which the user named in this command, or trusted before.
+"""Trust in code: only that of folders which the user named in this command, or trusted before, may run.
 
 A bundle is data: nothing that its files say makes code run. What a stage needs of a policy's code is in the folder
 that the bundle notes; it runs when the user named that folder (SOURCE, ``--policy``, ``--environment``), or trusted it
@@ -36,10 +36,10 @@ class NamedFolder:
     """A folder whose code may run.
 
     Args:
-        folder: Absolute, links resolved.
-        description: Its ``policy.yaml``, however it is called; empty for the usual name.
+        folder: absolute, links resolved.
+        description: its ``policy.yaml``, however it is called; empty for the usual name.
         factory: ``path.py:make`` where the user named one; empty for the one in the description.
-        remembered: Trusted before, by the hash of what is in the folder, and not named now.
+        remembered: trusted before, by the hash of what is in the folder, and not named now.
     """
 
     folder: str
@@ -52,7 +52,7 @@ _named: dict[str, NamedFolder] = {}
 
 
 def allow(folder: Path, description: Path | None = None, factory: str = "") -> None:
-    """Note that the user named a folder: code in it may run in this process."""
+    """Allow the code in a folder that the user named to run in this process."""
     where = str(folder.resolve())
     _named[where] = NamedFolder(where, str(description.resolve()) if description else "", factory)
 
@@ -68,14 +68,14 @@ def named_folders() -> list[list[Any]]:
 
 
 def restore(named: Sequence[Sequence[Any]]) -> None:
-    """Take over what the parent process was told."""
+    """Take over the named folders of the parent process."""
     _named.clear()
     _named.update({entry[0]: NamedFolder(*entry) for entry in named})
 
 
 @contextlib.contextmanager
 def forget_named() -> Iterator[None]:
-    """Begin a command: what an earlier one named in this process does not count for it."""
+    """Begin a command: forget the folders that earlier commands of this process named."""
     before = named_folders()
     restore(())
     try:
@@ -88,8 +88,8 @@ def require(folder: Path, runs: str) -> NamedFolder:
     """Return how a folder was named.
 
     Args:
-        folder: Whose code would run.
-        runs: What would run: ``make() of policy.py``.
+        folder: folder whose code would run.
+        runs: what would run: ``make() of policy.py``.
 
     Raises:
         SourceError: when the folder was neither named nor trusted, or has changed since it was trusted.
@@ -111,7 +111,7 @@ def trust(folder: Path) -> None:
     """Remember that the code in a folder, as it is now, may run.
 
     Raises:
-        UsageError: when it is no folder, or holds too much.
+        UsageError: when it is not a folder, or has too many files.
         OutputError: when it cannot be remembered.
     """
     if not folder.is_dir():
@@ -185,7 +185,7 @@ def _read() -> dict[str, str]:
     """Return folder -> content hash of what is trusted.
 
     Raises:
-        SourceError: when somebody else may write the file, or it makes no sense.
+        SourceError: when other users may write the file, or it is invalid.
     """
     file = trust_file()
     try:

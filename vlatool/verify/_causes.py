@@ -1,4 +1,4 @@
-"""Why the actions differ: what the compared stages say, and else what would make the two equal."""
+"""Causes of a difference between actions: the compared stages, or else the changes that would make both equal."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def causes(
     text = [*known, *_of_texts(policy, samples, tolerance)]
     where = "no single change of an input or of the action makes both equal, so it is the network (weights, layers, "
     where += "eval mode, the order of the inputs), or more than one stage"
-    return [*text, f"It cannot be told for certain which stage differs: {where}."], False
+    return [*text, f"Which stage differs is not certain: {where}."], False
 
 
 def _of_quantization(policy: Policy) -> Iterator[str]:

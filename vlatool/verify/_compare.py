@@ -1,4 +1,4 @@
-"""Both sides on the same observations, in this process: actions, and what is known of the stages between."""
+"""Run both sides on the same observations in this process: actions, and the stages between as far as known."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _worst(errors: list[float]) -> float:
 def _warnings(policy: Policy, original: Original, recording: Recording | None) -> list[str]:
     warnings = []
     if recording is None:
-        warnings.append("there is no recording, so both ran on random observations: pass --data FILE.npz to compare on "
+        warnings.append("nothing is recorded, so both ran on random observations: pass --data FILE.npz to compare on "
                      "what the policy is for")  # fmt: skip
     if any(step.noise for step in policy.bundle.manifest.program) and not original.takes_noise:
         warnings.append("the policy draws noise, and act() takes none: the difference is also that of the noise; write "

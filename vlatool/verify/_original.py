@@ -24,8 +24,8 @@ class Original:
 
     Args:
         factory: ``original.py:act`` or ``package.module:act``.
-        folder: What a path counts from.
-        spec: Of the policy that is compared.
+        folder: what a path counts from.
+        spec: spec of the policy that is compared.
 
     Raises:
         SourceError, MissingExtra: when it cannot be imported.

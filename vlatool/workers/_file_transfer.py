@@ -1,4 +1,4 @@
-"""Folders that are sent to other machines: named by the hash of what is in them, there whole or not at all."""
+"""Transfer of folders to other machines: named by the hash of their content, and complete or absent there."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Parcel:
     """What of a folder is sent.
 
     Args:
-        folder: Where it is on the machine that sends it, absolute.
-        files: In the order in which they are sent.
+        folder: where it is on the machine that sends it, absolute.
+        files: files in the order in which they are sent.
     """
 
     folder: str
@@ -196,7 +196,7 @@ class PathTranslation:
     """The names of folders here and there: each path in a text is that of the other side.
 
     Args:
-        pairs: Here -> there.
+        pairs: here -> there.
     """
 
     def __init__(self, pairs: Sequence[tuple[str, str]]) -> None:

@@ -1,4 +1,4 @@
-"""What a worker on another machine does, whatever engine started it: one job after the other, in a child of its own."""
+"""A worker on another machine, whatever engine started it: it runs one job after the other in a child process."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Order:
     """What a worker is to do, and where it is asked for.
 
     Args:
-        function, about, preload, last: Of the work.
-        parcels: What its requests name.
-        variables: Those of ``PASSED_VARIABLES`` that are set.
-        named: Whose code may run, as ``trust.named_so_far`` says it.
+        function, about, preload, last: fields of the work.
+        parcels: what its requests name.
+        variables: values of the ``PASSED_VARIABLES`` that are set.
+        named: folders whose code may run, as ``trust.named_folders`` returns them.
     """
 
     function: str
@@ -72,7 +72,7 @@ class RemoteWorker:
     """A worker.
 
     Args:
-        order: An ``Order`` as JSON values.
+        order: an ``Order`` as JSON values.
     """
 
     def __init__(self, order: Mapping[str, Any]) -> None:

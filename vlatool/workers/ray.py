@@ -39,7 +39,7 @@ class Ray(Workers):
     """
 
     def check(self) -> None:
-        """Raise when there is no ray, or no cluster.
+        """Raise when ray is not installed, or no cluster is running.
 
         Raises:
             MissingExtra: when ray is not installed.
@@ -49,7 +49,7 @@ class Ray(Workers):
         _connect()
 
     def answers(self, work: Work, tell: OnProgress, done: Done, note: Note) -> Generator[Any, None, None]:
-        """Yield the answers in order, whoever gave them."""
+        """Yield the answers in the order of the requests."""
         crew = _RayWorkers(_connect(), work, self.count, tell, done, note)
         try:
             yield from crew.run()
@@ -73,7 +73,7 @@ def _connect() -> Any:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
         why = one_line(str(error), 300).rstrip(".")
-        raise TargetError(f"There is no Ray cluster that takes this process ({ADDRESS}={address}): {why}.", START) \
+        raise TargetError(f"No Ray cluster accepts this process ({ADDRESS}={address}): {why}.", START) \
             from error  # fmt: skip
     return ray
 
@@ -82,8 +82,8 @@ def _refuse_unreachable(address: str, own: str) -> None:
     """Say at once that nobody listens: Ray itself goes on trying for many minutes.
 
     Args:
-        address: As Ray takes it; ``auto`` is what ``ray start`` noted on this machine.
-        own: This machine's address, which Ray takes for names of the loopback one.
+        address: address, as Ray takes it; ``auto`` is what ``ray start`` noted on this machine.
+        own: this machine's address, which Ray takes for names of the loopback one.
     """
     where = address
     if address == "auto":
@@ -273,7 +273,7 @@ class _RayWorkers:
             self._idle.append(seat)
 
     def _replace_worker(self, seat: Any, number: int, error: Exception) -> None:
-        """Hire another worker in the place of one that ended, and let its job be done again."""
+        """Replace a worker that ended, and retry its job."""
         with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
             self._ray.kill(seat)
         why = one_line(str(error), 300).rstrip(".")
