@@ -219,9 +219,7 @@ def require_present(module: str, extra: str) -> None:
     except ImportError:
         absent = True
     if absent or sys.modules.get(module, ...) is None:
-        raise MissingExtra(
-            f"This needs the package '{module}', which the extra '{extra}' provides.", pip_install(extra)
-        )
+        raise _missing(module, extra)
 
 
 def require(module: str, extra: str) -> ModuleType:
@@ -239,7 +237,8 @@ def require(module: str, extra: str) -> ModuleType:
                 f"'{module}' is installed, but '{error.name}', which it needs, is not.",
                 pip_install(extra),
             ) from error
-        raise MissingExtra(
-            f"This needs the package '{top}', which the extra '{extra}' provides.",
-            pip_install(extra),
-        ) from error
+        raise _missing(top, extra) from error
+
+
+def _missing(package: str, extra: str) -> MissingExtra:
+    return MissingExtra(f"This needs the package '{package}', which the extra '{extra}' provides.", pip_install(extra))

@@ -19,8 +19,8 @@ from vlatool.files.ownership import LEDGER
 WRITER = """
 import sys
 from pathlib import Path
-from vlatool.files.directory_writer import writing
-with writing(Path(sys.argv[1]), force=True) as draft:
+from vlatool.files.directory_writer import write_directory
+with write_directory(Path(sys.argv[1]), force=True) as draft:
     (draft / "graphs").mkdir()
     (draft / "graphs/main.onnx").write_bytes(b"half of the weights")
     print(draft, flush=True)
@@ -31,8 +31,8 @@ with writing(Path(sys.argv[1]), force=True) as draft:
 KILLED = """
 import os, sys
 from pathlib import Path
-from vlatool.files.directory_writer import writing
-with writing(Path(sys.argv[1])) as draft:
+from vlatool.files.directory_writer import write_directory
+with write_directory(Path(sys.argv[1])) as draft:
     (draft / "half").touch()
     print(draft.parent, flush=True)
     os.kill(os.getpid(), 9)
@@ -40,7 +40,7 @@ with writing(Path(sys.argv[1])) as draft:
 KILLED_LATE = """
 import os, sys
 from pathlib import Path
-from vlatool.files import writing as module
+from vlatool.files import directory_writer as module
 def kill(*_args, **_options):
     os.kill(os.getpid(), 9)
 replace = module._replace
@@ -53,7 +53,7 @@ if sys.argv[3] == "between":
     module._replace = last_rename_is_missing
 else:
     module.prune = kill
-with module.writing(Path(sys.argv[1]), force=True) as draft:
+with module.write_directory(Path(sys.argv[1]), force=True) as draft:
     (draft / "new").touch()
 """
 

@@ -12,7 +12,7 @@ import pytest
 from vlatool.errors import DataError, RecipeError, SourceError
 from vlatool.training import torchrun
 from vlatool.training.launcher import check_launch
-from vlatool.training.torchrun import Follower, Launch, check_shared, current_launch, follow, lead, write_rendezvous
+from vlatool.training.torchrun import Follower, Launch, check_shared, current_launch, follow, lead, write_token
 
 SAID = {"RANK": "1", "WORLD_SIZE": "4", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "10.0.0.7",
         "MASTER_PORT": "29500"}  # fmt: skip
@@ -59,11 +59,11 @@ def test_another_number_of_processes_is_refused(rank: int, size: int):
 
 
 def test_a_folder_that_is_not_seen_is_told(tmp_path: Path):
-    job = {"place": str(tmp_path), "rank": 1, "size": 2, **write_rendezvous(tmp_path)}
+    job = {"place": str(tmp_path), "rank": 1, "size": 2, **write_token(tmp_path)}
     check_shared(job)
     with pytest.raises(RecipeError, match=r"Process 2 of 2 on .* runs torch [\d.]+.*, the first process 0\.1"):
         check_shared({**job, "versions": {"torch": "0.1"}})
-    (tmp_path / torchrun.RENDEZVOUS_FILE).write_text("of another training")
+    (tmp_path / torchrun.RENDEZVOUS).write_text("of another training")
     with pytest.raises(RecipeError, match=f"does not see the folder .* {tmp_path}") as caught:
         check_shared(job)
     assert "VLATOOL_CACHE" in caught.value.fix

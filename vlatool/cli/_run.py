@@ -29,14 +29,7 @@ from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
 from vlatool.stage.controls import PRUNED, controls
 from vlatool.stage.finish import read_difference
-from vlatool.stage.run import (
-    cache_directory,
-    cached_transform,
-    first_steps,
-    measure_in_child,
-    run_measure,
-    run_transform,
-)
+from vlatool.stage.run import cache_directory, cached_transform, first_steps, measure_in_child, report_of, run_transform
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -281,7 +274,7 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
     """Run a stage here; evaluate a bundle of OpenVINO in the board's instruction set, where this host has that."""
     engine = getattr(stage, "engine", "") or bundle.manifest.engine
     if board is None or stage.kind() != "evaluate" or engine != ENGINE:
-        return run_measure(stage, bundle, context)
+        return report_of(stage, bundle, context)
     computes = board_set(board)
     confine = {MAX_CPU_ISA: computes.to_set}
     report = measure_in_child(confine, stage, bundle, context) if computes.to_set else stage.run(bundle, context)

@@ -158,14 +158,12 @@ def find_unlisted(root: Path, listed: set[str], free: tuple[str, ...], folder: s
                     return name
                 if entry.is_dir(follow_symlinks=False):
                     pending.append(name)
-                elif name not in listed and not (
-                    entry.is_file(follow_symlinks=False) and _is_exempt(name, free, folder)
-                ):
+                elif name not in listed and not (entry.is_file(follow_symlinks=False) and _exempt(name, free, folder)):
                     return name
     return ""
 
 
-def _is_exempt(name: str, free: tuple[str, ...], folder: str) -> bool:
+def _exempt(name: str, free: tuple[str, ...], folder: str) -> bool:
     return name in free or name.startswith(f"{folder}/") or name.rpartition("/")[2] in DESKTOP_FILES
 
 

@@ -130,8 +130,7 @@ def _check_nodes(root: Any, what: str, raised: type[InputError]) -> None:
     def size(node: Any) -> int:
         if id(node) in open_:
             raise raised(
-                f"{what} has an alias inside the value that it refers to{_line(node)}.",
-                "write the value out in its place",
+                f"{what} has an alias inside the value it refers to{_line(node)}.", "write the value out in its place"
             )
         if id(node) not in sizes:
             open_.add(id(node))

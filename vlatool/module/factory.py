@@ -12,15 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import (
-    InputError,
-    MissingExtra,
-    SourceError,
-    VlatoolError,
-    fix_for,
-    pip_install,
-    suggest,
-)
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, fix_for, pip_install, suggest
 from vlatool.files.printable import message_of
 from vlatool.module.bytecode import ignore_bytecode
 from vlatool.user_code.children import exit_error

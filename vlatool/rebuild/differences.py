@@ -55,9 +55,7 @@ def _compare(first: Bundle, second: Bundle, name: str) -> FileMatch:
     one, two = first.manifest.files.get(name), second.manifest.files.get(name)
     if one is None or two is None:
         size = (one or two).bytes if one or two else 0  # type: ignore[union-attr]
-        return FileMatch(
-            name, size, False, "only in the rebuilt bundle" if one is None else "not in the rebuilt bundle"
-        )
+        return FileMatch(name, size, False, f"{'only' if one is None else 'not'} in the rebuilt bundle")
     if same_bytes(first.path / name, second.path / name):
         return FileMatch(name, one.bytes, True)
     return FileMatch(name, one.bytes, False, explain(first.path / name, second.path / name))

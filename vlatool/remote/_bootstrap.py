@@ -132,12 +132,8 @@ def run(line: Line, directory: RunDirectory, guard: Guard, message: dict[str, An
     for folder in folders.values():
         folder.mkdir()
     paths = os.pathsep.join(filter(None, [str(package), os.environ.get("PYTHONPATH")]))
-    own = {
-        "PYTHONPATH": paths,
-        "PYTHONUTF8": "1",
-        "PYTHONUNBUFFERED": "1",
-        "VLATOOL_CACHE": str(directory.path / "cache"),
-    }
+    cache = str(directory.path / "cache")
+    own = {"PYTHONPATH": paths, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "VLATOOL_CACHE": cache}
     environment = {**os.environ, **{name: str(folder) for name, folder in folders.items()}, **own}
     environment.pop("PYTHONPYCACHEPREFIX", None)
     command = [sys.executable, "-m", message["module"]]

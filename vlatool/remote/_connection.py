@@ -18,7 +18,7 @@ from typing import IO, Any, cast
 from vlatool.errors import MissingExtra, TargetError
 from vlatool.files.limits import check_limit, limit
 from vlatool.files.printable import one_line, printable
-from vlatool.remote._validate_replies import parse_message
+from vlatool.remote._validate_replies import parse
 
 ALIVE_S = 5
 """Seconds between signs of life to the target."""
@@ -272,7 +272,7 @@ class Connection:
                 if marked:
                     self._answered = True
                     check_limit("target_message_bytes", len(rest), f"A message of {self._target}", TargetError)
-                    self._messages.append(parse_message(rest, self._target))
+                    self._messages.append(parse(rest, self._target))
         elif mark in self._buffer:
             check_limit("target_message_bytes", len(self._buffer), f"A message of {self._target}", TargetError)
         elif len(self._buffer) > MAX_NOISE_BYTES:

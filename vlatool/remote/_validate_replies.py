@@ -60,7 +60,7 @@ class DiskFull:
     path: str
 
 
-def parse_message(text: bytes | str, target: str) -> dict[str, Any]:
+def parse(text: bytes | str, target: str) -> dict[str, Any]:
     """Return a message of the target.
 
     Raises:
@@ -95,7 +95,7 @@ def sane(value: Any, target: str, depth: int = 0) -> Any:
     return value
 
 
-def read_reply(kind: type[T], value: Any, target: str, where: str) -> T:
+def read(kind: type[T], value: Any, target: str, where: str) -> T:
     """Return a reply of the target as an object of a type.
 
     Raises:
@@ -113,7 +113,7 @@ def python_of(facts: Any, target: str) -> Python:
     Raises:
         TargetError: when something of it is missing or of another type.
     """
-    python = read_reply(Python, facts, target, "python")
+    python = read(Python, facts, target, "python")
     return replace(
         python,
         command=one_line(python.command),

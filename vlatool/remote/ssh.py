@@ -25,9 +25,9 @@ from vlatool.remote._validate_replies import (
     DiskFull,
     Python,
     invalid_reply,
-    parse_message,
+    parse,
     python_of,
-    read_reply,
+    read,
     sane,
 )
 from vlatool.stage.base import OnProgress
@@ -131,7 +131,7 @@ def _find_python(
             if set(packages) == set(pythons[-1].packages):
                 return pythons[-1]
         elif "broken" in heard:
-            codes.append(read_reply(int, heard["broken"], target, "broken"))
+            codes.append(read(int, heard["broken"], target, "broken"))
     raise invalid_reply(target, f"it has more than {MAX_PYTHONS} Pythons")
 
 
@@ -150,7 +150,7 @@ def _send(connection: Connection, target: str, load: _push.Payload, tell: OnProg
     answer = connection.receive(DIRECTORY_S)
     if "ready" not in answer:
         raise _target_error(target, answer)
-    directory = read_reply(str, answer["ready"], target, "ready")
+    directory = read(str, answer["ready"], target, "ready")
     sent = 0
     for packed, size in load.archives():
         connection.doing = f"while files were sent ({sent / 1e6:.1f} of {load.size / 1e6:.1f} MB)"
@@ -170,7 +170,7 @@ def _target_error(target: str, answer: Mapping[str, Any]) -> VlatoolError:
             f"{target} has no directory to write to: {text}.", "set TMPDIR or XDG_CACHE_HOME there to one that has room"
         )
     if word == "no room":
-        disk = read_reply(DiskFull, parse_message(str(answer["text"]), target), target, "room")
+        disk = read(DiskFull, parse(str(answer["text"]), target), target, "room")
         numbers = f"{disk.need / 1e6:.1f} MB are needed, {disk.free / 1e6:.1f} MB are free"
         return OutputError(
             f"The disk of {target} is too full: {numbers} below {one_line(disk.path)}.", "free some space there"
@@ -194,7 +194,7 @@ def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell:
     while True:
         heard = connection.receive(alive=True)
         if "agent" in heard:
-            line = read_reply(str, heard["agent"], target, "agent")
+            line = read(str, heard["agent"], target, "agent")
             for there, here in paths.items():
                 line = line.replace(json.dumps(there)[1:-1], json.dumps(here)[1:-1])
             match read_line(line, lambda values: sane(values, target)):
@@ -207,7 +207,7 @@ def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell:
                 tell(f"{target} could not remove {one_line(str(heard['left']))}", None)
             if "refused" in heard:
                 raise _target_error(target, heard)
-            return _result(target, answer, read_reply(AgentExit, heard["ended"], target, "ended"))
+            return _result(target, answer, read(AgentExit, heard["ended"], target, "ended"))
 
 
 def _result(target: str, answer: Result | Raised | None, ended: AgentExit) -> dict[str, Any]:

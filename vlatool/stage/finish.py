@@ -275,12 +275,7 @@ def history(bundle: Bundle) -> tuple[dict[str, Any], ...]:
     if "candidate" not in made_by or (recorded and recorded[-1]["stage"] == OPTIMIZE):
         return recorded
     options = {name: made_by[name] for name in ("candidate", "profile") if name in made_by}
-    handed = {
-        "vlatool": made_by.get("vlatool", ""),
-        "stage": OPTIMIZE,
-        "options": options,
-        "input": manifest.parent,
-    }
+    handed = {"vlatool": made_by.get("vlatool", ""), "stage": OPTIMIZE, "options": options, "input": manifest.parent}
     decided = {name: getattr(manifest, name) for name in FINALIZED_FIELDS if getattr(manifest, name)}
     return (*recorded, {**handed, **decided})
 
@@ -341,9 +336,8 @@ def _outputs(
     actions = []
     fix = OF_THE_GRAPHS if policy.bundle.manifest.parent else OF_THE_POLICY
     for number, (observation, noise) in enumerate(samples):
-        doing = (
-            engine_call(engine, f"ran {graph_names(policy.bundle.manifest)}") if engine else contextlib.nullcontext()
-        )
+        deed = f"ran {graph_names(policy.bundle.manifest)}"
+        doing = engine_call(engine, deed) if engine else contextlib.nullcontext()
         held = not_finite_text(policy.spec, observation)
         remedy = OF_NOT_FINITE if held and not policy.bundle.manifest.parent else fix
         with doing, off_the_robot(f"observation {number}{f', which holds {held}' if held else ''}", remedy):

@@ -43,9 +43,8 @@ def count_shares(path: Path, context: Context) -> dict[str, float]:
         path.write_bytes(model.SerializeToString())
         shares, unknown = shares_and_unknown(path)
     if unknown:
-        named = ", ".join(unknown[:MAX_NAMES]) + (
-            f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
-        )
+        more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
+        named = ", ".join(unknown[:MAX_NAMES]) + more
         context.messages.append(f"{path.stem}: not counted, for want of fixed shapes: {named}")
     return shares
 

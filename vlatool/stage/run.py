@@ -122,7 +122,7 @@ def _words(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def run_measure(stage: Measure, source: Bundle, context: Context) -> Report:
+def report_of(stage: Measure, source: Bundle, context: Context) -> Report:
     """Run a stage that measures; in a child process where it opens graphs itself."""
     return measure_in_child({}, stage, source, context) if stage.runs_graphs else stage.run(source, context)
 
@@ -139,7 +139,7 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
         except DataError:
             context.progress(f"the cached {stage.name()} is damaged; measuring again", None)
     own = replace(context, unfinished=[], notes=[])
-    report = replace(run_measure(stage, source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    report = replace(report_of(stage, source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     mark_cache(cache)
     with write_directory(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")

@@ -13,12 +13,12 @@ from vlatool.errors import RecipeError, SourceError, VlatoolError
 from vlatool.training.group import AGAIN, LOST, Group, join_group
 from vlatool.training.torchrun import (
     PRELOAD,
-    RENDEZVOUS_FILE,
+    RENDEZVOUS,
     Follower,
     Launch,
     current_launch,
-    rendezvous_store,
-    write_rendezvous,
+    open_store,
+    write_token,
 )
 from vlatool.user_code.children import Child
 
@@ -124,8 +124,8 @@ def launch_processes(
     if size == 1:
         yield RankProcesses()
         return
-    (folder / RENDEZVOUS_FILE).unlink(missing_ok=True)
-    job = {**job, "place": str(folder), "size": size, **(write_rendezvous(folder) if launch else {})}
+    (folder / RENDEZVOUS).unlink(missing_ok=True)
+    job = {**job, "place": str(folder), "size": size, **(write_token(folder) if launch else {})}
     with contextlib.ExitStack() as opened:
         threads = opened.enter_context(ThreadPoolExecutor(size - 1))
         others: list[Child | Follower] = []
@@ -136,7 +136,7 @@ def launch_processes(
         crew = RankProcesses(others, threads)
         with crew.calling("load", job):
             pass
-        store, here = rendezvous_store(job)
+        store, here = open_store(job)
         with crew.calling("join", job):
             opened.enter_context(join_group(store, crew.group, device, here=here))
         yield crew

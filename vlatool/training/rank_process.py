@@ -22,7 +22,7 @@ from vlatool.training.held_out import HeldOut
 from vlatool.training.loop import Draw, Trainer
 from vlatool.training.objective import Objective
 from vlatool.training.stage import TrainingStage
-from vlatool.training.torchrun import check_shared, current_launch, rendezvous_store
+from vlatool.training.torchrun import check_shared, current_launch, open_store
 
 OnProgress = Callable[[str, float | None], None]
 FILE_SYSTEM_TIMEOUT_S = 120.0
@@ -75,7 +75,7 @@ def load(job: Mapping[str, Any], _tell: OnProgress) -> None:
 
 def join(job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Join the group, at the same time as its other processes."""
-    peer, (store, here) = _state[0], rendezvous_store(job)
+    peer, (store, here) = _state[0], open_store(job)
     peer.opened.enter_context(join_group(store, peer.group, peer.stage.settings().device.name, here=here))
 
 

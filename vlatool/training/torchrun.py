@@ -30,7 +30,7 @@ from vlatool.user_code.children import Child
 VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 """Environment variables that torchrun sets for each process."""
 AGENT = "TORCHELASTIC_USE_AGENT_STORE"
-RENDEZVOUS_FILE = "meeting"
+RENDEZVOUS = "meeting"
 """File in the folder of the training through which processes of one machine find each other; under torchrun it holds
 what shows that a process sees that folder."""
 PRELOAD = ("torch", "vlatool.training.rank_process")
@@ -119,10 +119,10 @@ def versions() -> dict[str, str]:
     return {"vlatool": VERSION, "torch": str(require("torch", "build").__version__)}
 
 
-def write_rendezvous(folder: Path) -> dict[str, Any]:
+def write_token(folder: Path) -> dict[str, Any]:
     """Write a token into the folder of the training; return it with the versions, for other processes to check."""
     token = secrets.token_hex(8)
-    (folder / RENDEZVOUS_FILE).write_text(token)
+    (folder / RENDEZVOUS).write_text(token)
     return {"token": token, "versions": versions()}
 
 
@@ -134,7 +134,7 @@ def check_shared(job: Mapping[str, Any]) -> None:
     """
     if "token" not in job:
         return
-    who, seen = f"Process {job['rank'] + 1} of {job['size']} on {platform.node()}", Path(job["place"], RENDEZVOUS_FILE)
+    who, seen = f"Process {job['rank'] + 1} of {job['size']} on {platform.node()}", Path(job["place"], RENDEZVOUS)
     for name, theirs in job["versions"].items():
         if (ours := versions()[name]) != theirs:
             raise RecipeError(f"{who} runs {name} {ours}, the first process {theirs}.", "install the same versions")
@@ -147,13 +147,13 @@ def check_shared(job: Mapping[str, Any]) -> None:
                           f"{seen.parent}.", SHARED)  # fmt: skip
 
 
-def rendezvous_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
+def open_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
     """Return a function that opens the store of a training's group, and whether all processes are on this machine."""
     launch = current_launch()
     if launch is not None:
         return partial(launch.store, f"vlatool-{job['token']}"), launch.on_one_machine
     store = require("torch.distributed", "build").FileStore
-    return partial(store, str(Path(job["place"]) / RENDEZVOUS_FILE), job["size"]), True
+    return partial(store, str(Path(job["place"]) / RENDEZVOUS), job["size"]), True
 
 
 class Follower:

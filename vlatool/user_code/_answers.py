@@ -187,9 +187,7 @@ def _engine_error(code: int, doing: EngineCall, said: str) -> GraphError:
     if code == -signal.SIGALRM:
         seconds = limit("engine_seconds")
         error = engine_crash(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)
-        return GraphError(
-            error.message, f"if it needs longer, raise it: {LIMITS_VARIABLE}=engine_seconds={10 * seconds}"
-        )
+        return GraphError(error.message, f"if it needs longer: {LIMITS_VARIABLE}=engine_seconds={10 * seconds}")
     how = f"with {_signal(code)}" if code < 0 else f"with exit code {code}"
     return engine_crash(doing, f"ended its process {how}", said)
 

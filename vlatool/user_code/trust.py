@@ -126,9 +126,8 @@ def trust(folder: Path) -> None:
         draft.replace(file)
     except OSError as error:
         draft.unlink(missing_ok=True)
-        raise OutputError(
-            f"{file} cannot be written: {error.strerror}.", f"name another file: {TRUST_VARIABLE}=FILE"
-        ) from error
+        fix = f"name another file: {TRUST_VARIABLE}=FILE"
+        raise OutputError(f"{file} cannot be written: {error.strerror}.", fix) from error
 
 
 def trust_file() -> Path:

@@ -86,10 +86,8 @@ class RemoteWorker:
             os.environ.pop(name, None)
         os.environ.update(self._order.variables)
         pairs = [(parcel.folder, str(parcel.place)) for parcel in self._order.parcels]
-        self._to_local, self._to_sender = (
-            PathTranslation(pairs),
-            PathTranslation([(path, folder) for folder, path in pairs]),
-        )
+        self._to_local = PathTranslation(pairs)
+        self._to_sender = PathTranslation([(path, folder) for folder, path in pairs])
 
     def hello(self) -> dict[str, Any]:
         """Return what this machine is, and which parcels it lacks: their places in the order."""

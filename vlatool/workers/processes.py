@@ -14,6 +14,5 @@ class Processes(Workers):
 
     def answers(self, work: Work, tell: OnProgress, done: Done, note: Note) -> Generator[Any, None, None]:
         """Yield the answers in order."""
-        return map_jobs(
-            work.function, work.requests, max(1, self.count), tell, work.about, work.preload, work.last, done
-        )
+        count = max(1, self.count)
+        return map_jobs(work.function, work.requests, count, tell, work.about, work.preload, work.last, done)

@@ -237,13 +237,11 @@ class _RayWorkers:
         for name in dict.fromkeys((*here, *there)):
             ours, theirs = (side.get(name, "none") for side in (here, there))
             if ours != theirs:
-                differences = (
-                    f"A worker of the Ray cluster has {name} {theirs}, this machine {ours}: what it computes may "
-                )
-                differences += "differ in rounding, and so may single episodes."
-                if differences not in self._told:
-                    self._told.add(differences)
-                    self._note(differences)
+                text = f"A worker of the Ray cluster has {name} {theirs}, this machine {ours}: what it computes may "
+                text += "differ in rounding, and so may single episodes."
+                if text not in self._told:
+                    self._told.add(text)
+                    self._note(text)
 
     def _accept_answer(self, seat: Any, number: int, said: dict[str, Any]) -> None:
         """Take what came of a job, and give the worker another one."""
