@@ -31,8 +31,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import ClassVar
 
-HERE = Path(__file__).parent
-DISTRIBUTION = "vlatool" if (HERE / "cli").is_dir() else "vlatool-runtime"
+PACKAGE = Path(__file__).parent
+DISTRIBUTION = "vlatool" if (PACKAGE / "cli").is_dir() else "vlatool-runtime"
 """Name of this distribution for pip: all of vlatool, or only what a robot needs, without a command line."""
 
 
@@ -192,7 +192,7 @@ def pip_install(extra: str, distribution: str = DISTRIBUTION) -> str:
     return f"pip install '{distribution}[{extra}]'"
 
 
-def refuse_two_distributions(packages: Path = HERE.parent) -> None:
+def refuse_two_distributions(packages: Path = PACKAGE.parent) -> None:
     """Refuse to run where both vlatool and vlatool-runtime are installed: they own the same files.
 
     Args:

@@ -55,11 +55,11 @@ def test_zeros_of_two_of_four_stay(sparse: Bundle, tmp_path: Path, options: dict
 def test_quantization_aware_training_keeps_them(sparse: Bundle):
     stage = build_stage("quantize.qat", {"steps": 2, "batch": 6, "episodes": 0, "student_episodes": 0})
     modules = load_modules(sparse)
-    _, lesson = stage.prepare_objective(modules, sparse)
-    assert lesson.constraint is not None
+    _, objective = stage.prepare_objective(modules, sparse)
+    assert objective.constraint is not None
     weight = modules["main"].blocks[0].mlp[1].weight
     zero = weight == 0
-    with lesson.constraint.step(1):
+    with objective.constraint.step(1):
         weight.data += 1
     assert torch.equal(weight == 0, zero)
 

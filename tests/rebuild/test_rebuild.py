@@ -22,7 +22,7 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.rebuild.differences import FileMatch, compare_bundles, explain, name_list
-from vlatool.rebuild.rebuild import Rebuilt, build_record, rebuild, version_changes
+from vlatool.rebuild.rebuild import RebuildResult, build_record, rebuild, version_changes
 from vlatool.report import Report
 from vlatool.sources import source_stage
 from vlatool.sources.onnx import OnnxFile
@@ -56,7 +56,7 @@ def dynamic_bundle(onnx_policy: Path, tmp_path_factory: pytest.TempPathFactory) 
 def again(tmp_path: Path):
     """Make a bundle again."""
 
-    def run(bundle: Bundle, source: Path | str | None = None, **settings: Any) -> Rebuilt:
+    def run(bundle: Bundle, source: Path | str | None = None, **settings: Any) -> RebuildResult:
         settings.setdefault("cache", tmp_path / "empty_cache")
         return rebuild(bundle, QUIET, source=None if source is None else str(source), **settings)
 
@@ -442,6 +442,6 @@ def test_the_same_command_in_another_process_gives_the_same_bytes(policy_templat
 )
 def test_the_file_that_others_were_made_from_is_the_first_difference(differing, first):
     files = tuple(FileMatch(name, 1, False, "other") for name in sorted(differing))
-    found = Rebuilt(Bundle(Path("b"), None), "", "", files, ()).first_difference  # type: ignore[arg-type]
+    found = RebuildResult(Bundle(Path("b"), None), "", "", files, ()).first_difference  # type: ignore[arg-type]
     assert found is not None
     assert found.file == first

@@ -32,7 +32,7 @@ def frames(tmp_path: Path) -> Frames:
     return frames
 
 
-def lesson() -> Objective:
+def objective() -> Objective:
     torch.manual_seed(0)
     module = nn.Sequential(nn.Linear(3, 8), nn.LayerNorm(8), nn.GELU(), nn.Linear(8, 1)).eval()
 
@@ -45,7 +45,7 @@ def lesson() -> Objective:
 
 def trained(frames: Frames, folder: Path, accumulate: int) -> tuple[list[float], torch.Tensor]:
     folder.mkdir()
-    taught = lesson()
+    taught = objective()
     trainer = Trainer(taught.modules, Settings(60, learning_rate=0.01, average=0.9), folder)
     trainer.train(60, Batches(taught.loss, frames, 20, accumulate, Group()), lambda _step, _loss: None)
     trainer.finish()

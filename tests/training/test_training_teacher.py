@@ -28,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.mark.parametrize("name", ["", "policy.yaml"])
 def test_a_policy_teaches_as_its_bundle_does(folder: Path, name: str, tmp_path: Path):
-    stage = PolicyDistillation(teacher=folder / name).named()
+    stage = PolicyDistillation(teacher=folder / name).trust_code()
     check_teacher(folder / name)
     made = run_transform(TorchModule(policy=folder), None, tmp_path / "bundle", Context())
     assert teacher_bundle(folder / name).hash == made.hash == teacher_bundle(made.path).hash
@@ -43,7 +43,7 @@ def test_its_code_runs_where_the_user_named_it(folder: Path):
             read(folder)
         assert f"--trust {folder.resolve()}" in caught.value.fix
     assert not trust.is_named(folder)
-    stage.named().check(None, None)
+    stage.trust_code().check(None, None)
 
 
 def test_what_it_is_made_of_is_part_of_the_key(folder: Path):

@@ -63,13 +63,13 @@ class Bundle:
             BundleError: when the directory is missing or no bundle, or a file is missing, changed, unknown or a link.
             SpecError: for an impossible spec or program.
         """
-        bundle = cls.described(path)
+        bundle = cls.open_lazily(path)
         if verify:
             bundle.verify()
         return bundle
 
     @classmethod
-    def described(cls, path: str | os.PathLike[str]) -> Bundle:
+    def open_lazily(cls, path: str | os.PathLike[str]) -> Bundle:
         """Read the manifest, check it against its digest; the files are checked when they are read (``read``).
 
         Raises:

@@ -27,7 +27,7 @@ from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
-from vlatool.stage.controls import PRUNED, controls
+from vlatool.stage.controls import PRUNED_KEY, controls
 from vlatool.stage.finish import read_difference
 from vlatool.stage.run import cache_directory, cached_transform, first_steps, measure_in_child, report_of, run_transform
 
@@ -130,7 +130,7 @@ def transform(
     if as_json:
         document({
             "bundle": str(out), "hash": result.hash, "bytes": result.size_bytes, "precision": precision,
-            "findings": result.manifest.findings, "pruned": result.manifest.made_by.get(PRUNED),
+            "findings": result.manifest.findings, "pruned": result.manifest.made_by.get(PRUNED_KEY),
             "board": on_board.values() if on_board else None,
             "difference": asdict(difference) if (difference := read_difference(result)) else None,
         })  # fmt: skip

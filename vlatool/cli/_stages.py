@@ -92,7 +92,7 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
         chosen = {name: value for name, value in options.items() if _typed(context, name)}
         name = f"vlatool {stage.kind()} {registry_name(stage)}"
         launch = _torchrun.launch_for(name, trains=issubclass(stage, Transform) and stage.trains)
-        built = stage_from(stage, _torchrun.with_processes(chosen, launch), name).named()
+        built = stage_from(stage, _torchrun.with_processes(chosen, launch), name).trust_code()
         if measures:
             _run.measure(typing.cast(Measure, built), **arguments)
         elif launch is not None:

@@ -161,7 +161,7 @@ class ClosedLoop(Measure):
             raise UsageError(f"Nothing can be decided: {seen[0]}.", FIX)
 
     def _bundles(self, source: Bundle) -> list[Bundle]:
-        return [*([Bundle.described(self.baseline)] if self.baseline else []), source]
+        return [*([Bundle.open_lazily(self.baseline)] if self.baseline else []), source]
 
     def on(self, profile: Profile) -> ClosedLoop:
         """Return the evaluation with the latency that is predicted for a board, where latency counts."""
@@ -329,7 +329,7 @@ class ClosedLoop(Measure):
             DataError: when both name one, and what would be played differs: a variant cannot choose its own.
         """
         own = source.manifest.environment if source else {}
-        base = Bundle.described(self.baseline).manifest.environment if self.baseline else {}
+        base = Bundle.open_lazily(self.baseline).manifest.environment if self.baseline else {}
         asked = {"make": self.environment, "tasks": self.tasks}
         other = [key for key, value in asked.items() if own and base and not value and own.get(key) != base.get(key)]
         if other:

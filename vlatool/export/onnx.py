@@ -88,7 +88,7 @@ class ExportOnnx(Transform):
         bundle = source_of(source, self.name())
         check_chunk(bundle.manifest.spec)
         observations = observations_for(bundle, self.samples)
-        expected, graphs = self._exported(bundle, observations, out, context)
+        expected, graphs = self._run_and_export(bundle, observations, out, context)
         gone = {name: written_in_float32(out / graph.file) for name, graph in graphs.items()}
         for name, graph in graphs.items():
             graphs[name] = replace(graph, precision=count_shares(out / graph.file, context))
@@ -104,7 +104,7 @@ class ExportOnnx(Transform):
                 )
         return exported
 
-    def _exported(
+    def _run_and_export(
         self, bundle: Bundle, observations: list[dict[str, Any]], out: Path, context: Context
     ) -> tuple[list[Any], dict[str, Graph]]:
         """Return what torch gives for the observations, and the graphs; no module is in memory afterwards.

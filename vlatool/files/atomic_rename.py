@@ -10,7 +10,7 @@ from pathlib import Path
 
 AT_FDCWD = -100
 NOREPLACE, EXCHANGE = 1, 2
-UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
+UNSUPPORTED_ERRORS = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 """Errors of a kernel or file system without such renames."""
 
 
@@ -50,6 +50,6 @@ def _rename(source: Path, target: Path, flags: int) -> bool:
     if call(AT_FDCWD, os.fsencode(source), AT_FDCWD, os.fsencode(target), ctypes.c_uint(flags)) == 0:
         return True
     number = ctypes.get_errno()
-    if number in UNSUPPORTED:
+    if number in UNSUPPORTED_ERRORS:
         return False
     raise OSError(number, os.strerror(number), str(source), None, str(target))

@@ -30,7 +30,7 @@ from vlatool.files.ownership import remove_owned, write_ledger
 from vlatool.files.scratch import rename_in_errors
 
 MARKER = "vlatool-draft.json"
-CONTENT, OLD = "content", "old"
+CONTENT, PREVIOUS_NAME = "content", "old"
 DRAFT_SUFFIX = re.compile(r"\.tmp-\d+-[0-9a-f]{8}$")
 MAX_ATTEMPTS = 10
 
@@ -50,7 +50,7 @@ class _Draft:
     @property
     def old(self) -> Path:
         """The previous directory, where directories cannot be exchanged."""
-        return self.path / OLD
+        return self.path / PREVIOUS_NAME
 
     @classmethod
     def make(cls, final: Path) -> _Draft:

@@ -27,8 +27,8 @@ MAX_LEDGER_BYTES = 1 << 28
 """Size of the largest ledger or manifest that is read."""
 MAX_SIDECAR = 4096
 """Size of the largest file beside a manifest that may contain the manifest's hash."""
-CHANGED = "has been changed since vlatool wrote it"
-NOT_OURS = "was not written by vlatool"
+CHANGED_REASON = "has been changed since vlatool wrote it"
+FOREIGN_REASON = "was not written by vlatool"
 
 FileStamp = tuple[int, int, int, int, int]
 """Device, inode, size, and the times of the last change of a file and of its inode in nanoseconds."""
@@ -121,7 +121,7 @@ def remove_owned(directory: Path, *, changed: bool = False) -> bool:
     entries = [] if listing is None else list(walk(directory, listing))
     if not changed and any(entry.foreign for entry in entries):
         return False
-    files = [entry.name for entry in entries if not entry.folder and entry.foreign in ("", CHANGED)]
+    files = [entry.name for entry in entries if not entry.folder and entry.foreign in ("", CHANGED_REASON)]
     for name in sorted(files, key=lambda file: (file in (MANIFEST, LEDGER), file == LEDGER)):
         with contextlib.suppress(OSError):
             os.unlink(directory / name)
@@ -149,7 +149,7 @@ def walk(directory: Path, listing: Listing, below: str = "") -> Iterator[Entry]:
         if not stat.S_ISDIR(status.st_mode):
             yield Entry(name, False, _foreign_file(directory / name, name, status.st_mode, listing))
         elif name not in listing.folders or status.st_dev != device:
-            yield Entry(name, True, NOT_OURS if status.st_dev == device else "is another file system")
+            yield Entry(name, True, FOREIGN_REASON if status.st_dev == device else "is another file system")
         else:
             yield from walk(directory, listing, name + "/")
             yield Entry(name, True)
@@ -160,11 +160,11 @@ def _foreign_file(path: Path, name: str, mode: int, listing: Listing) -> str:
     if not stat.S_ISREG(mode):
         return "is a link" if stat.S_ISLNK(mode) else "is not a regular file"
     if name == LEDGER:
-        return "" if _read_ledger(path.parent) == listing else CHANGED
+        return "" if _read_ledger(path.parent) == listing else CHANGED_REASON
     if name not in listing.files:
-        return NOT_OURS
+        return FOREIGN_REASON
     try:
-        return "" if cached_hash(path) == listing.files[name] else CHANGED
+        return "" if cached_hash(path) == listing.files[name] else CHANGED_REASON
     except OSError as error:
         return f"cannot be read ({error.strerror})"
 

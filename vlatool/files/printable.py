@@ -8,7 +8,7 @@ import unicodedata
 
 HIDDEN_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 """Unicode categories that move the cursor, change colours or the order of letters, or cannot be encoded."""
-ALLOWED = "\n\t\u200d\u00ad"
+ALLOWED_CHARACTERS = "\n\t\u200d\u00ad"
 MAX_CHARACTERS = 2000
 """Characters of a foreign message that are shown."""
 
@@ -93,6 +93,6 @@ def message_of(error: BaseException, longest: int = MAX_CHARACTERS) -> str:
 
 
 def _escape(character: str) -> str:
-    if character in ALLOWED or unicodedata.category(character) not in HIDDEN_CATEGORIES:
+    if character in ALLOWED_CHARACTERS or unicodedata.category(character) not in HIDDEN_CATEGORIES:
         return character
     return character.encode("unicode_escape", "surrogatepass").decode("ascii")

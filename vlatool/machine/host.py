@@ -55,7 +55,7 @@ ARM_CORES = {
     ("0x4e", "0x004"): "Carmel",
 }
 """(Implementer, part) of ``/proc/cpuinfo`` -> core; from ``arch/arm64/include/asm/cputype.h`` of Linux."""
-UNLIMITED = 1 << 60
+NO_LIMIT_BYTES = 1 << 60
 """A memory limit of cgroup v1 from here on means that there is none."""
 
 
@@ -206,7 +206,7 @@ def memory(root: Path = ROOT) -> dict[str, float | None]:
     for group in _groups(root, "memory"):
         for name in ("memory.max", "memory.limit_in_bytes"):
             limit = read_number(root, f"{group}/{name}")
-            if limit is not None and limit < UNLIMITED:
+            if limit is not None and limit < NO_LIMIT_BYTES:
                 limits.append(limit)
     return {
         "memory_mb": _mega(known.get("MemTotal")),

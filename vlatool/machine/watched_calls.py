@@ -97,7 +97,7 @@ _page: Page | None = None
 
 def new_page() -> int:
     """Return the descriptor of an empty page that another process may be given."""
-    fd = os.memfd_create("vlatool-awaited", os.MFD_CLOEXEC)
+    fd = os.memfd_create("vlatool-calls", os.MFD_CLOEXEC)
     os.ftruncate(fd, PAGE_BYTES)
     return fd
 

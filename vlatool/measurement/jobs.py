@@ -65,7 +65,7 @@ class WorkerJob:
 
     Args:
         job: The benchmark.
-        named: Folders whose code the user lets run (``trust.named_so_far``).
+        named: Folders whose code the user lets run (``trust.named_folders``).
     """
 
     job: LatencyJob

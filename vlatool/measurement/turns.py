@@ -223,7 +223,7 @@ def loaded(path: str, job: PairJob) -> Policy:
         VlatoolError: what ``load`` raises, with the bundle's path.
     """
     try:
-        known = [finding["name"] for finding in Bundle.described(path).manifest.findings]
+        known = [finding["name"] for finding in Bundle.open_lazily(path).manifest.findings]
         return load(path, engine=job.engine, threads=job.threads, seed=job.seed, accept=known)
     except VlatoolError as error:
         if path in error.message:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from vlatool.module._zero_values import Silent
+from vlatool.module._zero_values import ZeroValues
 from vlatool.module.factors import Axis, Factors, Shape
 
 
@@ -33,7 +33,7 @@ class Values:
         self._alike: dict[Any, Axis] = {}
         self.shapes: dict[Any, Any] = {}
         self.stored: set[Any] = set()
-        self._silent = Silent(self.stored)
+        self._silent = ZeroValues(self.stored)
 
     def shape(self, node: Any) -> Shape | None:
         """Return the axes of a node's value, None where it is not a tensor."""
@@ -100,7 +100,7 @@ class Values:
             self._alike[node] = piece
         return [piece for _ in sizes]
 
-    def stuck(self) -> frozenset[Any]:
+    def stuck_nodes(self) -> frozenset[Any]:
         """Return the nodes with equal pieces all of whose elements stay, though some of one piece might go."""
         return frozenset(node for node, axis in self._alike.items() if self._is_stuck(axis))
 

@@ -127,12 +127,12 @@ def _channel_shuffle(walk: Values, node: Any) -> Shape:
 
 
 _POOLS = ("max_pool{}d", "avg_pool{}d", "adaptive_avg_pool{}d", "adaptive_max_pool{}d", "max_pool{}d_with_indices")
-_UPSAMPLED = ("nearest1d", "nearest2d", "nearest3d", "linear1d", "bilinear2d", "trilinear3d", "bicubic2d")
+_UPSAMPLE_MODES = ("nearest1d", "nearest2d", "nearest3d", "linear1d", "bilinear2d", "trilinear3d", "bicubic2d")
 LAYERS: dict[str, Rule] = {
     **dict.fromkeys(("batch_norm", "instance_norm", "prelu"), _channels), "group_norm": _in_groups,
     **dict.fromkeys(("layer_norm", "rms_norm"), _over_last), "_weight_norm": _weight_norm,
     **{pool.format(rank): _over_space for pool in _POOLS for rank in (1, 2, 3)},
-    **{f"upsample_{kind}": _over_space for kind in _UPSAMPLED},
+    **{f"upsample_{kind}": _over_space for kind in _UPSAMPLE_MODES},
     **{f"_upsample_{kind}": _over_space for kind in ("bilinear2d_aa", "bicubic2d_aa")},
     **{f"_upsample_nearest_exact{rank}d": _over_space for rank in (1, 2, 3)},
     **{f"max_unpool{rank}d": _unpool for rank in (2, 3)},

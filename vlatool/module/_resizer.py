@@ -12,7 +12,7 @@ from vlatool.module._axis_values import argument, size_of
 from vlatool.module._segment_rules import SPLITS, along_of
 from vlatool.module.axes import Walk
 
-SIZED = {
+SIZE_ARGUMENTS = {
     "reshape": 1, "view": 1, "_unsafe_view": 1, "expand": 1, "broadcast_to": 1, "unflatten": 2,
     "zeros": 0, "ones": 0, "full": 0, "empty": 0, "new_zeros": 1, "new_ones": 1, "new_full": 1, "new_empty": 1,
 }  # fmt: skip
@@ -40,8 +40,8 @@ class Resizer:
             return
         name = getattr(node.target, "_opname", "")
         try:
-            if name in SIZED and self._walk.shape(node) is not None:
-                self._resize_list(node, SIZED[name])
+            if name in SIZE_ARGUMENTS and self._walk.shape(node) is not None:
+                self._resize_list(node, SIZE_ARGUMENTS[name])
             elif node in self._walk.counts:
                 self._resize_counts(node)
             elif name in SPLITS:

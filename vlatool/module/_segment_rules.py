@@ -9,7 +9,7 @@ from vlatool.module._axis_values import Values, argument, sizes_of
 from vlatool.module.factors import Axis, Shape
 
 Rule = Callable[[Values, Any], Any]
-FIXED = {"hstack": 1, "column_stack": 1, "vstack": 0, "dstack": 2, "hsplit": 1, "vsplit": 0, "dsplit": 2}
+FIXED_AXES = {"hstack": 1, "column_stack": 1, "vstack": 0, "dstack": 2, "hsplit": 1, "vsplit": 0, "dsplit": 2}
 """Operators that join or split along one axis, of values of rank 2 or more -> which it is."""
 SPLITS = ("chunk", "split", "split_with_sizes", "tensor_split", "unsafe_chunk", "unsafe_split",
           "unsafe_split_with_sizes", "hsplit", "vsplit", "dsplit")  # fmt: skip
@@ -21,7 +21,7 @@ def along_of(node: Any, rank: int) -> int:
     Raises:
         ValueError: for a vector, or a value that the operator makes a matrix of first.
     """
-    fixed = FIXED.get(node.target._opname)
+    fixed = FIXED_AXES.get(node.target._opname)
     if fixed is None:
         return int(argument(node, "dim", 0)) % rank
     if rank <= max(fixed, 1):

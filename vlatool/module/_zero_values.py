@@ -8,19 +8,19 @@ from vlatool.errors import require
 
 PRODUCTS = ("linear", "matmul", "mm", "bmm", "mv", "einsum", "addmm", "baddbmm", "tensordot", "conv1d", "conv2d",
             "conv3d", "conv_transpose1d", "conv_transpose2d", "conv_transpose3d")  # fmt: skip
-SCALED = ("batch_norm", "group_norm", "instance_norm", "layer_norm", "rms_norm")
+SCALE_OPERATORS = ("batch_norm", "group_norm", "instance_norm", "layer_norm", "rms_norm")
 """Those that multiply by a weight last."""
-MOVED = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze", "permute", "transpose",
+MOVES = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze", "permute", "transpose",
          "t", "mT", "numpy_T", "swapaxes", "swapdims", "movedim", "moveaxis", "expand", "expand_as", "repeat",
          "repeat_interleave", "tile", "clone", "contiguous", "detach", "to", "_to_copy", "alias", "lift_fresh_copy",
          "dropout", "slice", "narrow", "select", "unbind", "split", "split_with_sizes", "chunk", "tensor_split", "cat",
          "concat", "stack", "roll", "flip", "sum", "mean", "amax", "amin", "index_select", "gather", "reshape_as",
          "view_as")  # fmt: skip
 """Those that give zero for zero, and are not tagged as elementwise."""
-ZEROS = ("zeros", "new_zeros", "zeros_like")
+ZERO_OPERATORS = ("zeros", "new_zeros", "zeros_like")
 
 
-class Silent:
+class ZeroValues:
     """Finds out whether the values of a graph's nodes are zero where weights are.
 
     Args:
@@ -45,14 +45,14 @@ class Silent:
     def _is_zero(self, node: Any) -> bool:
         name = getattr(node.target, "_opname", getattr(node.target, "__name__", "")).removesuffix("_")
         inputs = [self._known[each] for each in node.all_input_nodes if _holds_tensors(each)]
-        if node.op != "call_function" or name in ZEROS:
-            return name in ZEROS
+        if node.op != "call_function" or name in ZERO_OPERATORS:
+            return name in ZERO_OPERATORS
         if name in PRODUCTS:
             bias = node.args[0] if name in ("addmm", "baddbmm") else (*node.args, None, None, None)[2]
             return any(inputs) and (name == "einsum" or not hasattr(bias, "op") or self._known[bias])
-        if name in SCALED:
+        if name in SCALE_OPERATORS:
             return len(inputs) > 1 and all(inputs[1:])
-        if name in MOVED or name == "getitem":
+        if name in MOVES or name == "getitem":
             return all(inputs)
         return self._gives_zero(node) if _is_elementwise(node.target) else False
 

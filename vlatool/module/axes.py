@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from vlatool.errors import require
 from vlatool.module._axis_values import Values, sizes_of
-from vlatool.module.axis_rules import TRANSPOSED, rule_for
+from vlatool.module.axis_rules import TRANSPOSES, rule_for
 from vlatool.module.factors import Atom, Axis, Shape
 
-REORDERING = (*TRANSPOSED, "permute", "movedim", "detach", "to", "_to_copy", "contiguous", "clone")
+REORDERING = (*TRANSPOSES, "permute", "movedim", "detach", "to", "_to_copy", "contiguous", "clone")
 """Operators after which a weight is still one."""
 INPUT, OUTPUT = "the policy's inputs", "the policy's outputs"
 """What keeps axes, beside operators."""
@@ -72,7 +72,7 @@ class Walk(Values):
     def __init__(self, program: Any) -> None:
         super().__init__()
         self._walk(program)
-        if stuck := self.stuck():
+        if stuck := self.stuck_nodes():
             super().__init__()
             self.apart = stuck
             self._walk(program)

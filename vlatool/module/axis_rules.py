@@ -225,32 +225,32 @@ def _embedding(walk: Values, node: Any) -> Shape:
     return [*ids, weight[1]]
 
 
-SAME = ("alias", "clone", "contiguous", "detach", "dropout", "alpha_dropout", "feature_dropout", "to", "_to_copy",
+IDENTITIES = ("alias", "clone", "contiguous", "detach", "dropout", "alpha_dropout", "feature_dropout", "to", "_to_copy",
         "type_as", "lift_fresh_copy")  # fmt: skip
 ELEMENTWISE = ("add", "bucketize", "copy", "expand_as", "hardswish", "hardsigmoid", "log_sigmoid", "real", "rsub",
                "rrelu", "selu", "celu", "square", "divide", "multiply", "subtract", "true_divide", "where")  # fmt: skip
 """Those that torch does not tag as elementwise."""
 UNIFORM = ("zeros", "ones", "full", "empty", "new_zeros", "new_ones", "new_full", "new_empty",
            "zeros_like", "ones_like", "full_like", "empty_like")  # fmt: skip
-REDUCED = ("mean", "sum", "amax", "amin", "max", "min", "std", "var", "prod", "logsumexp", "linalg_vector_norm", "norm",
+REDUCERS = ("mean", "sum", "amax", "amin", "max", "min", "std", "var", "prod", "logsumexp", "linalg_vector_norm", "norm",
            "any", "all", "argmax", "argmin", "median", "nanmedian", "nanmean", "nansum", "mode", "kthvalue", "quantile",
            "aminmax", "var_mean", "std_mean", "count_nonzero")  # fmt: skip
-ALONG = ("softmax", "_softmax", "log_softmax", "_log_softmax", "softmin", "cumsum", "cumprod", "sort", "topk",
+SCANS = ("softmax", "_softmax", "log_softmax", "_log_softmax", "softmin", "cumsum", "cumprod", "sort", "topk",
          "argsort", "flip", "roll", "logcumsumexp", "diff", "fft_fft", "fft_ifft", "fft_rfft", "fft_irfft", "fft_fft2",
          "fft_ifft2", "fft_rfft2", "fft_irfft2")  # fmt: skip
-RESHAPED = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze", "ravel")
-NUMBERED = ("arange", "linspace", "logspace", "eye", "scalar_tensor", "tril_indices", "triu_indices")
-TRANSPOSED = ("transpose", "t", "mT", "numpy_T", "swapaxes", "swapdims", "adjoint", "mH")
+RESHAPES = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze", "ravel")
+COUNTERS = ("arange", "linspace", "logspace", "eye", "scalar_tensor", "tril_indices", "triu_indices")
+TRANSPOSES = ("transpose", "t", "mT", "numpy_T", "swapaxes", "swapdims", "adjoint", "mH")
 _RULES: dict[str, Rule] = {
     **PRODUCTS, **LAYERS, **SEGMENTS,
-    **dict.fromkeys(SAME, _same), **dict.fromkeys(ELEMENTWISE, _elementwise),
+    **dict.fromkeys(IDENTITIES, _same), **dict.fromkeys(ELEMENTWISE, _elementwise),
     **dict.fromkeys(UNIFORM[:8], _uniform), **dict.fromkeys(UNIFORM[8:], _same),
-    **dict.fromkeys(ALONG, _along_axis), **dict.fromkeys(REDUCED, _reduce), **dict.fromkeys(RESHAPED, _reshape),
+    **dict.fromkeys(SCANS, _along_axis), **dict.fromkeys(REDUCERS, _reduce), **dict.fromkeys(RESHAPES, _reshape),
     **dict.fromkeys(("tril", "triu"), _triangle),
-    "permute": _permute, **dict.fromkeys(TRANSPOSED, _transpose), **dict.fromkeys(("movedim", "moveaxis"), _movedim),
+    "permute": _permute, **dict.fromkeys(TRANSPOSES, _transpose), **dict.fromkeys(("movedim", "moveaxis"), _movedim),
     **dict.fromkeys(("expand", "broadcast_to"), _expand), **dict.fromkeys(("repeat", "tile"), _repeat),
     "repeat_interleave": _repeat_each, **dict.fromkeys(("reshape_as", "view_as"), _reshape_as), "unfold": _windows,
-    **dict.fromkeys(NUMBERED, _counter_values), "one_hot": _one_hot, "outer": _outer, "kron": _kronecker,
+    **dict.fromkeys(COUNTERS, _counter_values), "one_hot": _one_hot, "outer": _outer, "kron": _kronecker,
     **dict.fromkeys(("linalg_vecdot", "cosine_similarity", "pairwise_distance"), _pairs_reduced),
     "select": _select, "embedding": _embedding,
     **dict.fromkeys(("index", "index_select"), _index),

@@ -28,7 +28,7 @@ FITS = (
     "correct the spec in policy.yaml if the policy never gets such an input, or forward() if it may; "
     "docs/guides/your-own-policy.md says what forward() is given"
 )
-SAME = 1e-3
+TOLERANCE = 1e-3
 """Relative and absolute difference that a different order of additions may cause."""
 
 
@@ -152,7 +152,7 @@ class BatchedProgram:
         except SourceError:
             return False
         close = require("torch", "build").allclose
-        return all(both[name].shape == value.shape and close(both[name].float(), value.float(), SAME, SAME)
+        return all(both[name].shape == value.shape and close(both[name].float(), value.float(), TOLERANCE, TOLERANCE)
                    for name, value in wanted.items())  # fmt: skip
 
     def _run(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-AGAIN = "make the bundle again from its policy: vlatool prune, or vlatool rebuild; edits are not written by hand"
+REMAKE = "make the bundle again from its policy: vlatool prune, or vlatool rebuild; edits are not written by hand"
 """What to do about an edit that does not fit."""
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, SourceError, require, suggest
 from vlatool.files.json import read_json
-from vlatool.module.edit import AGAIN
+from vlatool.module.edit import REMAKE
 from vlatool.module.edit import Edit as Edit
 from vlatool.module.feeds import first_feeds
 from vlatool.module.unit_removal import remove_units
@@ -45,7 +45,7 @@ SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": 
 
 SAFETENSORS_DTYPES = {"torch.float32": "F32", "torch.float64": "F64", "torch.float16": "F16", "torch.bfloat16": "BF16"}
 """Type of a weight that is trained -> as safetensors calls it."""
-_CHANGED: weakref.WeakSet[Any] = weakref.WeakSet()
+_CHANGED_MODULES: weakref.WeakSet[Any] = weakref.WeakSet()
 """Modules that were changed in this process."""
 
 
@@ -78,15 +78,15 @@ def edits_from(text: str | bytes, where: str) -> tuple[Edit, ...]:
         SourceError: when it is not one.
     """
     content = text.encode() if isinstance(text, str) else text
-    listed = read_json(content, where, SourceError, AGAIN, strict=True)
+    listed = read_json(content, where, SourceError, REMAKE, strict=True)
     if not isinstance(listed, list):
-        raise SourceError(f"{where} must hold a list of edits; got {type(listed).__name__}.", AGAIN)
+        raise SourceError(f"{where} must hold a list of edits; got {type(listed).__name__}.", REMAKE)
     return tuple(_edit(entry, where) for entry in listed)
 
 
 def _edit(value: Any, where: str) -> Edit:
     if not _is_edit(value):
-        raise SourceError(f"{where} has an invalid edit: {json.dumps(value)[:200]}; wanted {FORM}.", AGAIN)
+        raise SourceError(f"{where} has an invalid edit: {json.dumps(value)[:200]}; wanted {FORM}.", REMAKE)
     return Edit(str(value["graph"]), str(value["module"]), value["axis"], tuple(value["keep"]))
 
 
@@ -112,7 +112,7 @@ def apply_bundle(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: b
         SourceError: when an edit or a tensor does not fit the module, or the factory gives one that was changed before.
     """
     for graph, module in modules.items():
-        if module in _CHANGED:
+        if module in _CHANGED_MODULES:
             raise SourceError(
                 f"The factory gives the same module each time that it is called: '{graph}' was changed already.",
                 "let it make a new module each time",
@@ -151,15 +151,15 @@ def apply(
                 known = [name for name in parts if name][:MAX_LISTED]
                 more = f" and {len(parts) - 1 - len(known)} more" if len(parts) - 1 > len(known) else ""
                 says = f"An edit names the module '{edit.module}'; {suggest(edit.module, known)}{more}."
-                raise SourceError(says, AGAIN)
-            _CHANGED.add(made[edit.graph])
+                raise SourceError(says, REMAKE)
+            _CHANGED_MODULES.add(made[edit.graph])
             (_keep_blocks if edit.axis == BLOCKS else _keep)(parts[edit.module], edit)
     return made
 
 
 def _graph_module(modules: Mapping[str, nn.Module], graph: str) -> nn.Module:
     if graph not in modules:
-        raise SourceError(f"An edit names the graph '{graph}'; {suggest(graph, modules)}.", AGAIN)
+        raise SourceError(f"An edit names the graph '{graph}'; {suggest(graph, modules)}.", REMAKE)
     return modules[graph]
 
 
@@ -207,10 +207,12 @@ def _keep(module: Any, edit: Edit) -> None:
     torch = require("torch", "build")
     size = next((name for name in SIZES[edit.axis] if hasattr(module, name)), "")
     if not size or getattr(module, "groups", 1) != 1 or getattr(module, "transposed", False):
-        raise SourceError(f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen from.", AGAIN)
+        raise SourceError(
+            f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen from.", REMAKE
+        )
     if max(edit.keep) >= getattr(module, size):
         has = f"'{edit.module}' has {getattr(module, size)} {edit.axis}"
-        raise SourceError(f"{has}, numbered from 0; an edit keeps number {max(edit.keep)}.", AGAIN)
+        raise SourceError(f"{has}, numbered from 0; an edit keeps number {max(edit.keep)}.", REMAKE)
     axis = CHANNELS.index(edit.axis)
     for holder in (module._parameters, module._buffers):
         for name, value in holder.items():
@@ -227,11 +229,11 @@ def _keep_blocks(module: Any, edit: Edit) -> None:
     if not isinstance(module, nn.ModuleList | nn.Sequential):
         kind = type(module).__name__
         said = f"The blocks of '{edit.module}' ({kind}) cannot be chosen: it is not an nn.ModuleList or nn.Sequential."
-        raise SourceError(said, AGAIN)
+        raise SourceError(said, REMAKE)
     blocks = list(module._modules.items())
     if max(edit.keep) >= len(blocks):
         has = f"'{edit.module}' has {len(blocks)} blocks, numbered from 0"
-        raise SourceError(f"{has}; an edit keeps number {max(edit.keep)}.", AGAIN)
+        raise SourceError(f"{has}; an edit keeps number {max(edit.keep)}.", REMAKE)
     module._modules.clear()
     for number, index in enumerate(edit.keep):
         name, block = blocks[index]

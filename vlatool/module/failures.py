@@ -43,17 +43,17 @@ GENERATE = Cause(
     "export one decoding step as a graph and let the program of policy.yaml run it: 'repeat' for a fixed number of "
     "tokens, 'keep' or 'carry' for the cache; generate() itself decides from its own output when it ends",
 )  # fmt: skip
-SCRIPTED = Cause(
+TORCHSCRIPT = Cause(
     "a TorchScript module", None,
     "build the Python module that was scripted and load its weights, or save it with torch.export.save: TorchScript "
     "cannot be exported again",
 )  # fmt: skip
-QUANTIZED = Cause(
+QUANTIZED_WEIGHTS = Cause(
     "weights that torch has quantized", r"\bquantized::|quantized\.\w*PackedParams|torch\.(?:qint8|quint8|qint32)\b",
     "let make() return the module as it was before torch quantized it, in float; vlatool quantize makes int8 of what "
     "is exported",
 )  # fmt: skip
-CHECKED = Cause(
+CHECKED_DISTRIBUTION = Cause(
     "a distribution that checks its parameters", None,
     "return what the distribution is made of (its mean, its logits), or turn the checks off in policy.py: "
     "torch.distributions.Distribution.set_default_validate_args(False)",
@@ -64,9 +64,9 @@ CONTROL_FLOW = Cause(
     "decide with torch.where() instead of 'if', a fixed number of turns instead of 'while'; keep int(), "
     "float() and .item() of tensors out of forward()",
 )  # fmt: skip
-OTHER = Cause("", "", f"change what that line names; {GUIDE} says what forward() may hold")
+OTHER_CAUSE = Cause("", "", f"change what that line names; {GUIDE} says what forward() may hold")
 CAUSES = (
-    QUANTIZED,
+    QUANTIZED_WEIGHTS,
     Cause(
         "a generator of random numbers", r"Optional\[Generator\]|torch\._C\.Generator",
         "let forward() take the noise as an input, and declare it in the program: "
@@ -173,9 +173,9 @@ def _cause(chain: list[BaseException], module: Any) -> Cause:
     if any(frame.f_code.co_name == "generate" for frame, _line in _frames(chain[-1]) if not _is_tool(frame)):
         return GENERATE
     if any(type(part).__module__.startswith("torch.jit") for part in module.modules()):
-        return SCRIPTED
-    cause = _cause_in_text(chain) or OTHER
-    return CHECKED if cause is CONTROL_FLOW and _in_distribution(chain) else cause
+        return TORCHSCRIPT
+    cause = _cause_in_text(chain) or OTHER_CAUSE
+    return CHECKED_DISTRIBUTION if cause is CONTROL_FLOW and _in_distribution(chain) else cause
 
 
 def _in_distribution(chain: list[BaseException]) -> bool:

@@ -32,7 +32,7 @@ PERTURBATIONS = (0.0, -1.0, 1e3, -1e3)
 """What the numbers of other attributes are multiplied by, after 1 is added."""
 LIST_GROWTH = 32
 """How many times as long a list is made: it may take effect once it is full."""
-SAME = 1e-5
+TOLERANCE = 1e-5
 """Relative and absolute difference of outputs up to which they are equal."""
 
 
@@ -210,6 +210,6 @@ def _run(module: nn.Module, step: ProgramStep, feeds: Mapping[str, Any]) -> list
 def _equal(got: list[Tensor] | None, expected: list[Tensor]) -> bool:
     torch = require("torch", "build")
     return got is not None and all(
-        one.shape == other.shape and torch.allclose(one.double(), other.double(), SAME, SAME, equal_nan=True)
+        one.shape == other.shape and torch.allclose(one.double(), other.double(), TOLERANCE, TOLERANCE, equal_nan=True)
         for one, other in zip(got, expected, strict=True)
     )

@@ -11,7 +11,7 @@ from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
 from vlatool.module._resizer import Resizer
 from vlatool.module.axes import Walk
-from vlatool.module.edit import AGAIN
+from vlatool.module.edit import REMAKE
 from vlatool.module.factors import Shape
 from vlatool.module.factory import map_user_exceptions
 from vlatool.module.to_onnx import quiet_exporter
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from vlatool.module.edit import Edit
 
-ASSERTED = "_assert_tensor_metadata"
+METADATA_ASSERTION = "_assert_tensor_metadata"
 """Operator that a trace has before each conversion: dtype and device as they were then, other ones in a training."""
 RETRACE = "vlatool_retrace"
 """Attribute of a cut module that takes one batch size alone: gives the same module for another size."""
@@ -130,7 +130,7 @@ def _remove_units(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Ed
     keep = {_leaf(walk, edit): edit.keep for edit in edits}
     resizer = Resizer(walk, keep)
     for node in list(program.graph.nodes):
-        if getattr(node.target, "_opname", "") == ASSERTED:
+        if getattr(node.target, "_opname", "") == METADATA_ASSERTION:
             program.graph.erase_node(node)
         else:
             resizer.resize(node)
@@ -157,10 +157,10 @@ def _leaf(walk: Walk, edit: Edit) -> int:
     atoms = {atom.path: atom.leaf for atom in walk.factors.atoms(shape[axis])} if axis < len(shape) else {}
     leaf = atoms.get(tuple(path))
     if leaf is None or walk.factors.is_frozen(leaf):
-        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.", AGAIN)
+        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.", REMAKE)
     if max(edit.keep) >= (size := walk.factors.sizes[leaf]):
         kept = f"numbered from 0; an edit keeps number {max(edit.keep)}"
-        raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}, {kept}.", AGAIN)
+        raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}, {kept}.", REMAKE)
     return leaf
 
 

@@ -15,7 +15,7 @@ from vlatool.prune._reached import SHORT, recorded, refuse_short, sentences
 from vlatool.prune._selection import Selection
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
 from vlatool.stage.base import Context
-from vlatool.stage.controls import PRUNED
+from vlatool.stage.controls import PRUNED_KEY
 
 if TYPE_CHECKING:
     from torch import nn
@@ -72,7 +72,7 @@ class Structured(ModuleStage):
         record = recorded(self.ratio, work, whole, left, walks.values())
         context.messages.extend(sentences(record))
         edits = tuple(group.edit() for group in groups if group.stays < group.size)
-        return ModuleChanges(edits, record={PRUNED: record})
+        return ModuleChanges(edits, record={PRUNED_KEY: record})
 
     def accept(self, bundle: Bundle) -> None:
         """Refuse what falls short of the ratio.

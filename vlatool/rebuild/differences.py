@@ -160,10 +160,10 @@ def _explain_onnx(one: Path, two: Path) -> str:
     said = _named_difference("initializer", first.graph.initializer, second.graph.initializer)
     said += _named_difference("node", first.graph.node, second.graph.node)
     for part in ("input", "output", "value_info"):
-        if _serialized(getattr(first.graph, part)) != _serialized(getattr(second.graph, part)):
+        if _serialize(getattr(first.graph, part)) != _serialize(getattr(second.graph, part)):
             said.append(f"the graph's {part}")
     for part in ("opset_import", "functions", "metadata_props"):
-        if _serialized(getattr(first, part)) != _serialized(getattr(second, part)):
+        if _serialize(getattr(first, part)) != _serialize(getattr(second, part)):
             said.append(part)
     for part in ("ir_version", "producer_name", "producer_version", "doc_string"):
         if getattr(first, part) != getattr(second, part):
@@ -186,7 +186,7 @@ def _named_difference(kind: str, one: Any, two: Any) -> list[str]:
     return said
 
 
-def _serialized(items: Any) -> list[bytes]:
+def _serialize(items: Any) -> list[bytes]:
     return [item.SerializeToString(deterministic=True) for item in items]
 
 

@@ -26,7 +26,7 @@ from vlatool.stage.finish import FINALIZED_FIELDS, OPTIMIZE, history, reseal
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust
 
-MADE_LAST = ("graphs", "golden", MANIFEST)
+LAST_FILES = ("graphs", "golden", MANIFEST)
 UNUSABLE = "make the bundle again, with the command that made it"
 
 Entry = dict[str, Any]
@@ -36,7 +36,7 @@ GRAPHS = "graphs/"
 
 
 @dataclass(frozen=True)
-class Rebuilt:
+class RebuildResult:
     """What came of making a bundle again.
 
     Args:
@@ -77,7 +77,7 @@ class Rebuilt:
         return all(file.identical or file.file == MANIFEST or _is_golden(file.file) for file in self.files)
 
     @property
-    def beside(self) -> tuple[str, ...]:
+    def files_beside(self) -> tuple[str, ...]:
         """What is in the bundle, and in no hash, so that nothing of it was compared."""
         hashed = (MANIFEST, DIGEST, LEDGER)
         return tuple(name for name in UNRECORDED_NAMES if name not in hashed and (self.bundle.path / name).exists())
@@ -86,7 +86,7 @@ class Rebuilt:
 def _rank(name: str) -> int:
     """Return how late in the making of a bundle a file comes: what differs first may be why later ones do."""
     folder = name.partition("/")[0]
-    return MADE_LAST.index(folder) + 1 if folder in MADE_LAST else 0
+    return LAST_FILES.index(folder) + 1 if folder in LAST_FILES else 0
 
 
 def _is_golden(file: str) -> bool:
@@ -104,7 +104,7 @@ class _Start:
 
 
 @dataclass
-class _Places:
+class _FileSearch:
     """Where files that an option names are looked for."""
 
     files: tuple[Path, ...]
@@ -174,7 +174,7 @@ def rebuild(
     cache: Path,
     out: Path | None = None,
     force: bool = False,
-) -> Rebuilt:
+) -> RebuildResult:
     """Run the recorded stages again in a fresh directory and compare what they make with the bundle.
 
     Args:
@@ -198,9 +198,9 @@ def rebuild(
     with scratch_directory() as scratch:
         product = start.bundle
         for number, (entry, stage) in enumerate(start.stages):
-            before, place = product, scratch / f"{number}-{entry['stage']}"
+            before, folder = product, scratch / f"{number}-{entry['stage']}"
             product = (
-                _finalized(entry, before, place) if stage is None else run_transform(stage, before, place, context)
+                _finalize(entry, before, folder) if stage is None else run_transform(stage, before, folder, context)
             )
             same.append((entry["stage"], _graphs_as_recorded(entry, product)))
             if before is not None and before is not start.bundle:
@@ -213,14 +213,14 @@ def rebuild(
                 shutil.copytree(
                     product.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION, LEDGER)
                 )
-        return Rebuilt(bundle, product.hash, start.source, compared, tuple(same), left_out)
+        return RebuildResult(bundle, product.hash, start.source, compared, tuple(same), left_out)
 
 
 def _start(
     bundle: Bundle, entries: tuple[Entry, ...], source: str | None, files: tuple[Path, ...], cache: Path
 ) -> _Start:
     """Find the source, check that it is the recorded one, and build every stage before any runs."""
-    places = _Places(files, [bundle.path.parent, Path()])
+    search = _FileSearch(files, [bundle.path.parent, Path()])
     if source is not None and (Path(source) / MANIFEST).is_file():
         begin, first = Bundle.open(source), None
         later = _from_bundle(begin, entries, bundle)
@@ -236,8 +236,8 @@ def _start(
         later = entries[1:]
         policy = getattr(first, "model", None) or getattr(first, "policy", None)
         if policy is not None:
-            places.folders.insert(0, policy if policy.is_dir() else policy.parent)
-    stages = [(entry, None if entry["stage"] == OPTIMIZE else _stage(entry, places)) for entry in later]
+            search.folders.insert(0, policy if policy.is_dir() else policy.parent)
+    stages = [(entry, None if entry["stage"] == OPTIMIZE else _stage(entry, search)) for entry in later]
     beginning = [] if first is None else [(entries[0], first)]
     return _Start(str(source), begin, (*beginning, *stages))
 
@@ -254,7 +254,7 @@ def _from_bundle(begin: Bundle, entries: tuple[Entry, ...], bundle: Bundle) -> t
     )
 
 
-def _stage(entry: Entry, places: _Places) -> Transform:
+def _stage(entry: Entry, search: _FileSearch) -> Transform:
     """Build the stage of an entry, its files found and checked."""
     name, options = entry["stage"], dict(entry.get("options", {}))
     fields = stage_class(name).model_fields
@@ -263,7 +263,7 @@ def _stage(entry: Entry, places: _Places) -> Transform:
             match = RECORDED_FILE.fullmatch(str(value))
             if match is None:
                 raise BundleError(f"The build record names the file '{value}' of {name} without its hash.", UNUSABLE)
-            options[key] = places.find(match["name"], match["hash"], name)
+            options[key] = search.find(match["name"], match["hash"], name)
     stage = build_stage(name, options)
     if not isinstance(stage, Transform):
         raise BundleError(
@@ -277,9 +277,9 @@ def _recorded_source(
 ) -> tuple[Transform, str]:
     """Return the source stage and where its policy is; its files have the recorded hashes."""
     problem: VlatoolError | None = None
-    for place in [source] if source is not None else _noted_places(bundle, entries, cache):
+    for folder in [source] if source is not None else _noted_folders(bundle, entries, cache):
         try:
-            return _checked_source(place, entries[0], bundle), place
+            return _checked_source(folder, entries[0], bundle), folder
         except VlatoolError as error:
             problem = problem or error
     raise problem or SourceError(
@@ -321,7 +321,7 @@ def _short_hash(digest: str | None) -> str:
     return f"sha256:{digest[:16]}" if digest else "no such file"
 
 
-def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> Iterator[str]:
+def _noted_folders(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> Iterator[str]:
     """Yield where the source may be: as the bundle or the cached source bundle notes.
 
     Raises:
@@ -346,7 +346,7 @@ def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> It
         raise SourceError(refused.message, f"name the policy: --source DIR; or {refused.fix}")
 
 
-def _finalized(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
+def _finalize(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
     """Seal a candidate as ``optimize`` does; what it measured and decided is taken from the record."""
     bundle = source_of(bundle, OPTIMIZE)
     out.mkdir()

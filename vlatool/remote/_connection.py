@@ -31,7 +31,7 @@ MAX_NOISE_BYTES = 1 << 20
 MAX_STDERR_BYTES = 1 << 16
 """Bytes of ssh's standard error that are kept, the last ones."""
 
-AGAIN = "run it again; the target removes what was sent when the connection ends"
+RUN_AGAIN = "run it again; the target removes what was sent when the connection ends"
 REFUSALS = (
     (
         r"Could not resolve hostname",
@@ -147,7 +147,7 @@ class Connection:
                 except BrokenPipeError:
                     return self._last_words()
             if time.monotonic() - moved > STALLED_S:
-                raise TargetError(f"{self._target} took nothing for {STALLED_S} s {self.doing}.", AGAIN)
+                raise TargetError(f"{self._target} took nothing for {STALLED_S} s {self.doing}.", RUN_AGAIN)
         return True
 
     def tell(self, message: dict[str, Any]) -> bool:
@@ -179,7 +179,7 @@ class Connection:
         text = printable(self._said.decode("utf-8", "replace"))
         last = one_line(next((line for line in reversed(text.splitlines()) if line.strip()), f"exit code {code}"))
         if self._answered:
-            return TargetError(f"The connection to {self._target} ended {self.doing}: {last}", AGAIN)
+            return TargetError(f"The connection to {self._target} ended {self.doing}: {last}", RUN_AGAIN)
         for pattern, meaning, fix in REFUSALS:
             if code == 255 and re.search(pattern, text):
                 return TargetError(f"Cannot reach {self._target}, {meaning}: {last}", fix.format(target=self._target))

@@ -89,9 +89,9 @@ def script(marker: str, python: str, packages: Sequence[str]) -> bytes:
 
 
 def program() -> str:
-    """Return the text of ``_place`` and ``_bootstrap`` as one program that imports nothing of vlatool."""
+    """Return the text of ``_run_directory`` and ``_bootstrap`` as one program that imports nothing of vlatool."""
     lines = ["from __future__ import annotations"]
-    for name in ("_place.py", "_bootstrap.py"):
+    for name in ("_run_directory.py", "_bootstrap.py"):
         lines += (Path(__file__).with_name(name)).read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines[1:] if not line.startswith(("from __future__ ", "from vlatool"))]
     return "\n".join([lines[0], *kept]) + "\n"

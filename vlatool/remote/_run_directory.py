@@ -14,7 +14,7 @@ from pathlib import Path
 BLOCK = 4096
 PREFIX = "vlatool-run-"
 LOCK = "lock"
-CREATED = "made"
+CREATED_FILE = "made"
 """File that names the directories which the first run made; the last run removes them."""
 
 
@@ -68,7 +68,7 @@ class RunDirectory:
         missing = [str(parent) for parent in (cache, *cache.parents) if not parent.exists()]
         self._shared.mkdir(mode=0o700, parents=True, exist_ok=True)
         if missing:
-            (self._shared / CREATED).write_text("\0".join(missing), encoding="utf-8", errors="surrogateescape")
+            (self._shared / CREATED_FILE).write_text("\0".join(missing), encoding="utf-8", errors="surrogateescape")
         sweep(self._shared)
         return Path(tempfile.mkdtemp(prefix=PREFIX, dir=self._shared))
 
@@ -109,10 +109,10 @@ class RunDirectory:
         if self._shared is None:
             return
         with contextlib.suppress(OSError):
-            record = self._shared / CREATED
+            record = self._shared / CREATED_FILE
             left = os.listdir(self._shared)
             parents = [self._shared, self._shared.parent]
-            if left == [CREATED]:
+            if left == [CREATED_FILE]:
                 parents += map(Path, record.read_text(encoding="utf-8", errors="surrogateescape").split("\0"))
                 record.unlink()
             for parent in parents:

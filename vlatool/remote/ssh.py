@@ -19,7 +19,7 @@ from vlatool.errors import OutputError, TargetError, UsageError, VlatoolError
 from vlatool.files.printable import one_line
 from vlatool.measurement.child import CRASHES, Progress, Raised, Result, error_of, read_line, signal_name
 from vlatool.remote import _probe, _push
-from vlatool.remote._connection import AGAIN, Connection
+from vlatool.remote._connection import RUN_AGAIN, Connection
 from vlatool.remote._validate_replies import (
     AgentExit,
     DiskFull,
@@ -179,7 +179,7 @@ def _target_error(target: str, answer: Mapping[str, Any]) -> VlatoolError:
         return OutputError(f"The disk of {target} became full: {text}.", "free some space there")
     if word == "corrupt":
         return TargetError(f"What was sent to {target} did not arrive whole: {text}.", "run it again")
-    return TargetError(f"{target} could not run the benchmark: {text or one_line(str(answer))}.", AGAIN)
+    return TargetError(f"{target} could not run the benchmark: {text or one_line(str(answer))}.", RUN_AGAIN)
 
 
 def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell: OnProgress) -> dict[str, Any]:

@@ -150,7 +150,7 @@ class Stage(Numeric):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Raise a user error when this stage cannot run on that source; a cheap check."""
 
-    def named(self) -> Self:
+    def trust_code(self) -> Self:
         """Allow the code of policies that the options name to run: the user typed them (not for options in a file)."""
         return self
 

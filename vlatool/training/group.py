@@ -20,8 +20,8 @@ from vlatool.errors import SourceError, require
 if TYPE_CHECKING:
     from torch import Tensor
 
-LOST = "Another process of the training is gone."
-AGAIN = "run the same command again: it goes on from the last checkpoint"
+LOST_PROCESS = "Another process of the training is gone."
+RUN_AGAIN = "run the same command again: it goes on from the last checkpoint"
 INTERFACE = "GLOO_SOCKET_IFNAME"
 BACKENDS = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
 """Device -> what adds up: counts and losses on the processor in any case."""
@@ -67,7 +67,7 @@ def map_lost_process() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise SourceError(LOST, AGAIN) from error
+        raise SourceError(LOST_PROCESS, RUN_AGAIN) from error
 
 
 def _sum_gradients(loss: float, weights: Sequence[Tensor]) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import RecipeError, SourceError, VlatoolError
-from vlatool.training.group import AGAIN, LOST, Group, join_group
+from vlatool.training.group import LOST_PROCESS, RUN_AGAIN, Group, join_group
 from vlatool.training.torchrun import (
     PRELOAD,
     RENDEZVOUS,
@@ -66,7 +66,7 @@ class RankProcesses:
         try:
             yield
         except SourceError as error:
-            if error.message != LOST:
+            if error.message != LOST_PROCESS:
                 raise
             self._end(calls)
             raise self._cause(error) from error
@@ -97,10 +97,10 @@ class RankProcesses:
 
     def _cause(self, error: BaseException) -> BaseException:
         """Return the error that came first, not one of those that followed from it; of a kill, how to go on."""
-        first = next((each for each in self._errors if LOST not in str(each)), error)
+        first = next((each for each in self._errors if LOST_PROCESS not in str(each)), error)
         if not isinstance(first, VlatoolError) or "(SIG" not in first.message:
             return first
-        return type(first)(first.message, "; ".join(filter(None, dict.fromkeys((first.fix, AGAIN)))))
+        return type(first)(first.message, "; ".join(filter(None, dict.fromkeys((first.fix, RUN_AGAIN)))))
 
 
 @contextlib.contextmanager
@@ -133,13 +133,13 @@ def launch_processes(
             other = Follower(launch, rank) if launch else Child(f"{about}, process {rank + 1} of {size}", PRELOAD)
             opened.enter_context(other)
             others.append(other)
-        crew = RankProcesses(others, threads)
-        with crew.calling("load", job):
+        processes = RankProcesses(others, threads)
+        with processes.calling("load", job):
             pass
         store, here = open_store(job)
-        with crew.calling("join", job):
-            opened.enter_context(join_group(store, crew.group, device, here=here))
-        yield crew
+        with processes.calling("join", job):
+            opened.enter_context(join_group(store, processes.group, device, here=here))
+        yield processes
 
 
 def check_launch(launch: Launch | None, size: int) -> None:

@@ -75,33 +75,33 @@ def load(job: Mapping[str, Any], _tell: OnProgress) -> None:
 
 def join(job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Join the group, at the same time as its other processes."""
-    peer, (store, here) = _state[0], open_store(job)
-    peer.opened.enter_context(join_group(store, peer.group, peer.stage.settings().device.name, here=here))
+    state, (store, here) = _state[0], open_store(job)
+    state.opened.enter_context(join_group(store, state.group, state.stage.settings().device.name, here=here))
 
 
 def prepare(_job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Resume the training, and hold a part of the weights where they are sharded."""
-    peer, objective = _state[0], _state[0].objective
-    settings = peer.stage.settings()
-    peer.trainer = Trainer(objective.trainable, settings, peer.folder, peer.group, objective.constraint)
+    state, objective = _state[0], _state[0].objective
+    settings = state.stage.settings()
+    state.trainer = Trainer(objective.trainable, settings, state.folder, state.group, objective.constraint)
 
 
 def train(job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Take steps up to a number, on a number of rounds of rows."""
-    peer = _state[0]
-    for number in range(peer.frames.count, job["rounds"]):
-        if _wait_for_round(peer.frames, number):
-            peer.frames.read(number)
-    peer.expert.read()
-    if len(peer.frames) != job["rows"]:
+    state = _state[0]
+    for number in range(state.frames.count, job["rounds"]):
+        if _wait_for_round(state.frames, number):
+            state.frames.read(number)
+    state.expert.read()
+    if len(state.frames) != job["rows"]:
         raise DataError(
-            f"The first process trains on {job['rows']} rows, process {peer.group.rank + 1} sees {len(peer.frames)} "
-            f"of them in {peer.folder}.",
+            f"The first process trains on {job['rows']} rows, process {state.group.rank + 1} sees {len(state.frames)} "
+            f"of them in {state.folder}.",
             "let all processes see the same folder (VLATOOL_CACHE)",
         )
-    peer.training.look(partial(peer.objective.look, peer.frames, peer.expert.frames))
-    peer.training.train(job["until"], peer.batches, lambda _step, _loss: None)
-    peer.training.save()
+    state.training.look(partial(state.objective.look, state.frames, state.expert.frames))
+    state.training.train(job["until"], state.batches, lambda _step, _loss: None)
+    state.training.save()
 
 
 def _wait_for_round(frames: Frames, number: int) -> bool:
@@ -120,11 +120,11 @@ def show(_job: Mapping[str, Any], _tell: OnProgress) -> None:
 
 def examine(_job: Mapping[str, Any], _tell: OnProgress) -> None:
     """Compute the held-out loss, as the first process does."""
-    peer, held_out = _state[0], HeldOut(_state[0].folder)
+    state, held_out = _state[0], HeldOut(_state[0].folder)
     held_out.read()
-    with peer.training.averaged_weights():
-        terms = peer.stage.supervision().alpha, peer.objective.validation, peer.objective.expert
-        held_out.mixture_loss(*terms, peer.stage.batch, peer.stage.settings().device)
+    with state.training.averaged_weights():
+        terms = state.stage.supervision().alpha, state.objective.validation, state.objective.expert
+        held_out.mixture_loss(*terms, state.stage.batch, state.stage.settings().device)
 
 
 def judge(job: Mapping[str, Any], _tell: OnProgress) -> None:

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import RecipeError, SourceError, require
-from vlatool.training.group import AGAIN, LOST, Group, map_lost_process
+from vlatool.training.group import LOST_PROCESS, RUN_AGAIN, Group, map_lost_process
 from vlatool.training.units import cut_units, owners_of
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ class Parts(Shards):
             yield
         except (RuntimeError, SourceError) as error:
             if _is_communication_error(error):
-                raise SourceError(LOST, AGAIN) from error
+                raise SourceError(LOST_PROCESS, RUN_AGAIN) from error
             raise
 
     @contextlib.contextmanager

@@ -115,7 +115,7 @@ class TrainingStage(ModuleStage):
         teacher = teacher_source(self.teacher) if self.teacher else None
         return super().key(f"{source_hash} {teacher.key('')}" if teacher else source_hash)
 
-    def named(self) -> Self:
+    def trust_code(self) -> Self:
         """Allow the code of a teacher that is a policy to run in this process: the user named its folder."""
         if self.teacher and teacher_source(self.teacher):
             trust.allow(description_file(self.teacher).parent, None if self.teacher.is_dir() else self.teacher)

@@ -65,7 +65,7 @@ def check_teacher(path: Path) -> None:
         stage.check(None, None)
         return
     try:
-        Bundle.described(path)
+        Bundle.open_lazily(path)
     except BundleError as error:
         raise BundleError(f"The teacher cannot be opened: {error.message}", TEACHES) from error
 

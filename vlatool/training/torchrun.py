@@ -39,8 +39,8 @@ LEAVE_CALL = "leave"
 START_S, LEFT_S, POLL_S = 300.0, 5.0, 0.05
 """Seconds in which another process comes, and goes; and between two looks at the store."""
 LOOPBACK = ("127.", "localhost", "::1")
-AGAIN = "run the same command again on all machines: it goes on from the last checkpoint"
-SHARED = "let all machines see one cache under the same path (VLATOOL_CACHE=FOLDER on a shared file system)"
+RUN_AGAIN = "run the same command again on all machines: it goes on from the last checkpoint"
+SHARE_CACHE = "let all machines see one cache under the same path (VLATOOL_CACHE=FOLDER on a shared file system)"
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def check_shared(job: Mapping[str, Any]) -> None:
         same = False
     if not same:
         raise RecipeError(f"{who} does not see the folder in which the first process keeps rows and checkpoints: "
-                          f"{seen.parent}.", SHARED)  # fmt: skip
+                          f"{seen.parent}.", SHARE_CACHE)  # fmt: skip
 
 
 def open_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
@@ -157,7 +157,7 @@ def open_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
 
 
 class Follower:
-    """A process that follows this one, as ``Apart`` is one that it started: it calls functions of ``rank_process``.
+    """A process that follows this one, as ``Child`` is one that it started: it calls functions of ``rank_process``.
 
     Args:
         launch: this process.
@@ -207,7 +207,7 @@ class Follower:
                     self._raise_error(json.loads(self._store.get(key)))
                     return
             time.sleep(POLL_S)
-        raise SourceError(f"{self._who} of the training does not answer.", AGAIN)
+        raise SourceError(f"{self._who} of the training does not answer.", RUN_AGAIN)
 
     def _raise_error(self, answer: Mapping[str, str] | None) -> None:
         if answer is None:
@@ -275,7 +275,7 @@ def _next_call(store: Any, name: str) -> Any:
                 return None
             time.sleep(POLL_S)
     except RuntimeError as error:
-        raise SourceError("The first process of the training is gone.", AGAIN) from error
+        raise SourceError("The first process of the training is gone.", RUN_AGAIN) from error
 
 
 def _run_call(child: Child, launch: Launch, call: Mapping[str, Any]) -> Any:

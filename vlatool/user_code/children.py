@@ -288,7 +288,7 @@ def call(
     *,
     own: bool = False,
 ) -> Any:
-    """Call a function in a child of its own; see ``Child`` and ``Apart.call``."""
+    """Call a function in a child of its own; see ``Child`` and ``Child.call``."""
     with Child(about, preload, environment) as child:
         return child.call(function, job, tell, own=own)
 

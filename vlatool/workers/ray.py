@@ -50,11 +50,11 @@ class Ray(Workers):
 
     def answers(self, work: Work, tell: OnProgress, done: Done, note: Note) -> Generator[Any, None, None]:
         """Yield the answers in the order of the requests."""
-        crew = _RayWorkers(_connect(), work, self.count, tell, done, note)
+        workers = _RayWorkers(_connect(), work, self.count, tell, done, note)
         try:
-            yield from crew.run()
+            yield from workers.run()
         finally:
-            crew.dismiss(gently=sys.exc_info()[0] is None)
+            workers.dismiss(gently=sys.exc_info()[0] is None)
 
 
 def _connect() -> Any:
@@ -127,7 +127,7 @@ class _RayWorkers:
         self._most = most
         self._waiting = deque(range(len(work.requests)))
         self._busy: dict[Any, tuple[Any, int]] = {}
-        """What is awaited -> the worker that it comes from, and the number of its job."""
+        """Pending object -> the worker that it comes from, and the number of its job."""
         self._idle: list[Any] = []
         self._answers: dict[int, Any] = {}
         self._attempts: Counter[int] = Counter()
@@ -212,7 +212,7 @@ class _RayWorkers:
         self._next(seat)
 
     def _send(self, seat: Any, number: int) -> Any:
-        """Send a parcel, whose blocks are put into the cluster once; return what is awaited."""
+        """Send a parcel, whose blocks are put into the cluster once; return the pending object."""
         if number not in self._sent:
             parcel: Parcel = self._parcels[number]
             self._tell(f"sending {parcel.folder} to the workers", None)
