@@ -232,9 +232,9 @@ ELEMENTWISE = ("add", "bucketize", "copy", "expand_as", "hardswish", "hardsigmoi
 """Those that torch does not tag as elementwise."""
 UNIFORM = ("zeros", "ones", "full", "empty", "new_zeros", "new_ones", "new_full", "new_empty",
            "zeros_like", "ones_like", "full_like", "empty_like")  # fmt: skip
-REDUCERS = ("mean", "sum", "amax", "amin", "max", "min", "std", "var", "prod", "logsumexp", "linalg_vector_norm", "norm",
-           "any", "all", "argmax", "argmin", "median", "nanmedian", "nanmean", "nansum", "mode", "kthvalue", "quantile",
-           "aminmax", "var_mean", "std_mean", "count_nonzero")  # fmt: skip
+REDUCERS = ("mean", "sum", "amax", "amin", "max", "min", "std", "var", "prod", "logsumexp", "linalg_vector_norm",
+            "norm", "any", "all", "argmax", "argmin", "median", "nanmedian", "nanmean", "nansum", "mode", "kthvalue",
+            "quantile", "aminmax", "var_mean", "std_mean", "count_nonzero")  # fmt: skip
 SCANS = ("softmax", "_softmax", "log_softmax", "_log_softmax", "softmin", "cumsum", "cumprod", "sort", "topk",
          "argsort", "flip", "roll", "logcumsumexp", "diff", "fft_fft", "fft_ifft", "fft_rfft", "fft_irfft", "fft_fft2",
          "fft_ifft2", "fft_rfft2", "fft_irfft2")  # fmt: skip
