@@ -125,6 +125,10 @@ def apply_bundle(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: b
     return made
 
 
+edited = apply_bundle
+"""Old name, for code outside vlatool."""
+
+
 def apply(
     modules: Mapping[str, nn.Module], edits: Iterable[Edit], bundle: Bundle | None = None
 ) -> dict[str, nn.Module]:
