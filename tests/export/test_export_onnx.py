@@ -10,7 +10,7 @@ from vlatool.data import recorded_observations
 from vlatool.errors import GraphError, RecipeError, SourceError, SpecError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.measurement.jobs import LatencyJob
-from vlatool.measurement.worker import measure, opened
+from vlatool.measurement.worker import measure, open_policy
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.quantize.qat import Qat
 from vlatool.quantize.static_int8 import StaticInt8
@@ -168,7 +168,7 @@ def test_eager_torch_and_the_graphs_draw_the_same_noise(source, tmp_path: Path):
     made = export(bundle, tmp_path / "out")
     observation = {"state": np.array([0.1, -0.5, 2.0], np.float32)}
     job = LatencyJob((str(made.path), str(bundle.path)), iterations=40, warmup=1)
-    contestants = [opened(path, job) for path in job.bundles]
+    contestants = [open_policy(path, job) for path in job.bundles]
     graphs, eager = (each.policy.infer(observation).chunk for each in contestants)
     np.testing.assert_allclose(graphs, eager, rtol=1e-4, atol=1e-6)
     found = measure(contestants, job, lambda what, share: None)

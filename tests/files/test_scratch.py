@@ -20,7 +20,7 @@ from vlatool.files import scratch as scratch_module
 from vlatool.files.directory_writer import write_directory
 from vlatool.files.scratch import scratch_directory
 from vlatool.files.user_files import atomic_file
-from vlatool.measurement.child import ended
+from vlatool.measurement.child import end_error
 from vlatool.measurement.jobs import Limits
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
@@ -48,7 +48,7 @@ def corrupt(place: Path) -> None:
 def last_words(place: Path) -> None:
     code = "import sys; sys.exit(f'cannot map {sys.argv[1]}/graphs/main.onnx')"
     done = subprocess.run([sys.executable, "-c", code, str(place)], capture_output=True, text=True, check=False)
-    raise ended("the policy", done.returncode, done.stderr, Limits())
+    raise end_error("the policy", done.returncode, done.stderr, Limits())
 
 
 def a_child(place: Path) -> None:

@@ -29,7 +29,7 @@ from vlatool.explain._remedy import measure, plans
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.workload import workload
 from vlatool.machine.host import before_run
-from vlatool.measurement.reach import reached_in
+from vlatool.measurement.reach import reach_by_dtype
 from vlatool.measurement.validity import busy, validity
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.report import Report, Row
@@ -201,7 +201,7 @@ def _times(findings: _Findings, options: Options, context: Context) -> None:
     context.progress("profiling the operators", None)
     findings.operators = profile(findings.bundle, values, options.runs, options.threads)
     engine = findings.bundle.manifest.engine or DEFAULT_ENGINE
-    findings.reach = reached_in(engine, _macs(findings.bundle), options.threads)
+    findings.reach = reach_by_dtype(engine, _macs(findings.bundle), options.threads)
     if findings.baseline is not None:
         context.progress("profiling the operators of float32", None)
         compared = reference_engine(findings.bundle)

@@ -20,7 +20,7 @@ from vlatool.gate.timed import Timed
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
 from vlatool.measurement.pairs import PairJob
-from vlatool.measurement.validity import busy, throttled, validity
+from vlatool.measurement.validity import busy, throttling, validity
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context
@@ -73,7 +73,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
             results.append(deadline.examine(timed, gate.deadline))
     if gate.answers:
         results.append(answers.examine(agreement, timed, gate.answers))
-    seen = (*throttled(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
+    seen = (*throttling(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
     seen = seen if gate.latency or gate.deadline else ()  # findings about times
     name = candidate.manifest.name
     row = _row("candidate", candidate, timed, results)

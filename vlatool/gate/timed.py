@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from vlatool.gate.inputs import TIMING, Inputs
 from vlatool.measurement.pairs import PairJob, Pairs, measure_pairs
-from vlatool.measurement.turns import wanted
+from vlatool.measurement.turns import observation_count
 from vlatool.stage.base import Context
 
 
@@ -41,7 +41,7 @@ class Timed:
     def _measure(self, job: PairJob, number: int) -> Pairs:
         if self.inputs is None:
             return measure_pairs(job, self.timeout)
-        with self.inputs.file(wanted(job.pairs), TIMING, number) as path:
+        with self.inputs.file(observation_count(job.pairs), TIMING, number) as path:
             return measure_pairs(replace(job, observations=str(path)), self.timeout)
 
     def at_threads(self, threads: int) -> Timed:

@@ -9,9 +9,9 @@ import pytest
 
 from vlatool.errors import UsageError
 from vlatool.machine.processes import python_code, python_command
-from vlatool.measurement import limited
+from vlatool.measurement import process_limits
 from vlatool.measurement.jobs import Limits
-from vlatool.measurement.limited import chosen, command, grouped, ran_out
+from vlatool.measurement.process_limits import choose_processors, command, control_group, ran_out
 
 USES = "import os, sys; print(sorted(os.sched_getaffinity(0)))"
 
@@ -37,21 +37,21 @@ def test_a_module_runs_under_limits(tmp_path, monkeypatch):
 
 def test_the_first_processors_are_taken_and_missing_ones_named():
     usable = sorted(os.sched_getaffinity(0))
-    assert chosen(Limits(cores=1)).cpus == (usable[0],)
-    assert chosen(Limits((usable[-1],), 3)).cpus == (usable[-1],)
-    assert chosen(Limits(memory_mb=5)) == Limits(memory_mb=5)
+    assert choose_processors(Limits(cores=1)).cpus == (usable[0],)
+    assert choose_processors(Limits((usable[-1],), 3)).cpus == (usable[-1],)
+    assert choose_processors(Limits(memory_mb=5)) == Limits(memory_mb=5)
     with pytest.raises(UsageError, match=f"names processor 9999; this process may use {usable[0]}"):
-        chosen(Limits((9999,)))
+        choose_processors(Limits((9999,)))
 
 
 def test_a_control_group_is_made_where_there_is_one_and_removed(tmp_path, monkeypatch):
     base = tmp_path / "memory"
     base.mkdir()
-    monkeypatch.setattr(limited, "GROUPS", ((base, "memory.max", ("memory.swap.max", "0")),))
-    with grouped(Limits(memory_mb=100)) as limits:
+    monkeypatch.setattr(process_limits, "GROUPS", ((base, "memory.max", ("memory.swap.max", "0")),))
+    with control_group(Limits(memory_mb=100)) as limits:
         assert limits.cgroup == "", "a plain directory is no control group"
         assert list(base.iterdir()) == []
-    with grouped(Limits(cores=1)) as limits:
+    with control_group(Limits(cores=1)) as limits:
         assert limits == Limits(cores=1)
 
 
@@ -60,7 +60,7 @@ def test_what_needs_more_memory_is_stopped(tmp_path, monkeypatch):
         "block = bytearray(400_000_000)\nblock[::4096] = bytes(len(block[::4096]))\nprint('lived')\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    with grouped(Limits(memory_mb=200)) as limits:
+    with control_group(Limits(memory_mb=200)) as limits:
         done = subprocess.run(command(limits, "hungry"), capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "lived" not in done.stdout
@@ -81,12 +81,12 @@ def test_a_group_says_whether_it_ended_a_process(tmp_path):
 
 
 def test_groups_of_runs_that_were_killed_are_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(limited, "GROUPS", ((tmp_path, "memory.max", ("memory.swap.max", "0")),))
+    monkeypatch.setattr(process_limits, "GROUPS", ((tmp_path, "memory.max", ("memory.swap.max", "0")),))
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     for name in (f"vlatool-{gone.pid}-a", f"vlatool-{os.getpid()}-b", "vlatool-x-c", "other"):
         (tmp_path / name).mkdir()
-    with grouped(Limits(cores=1)):
+    with control_group(Limits(cores=1)):
         pass
     assert {each.name for each in tmp_path.iterdir()} == {f"vlatool-{os.getpid()}-b", "vlatool-x-c", "other"}
 

@@ -1,4 +1,4 @@
-"""Run a module of vlatool under limits: ``python -m vlatool.measurement.limited LIMITS MODULE ARGUMENTS...``.
+"""Run a module of vlatool under limits: ``python -m vlatool.measurement.process_limits LIMITS MODULE ARGUMENTS...``.
 
 The limits are set before anything is imported that could take memory or start threads.
 """
@@ -34,17 +34,17 @@ def command(limits: Limits, module: str, arguments: Sequence[str] = ()) -> list[
     """Return the command of a module, under the limits where there are any."""
     if not limits:
         return python_command(module, arguments)
-    return python_command("vlatool.measurement.limited", (json.dumps(to_json(limits)), module, *arguments))
+    return python_command("vlatool.measurement.process_limits", (json.dumps(to_json(limits)), module, *arguments))
 
 
 @contextlib.contextmanager
-def grouped(limits: Limits) -> Iterator[Limits]:
+def control_group(limits: Limits) -> Iterator[Limits]:
     """Yield the limits with a control group for the memory where this user may make one, and remove it in the end.
 
     Memory that a control group limits is what the kernel counts as resident, as on the board. Elsewhere each process
     limits its private writable memory (``RLIMIT_DATA``), which counts what is reserved and not touched, too.
     """
-    _sweep()
+    _remove_stale_groups()
     group = _new_group(limits) if limits.memory_mb else None
     try:
         yield limits if group is None else replace(limits, cgroup=str(group))
@@ -53,7 +53,7 @@ def grouped(limits: Limits) -> Iterator[Limits]:
             _remove(group)
 
 
-def _sweep() -> None:
+def _remove_stale_groups() -> None:
     """Remove the groups of runs that were killed."""
     for base, *_ in GROUPS:
         for left in base.glob("vlatool-*-*"):
@@ -110,7 +110,7 @@ def _new_group(limits: Limits) -> Path | None:
     return None
 
 
-def chosen(limits: Limits) -> Limits:
+def choose_processors(limits: Limits) -> Limits:
     """Return the limits with the processors named: those that are asked for, the first ones of them where fewer.
 
     Raises:
