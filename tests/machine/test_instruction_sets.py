@@ -82,7 +82,7 @@ def test_a_process_is_confined_when_the_variable_says_so_and_the_processor_can(b
 )
 def test_a_name_above_what_the_processor_has_confines_nothing(host, told: str, warned: bool):
     found = compare_sets("nuc", NUC, host, told)
-    assert found.alike is (host == NUC and told != "AVX2")
+    assert found.same_set is (host == NUC and told != "AVX2")
     assert bool(found.warnings()) is warned
     assert ("ONEDNN_MAX_CPU_ISA" in str(found.warnings())) is (told == "AVX2")
 
@@ -127,7 +127,7 @@ def test_a_set_that_a_person_chose_is_kept_and_told():
 
 def test_a_host_of_the_same_set_needs_nothing_and_says_that_the_core_is_another():
     found = compare_sets("nuc", NUC, NUC)
-    assert (found.to_set, found.warnings(), found.alike) == ("", (), True)
+    assert (found.to_set, found.warnings(), found.same_set) == ("", (), True)
     assert "milliseconds are this host's" in found.sentences()[0]
 
 

@@ -13,19 +13,11 @@ from typing import Any
 
 from vlatool.bundle.manifest import FileRecord, Manifest, check_files
 from vlatool.errors import BundleError
+from vlatool.files import verified_read
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit, limit
 from vlatool.files.ownership import LEDGER, cached_hash
-from vlatool.files.verified_read import (
-    DESKTOP_FILES,
-    FIX,
-    find_unlisted,
-    open_inside,
-    read_all,
-    read_verified,
-    verified_directory,
-    verify_file,
-)
+from vlatool.files.verified_read import DESKTOP_FILES, FIX
 
 MANIFEST = "manifest.json"
 DIGEST = "manifest.sha256"
@@ -94,7 +86,7 @@ class Bundle:
         self.check_tree()
         names = [name for name in self.manifest.files if name.startswith(prefix) and not (but and name.startswith(but))]
         for name in [name for name in names if name not in self._verified]:
-            verify_file(self.path, name, *self._record(name))
+            verified_read.verify_file(self.path, name, *self._record(name))
 
     def check_tree(self) -> None:
         """Refuse what the manifest does not record, and a manifest that names files which it does not record.
@@ -104,7 +96,7 @@ class Bundle:
         """
         check_files(self.manifest)
         try:
-            stranger = find_unlisted(self.path, set(self.manifest.files), UNRECORDED_NAMES[1:], REPORTS)
+            stranger = verified_read.find_unlisted(self.path, set(self.manifest.files), UNRECORDED_NAMES[1:], REPORTS)
         except OSError as error:
             raise BundleError(
                 f"{self.path} cannot be read: {error.strerror}.",
@@ -132,7 +124,7 @@ class Bundle:
         sha256, size = self._record(name)
         if allowed:
             check_limit(allowed, size, f"{self.path / name}", BundleError)
-        content = read_verified(self.path, name, sha256, size)
+        content = verified_read.read_verified(self.path, name, sha256, size)
         self._verified.add(name)
         return content
 
@@ -141,14 +133,14 @@ class Bundle:
         return self.read(f"{ASSETS}/{name}", allowed)
 
     @contextlib.contextmanager
-    def held(self, folder: str, names: Iterable[str]) -> Iterator[Path]:
+    def verified_folder(self, folder: str, names: Iterable[str]) -> Iterator[Path]:
         """Verify files that an engine opens by name, and give the directory ``folder`` while they stay as they are.
 
         Raises:
             BundleError: when a file is not what the manifest says, or changed before the block ended.
         """
         files = {name: self._record(name) for name in names}
-        with verified_directory(self.path, folder, files) as path:
+        with verified_read.verified_directory(self.path, folder, files) as path:
             yield path
         self._verified.update(files)
 
@@ -268,5 +260,5 @@ def _check_digest(root: Path, content: bytes) -> None:
 
 def _read_small(root: Path, name: str, most: int) -> bytes:
     """Return the content of a file that is not recorded: up to ``most`` bytes, and one more when it has more."""
-    with open_inside(root, name) as handle:
-        return read_all(handle, min(os.fstat(handle).st_size, most))
+    with verified_read.open_inside(root, name) as handle:
+        return verified_read.read_all(handle, min(os.fstat(handle).st_size, most))

@@ -63,7 +63,7 @@ class BoardSet:
         return bool(self.wanted) and not self.lacks and self.isa_limit == self.wanted != self.host
 
     @property
-    def alike(self) -> bool:
+    def same_set(self) -> bool:
         """Whether everything computes in the board's set: it is this host's."""
         return bool(self.wanted) and self.host == self.wanted and self.isa_limit in ("", self.wanted)
 
@@ -88,13 +88,13 @@ class BoardSet:
             return ""
         if self.to_set or self.confined:
             return f"OpenVINO confined to {self.wanted}, in a process of its own; ONNX Runtime as this host is"
-        if self.alike:
+        if self.same_set:
             return f"OpenVINO in {self.wanted}, as this host is"
         return f"OpenVINO in {self.isa_limit or self.host or 'what this host has'}; {self.board} has {self.wanted}"
 
     def sentences(self) -> tuple[str, ...]:
         """Say what the figures of OpenVINO are those of, where that is the board's set."""
-        if self.alike:
+        if self.same_set:
             return (f"This host has the instruction set of {self.board} ({self.wanted}) on another core: errors and "
                     "ratios are of that set, milliseconds are this host's.",)  # fmt: skip
         if not self.confined:
@@ -112,11 +112,11 @@ class BoardSet:
         if self.confined or self.to_set:
             sentence = f"OpenVINO was confined to {self.wanted}, the instruction set of {self.board}"
             return (f"{sentence}: its answers are of that set.",)
-        return (f"This host has the instruction set of {self.board} ({self.wanted}).",) if self.alike else ()
+        return (f"This host has the instruction set of {self.board} ({self.wanted}).",) if self.same_set else ()
 
     def warnings(self) -> tuple[str, ...]:
         """Say where this host's figures are not those of the board's set, what that means, and what to do."""
-        if not self.wanted or self.confined or self.alike:
+        if not self.wanted or self.confined or self.same_set:
             return ()
         if self.isa_limit:
             return (f"ONEDNN_MAX_CPU_ISA={self.isa_limit} is set, so that OpenVINO computes neither as {self.board} "

@@ -100,7 +100,7 @@ def about_int8(rows: Mapping[str, Row], engines: Mapping[str, str], where: Board
         f"{where.board} has no VNNI: int8 products are added in pairs of 16 bits there, which can saturate, and int8 "
         "may be slower than float32. "
     )
-    if not (where.confined or where.alike):
+    if not (where.confined or where.same_set):
         return (f"{words}Whether it is was not measured: OpenVINO does not compute in that set here.",)
     words += "It was tried all the same: "
     tried = {name: speedup for name, row in rows.items()

@@ -58,11 +58,7 @@ REFUSALS = (
         "nothing answers at that address and port",
         "check that sshd runs there, and on which port (Port in ~/.ssh/config)",
     ),
-    (
-        r"timed out|Timeout",
-        "it does not answer in time",
-        "check that it is on and in this network: ssh {target} true",
-    ),
+    (r"timed out|Timeout", "it does not answer in time", "check that it is on and in this network: ssh {target} true"),
     (
         r"No route to host|Network is unreachable",
         "there is no way to its network",

@@ -20,16 +20,7 @@ from vlatool.files.printable import one_line
 from vlatool.measurement.child import CRASHES, Progress, Raised, Result, error_of, read_line, signal_name
 from vlatool.remote import _probe, _push
 from vlatool.remote._connection import RUN_AGAIN, Connection
-from vlatool.remote._validate_replies import (
-    AgentExit,
-    DiskFull,
-    Python,
-    invalid_reply,
-    parse,
-    python_of,
-    read,
-    sane,
-)
+from vlatool.remote._validate_replies import AgentExit, DiskFull, Python, invalid_reply, parse, python_of, read, sane
 from vlatool.stage.base import OnProgress
 
 AGENT = "vlatool.measurement.agent"
@@ -104,8 +95,7 @@ def _check(target: str, python: str) -> None:
     """Refuse what ssh would take for an option, or a shell for more than a name."""
     if not target or target.startswith("-") or any(letter.isspace() or not letter.isprintable() for letter in target):
         raise UsageError(
-            f"The target {target!r} is not a machine that ssh can reach.",
-            "give user@host, or a Host of ~/.ssh/config",
+            f"The target {target!r} is not a machine that ssh can reach.", "give user@host, or a Host of ~/.ssh/config"
         )
     if python.startswith("-") or not python.isprintable():
         raise UsageError(

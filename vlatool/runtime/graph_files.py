@@ -50,11 +50,11 @@ def _opened(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: i
             return engine(path, threads, graph.compute, content)
         del content
     with contextlib.ExitStack() as stack:
-        place = stack.enter_context(bundle.held(folder, [graph.file]))
+        place = stack.enter_context(bundle.verified_folder(folder, [graph.file]))
         with open_inside(place, name) as handle:
             locations = external_files(OpenFile(handle))
         if beside := recorded(bundle, graph.file, locations):
-            stack.enter_context(bundle.held(folder, beside))
+            stack.enter_context(bundle.verified_folder(folder, beside))
         return engine(path, threads, graph.compute, place / name)
 
 

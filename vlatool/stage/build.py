@@ -51,8 +51,7 @@ def stage_from(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> 
     except ValidationError as error:
         problems = [_problem(item, kind) for item in error.errors()]
         raise RecipeError(
-            f"{where}: " + "; ".join(problems) + ".",
-            "correct what is named; docs/reference/stages.md has every option",
+            f"{where}: " + "; ".join(problems) + ".", "correct what is named; docs/reference/stages.md has every option"
         ) from error
 
 

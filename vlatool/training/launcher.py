@@ -11,15 +11,7 @@ from typing import Any
 
 from vlatool.errors import RecipeError, SourceError, VlatoolError
 from vlatool.training.group import LOST_PROCESS, RUN_AGAIN, Group, join_group
-from vlatool.training.torchrun import (
-    PRELOAD,
-    RENDEZVOUS,
-    Follower,
-    Launch,
-    current_launch,
-    open_store,
-    write_token,
-)
+from vlatool.training.torchrun import PRELOAD, RENDEZVOUS, Follower, Launch, current_launch, open_store, write_token
 from vlatool.user_code.children import Child
 
 MODULE = "vlatool.training.rank_process"
