@@ -23,7 +23,7 @@ ENTRIES = {
     "quantization method": ("vlatool.quantize", ""),
     "kind of source": ("vlatool.sources", ""),
     "engine": ("vlatool.engines", ""),
-    "engine on another provider": ("vlatool.engines", "ExecutionProvider"),
+    "engine on another provider": ("vlatool.engines", "\n    providers = "),
     "reader of recordings": ("vlatool.data", ""),
     "controller": ("vlatool.control", "def act("),
     "policy wrapper": ("vlatool.control", "def infer("),

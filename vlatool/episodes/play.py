@@ -133,7 +133,7 @@ class Worker:
     """What a child process keeps between jobs: the policy and the environment of the current task."""
 
     def __init__(self, path: str, engine: str) -> None:
-        self._bundle = Bundle.described(path)
+        self._bundle = Bundle.open_lazily(path)
         policy = _open_policy(self._bundle, engine)
         self.policy = FrameRecorder(policy, policy.encode)
         self._answers: Array | None = None
@@ -232,13 +232,13 @@ def open_bundle(request: Mapping[str, Any], _tell: Tell) -> None:
         BundleError, GraphError: when it cannot be.
     """
     asked = from_json(Request, request)
-    _open_policy(Bundle.described(asked.bundle), asked.engine)
+    _open_policy(Bundle.open_lazily(asked.bundle), asked.engine)
 
 
 def disturbances(request: Mapping[str, Any], _tell: Tell) -> list[str]:
     """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
     asked = from_json(Request, request)
-    spec = Bundle.described(asked.bundle).manifest.spec
+    spec = Bundle.open_lazily(asked.bundle).manifest.spec
     with limited("make()", asked.job.task, None, asked.job.timeout_s):
         environment = call_factory(asked.job.environment, Path(asked.job.folder), {"task": asked.job.task})
     try:

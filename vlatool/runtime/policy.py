@@ -13,8 +13,8 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
+from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.spec import PolicySpec
-from vlatool.bundle.unexported import no_graph
 from vlatool.errors import BundleError, GraphError, UsageError
 from vlatool.files.printable import printable
 from vlatool.runtime.arguments import check_whole
@@ -76,7 +76,7 @@ class BundlePolicy:
         """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``."""
         manifest = bundle.manifest
         if not manifest.graphs:
-            raise no_graph(bundle, "run")
+            raise no_graph_error(bundle, "run")
         check_chunk(manifest.spec)
         limit_mb = allowed_mb(manifest, memory_mb)
         check_sizes(manifest, limit_mb)
