@@ -21,6 +21,7 @@ from vlatool.machine.host import MAX_CPU_ISA, OLDER_MAX_CPU_ISA, architecture, v
 from vlatool.machine.instruction_sets import openvino_set
 from vlatool.machine.processes import SINGLE
 from vlatool.machine.version import VERSION
+from vlatool.runtime.engine import identities
 from vlatool.user_code import trust
 from vlatool.user_code.children import Child, ChildKilled
 from vlatool.workers import Work
@@ -65,7 +66,7 @@ def this_machine() -> dict[str, str]:
     """Return what may differ between machines and change what is computed: name -> version."""
     installed = versions(RELEVANT_PACKAGES)
     about = {"vlatool": VERSION, "Python": platform.python_version(), "processor": str(architecture())}
-    return {**about, "instruction set": openvino_set(), **installed}
+    return {**about, "instruction set": openvino_set(), **installed, **identities()}
 
 
 class RemoteWorker:
