@@ -11,7 +11,7 @@ from vlatool.errors import BundleError
 
 POLICY = "POLICY"
 """Stands for the folder of the policy's code where it is not known, or gone."""
-MOST = 1 << 16
+MAX_LOCATION_BYTES = 1 << 16
 """Bytes of ``location.json`` that are looked at."""
 
 
@@ -39,7 +39,7 @@ def _folder(bundle: Path) -> str:
     """Return the folder of the policy's code, as the bundle notes it, for a shell."""
     try:
         with (bundle / LOCATION).open(encoding="utf-8") as stream:
-            folder = json.loads(stream.read(MOST))["folder"]
+            folder = json.loads(stream.read(MAX_LOCATION_BYTES))["folder"]
         known = isinstance(folder, str) and folder.isprintable() and Path(folder).is_absolute()
         return shlex.quote(folder) if known and Path(folder).is_dir() else POLICY
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

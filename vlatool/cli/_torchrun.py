@@ -65,9 +65,8 @@ def train(stage: Transform, launch: Launch, source: str, **arguments: Any) -> No
         return
 
     def named() -> None:
-        from vlatool.sources import is_bundle, source_stage
+        from vlatool.sources import open_source
 
-        if not is_bundle(source):  # what is typed may run here, too
-            source_stage(source)
+        open_source(source)  # what is typed may run here, too
 
     follow(launch, stage.name(), named)

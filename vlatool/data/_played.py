@@ -17,11 +17,11 @@ Array = NDArray[Any]
 PLAYED = "data/played.npz"
 BEGINS = "(begins)"
 """Array that says of each row whether an episode begins with it, where the policy keeps values."""
-MOST = 128
+MAX_PLAYED = 128
 """Observations that are kept: twice those that calibrate by default."""
-LEAST = 16
+MIN_PLAYED = 16
 BYTES = 64 << 20
-"""Of observations beyond ``LEAST``, before they are compressed: large images are kept fewer."""
+"""Of observations beyond ``MIN_PLAYED``, before they are compressed: large images are kept fewer."""
 
 
 class Encoded(dict[str, Array]):
@@ -36,7 +36,7 @@ AGAIN = "train again: quantize qat writes it"
 
 def kept_rows(most: int, row_bytes: int) -> int:
     """Return how many observations of a size are kept."""
-    return min(most, max(LEAST, BYTES // max(1, row_bytes)))
+    return min(most, max(MIN_PLAYED, BYTES // max(1, row_bytes)))
 
 
 def played_observations(source: Bundle) -> list[Encoded]:

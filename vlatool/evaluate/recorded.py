@@ -18,8 +18,7 @@ from vlatool.accuracy.skill import skill, variation
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.bundle.program import keeps_values
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data import CALIBRATION, EVALUATION, Moment, Recording, evaluation_recording
-from vlatool.errors import DataError
+from vlatool.data import Moment, Recording, evaluation_recording, no_evaluation, recordings_of
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._names import names_of
 from vlatool.machine.host import fingerprint
@@ -65,7 +64,7 @@ class Recorded(Measure):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is something to evaluate on."""
         if source is not None and self.data is None and not carries_recordings(source):
-            raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
+            raise no_evaluation(source)
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Evaluate and return a row for the bundle, and one for the baseline when there is one."""
@@ -116,7 +115,7 @@ class Recorded(Measure):
 
 def carries_recordings(bundle: Bundle) -> bool:
     """Say whether a bundle brings observations to evaluate it on: recorded for it, or for calibration."""
-    return EVALUATION in bundle.manifest.files or CALIBRATION in bundle.manifest.files
+    return recordings_of(bundle).for_evaluation() is not None
 
 
 def _summary(row: Row) -> str:

@@ -16,6 +16,7 @@ import shutil
 import uuid
 from pathlib import Path
 
+from vlatool.files.tree import files_below
 from vlatool.files.written import hash_once, note_seen
 
 TAG = "CACHEDIR.TAG"
@@ -59,16 +60,21 @@ def cache_of(path: Path) -> Path | None:
 
 
 def carry(source: Path, target: Path, sha256: str = "") -> None:
-    """Give ``target`` the content of ``source``: a link among the stages of a cache, else a copy.
+    """Give ``target`` the content of ``source``: links among the stages of a cache, else copies.
 
     Args:
-        source: A file; a link leads to it.
-        target: A new file.
-        sha256: Of the source, where it is known.
+        source: A file or a directory; a link leads to it.
+        target: A new file or directory.
+        sha256: SHA-256 of a file, where it is known.
 
     Raises:
         OSError: when the source cannot be read, or the target not be written.
     """
+    if source.is_dir():
+        for name, file in files_below(source).items():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            carry(file, target / name)
+        return
     source = source.resolve()
     share = source.stat().st_size >= SHARED and (not sha256 or DIGEST.fullmatch(sha256))
     cache = cache_of(target) if share else None

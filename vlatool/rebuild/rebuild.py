@@ -19,8 +19,8 @@ from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
 from vlatool.rebuild.differences import Compared, compare_bundles
-from vlatool.sources import source_stage
-from vlatool.stage.base import Context, Transform, installed_version, source_of
+from vlatool.sources import is_bundle, source_stage
+from vlatool.stage.base import Context, Transform, content_hash, installed_version, source_of
 from vlatool.stage.build import build_stage, stage_class
 from vlatool.stage.finish import DECIDED, FINALIZED, history, reseal
 from vlatool.stage.run import run_transform
@@ -114,8 +114,8 @@ class _Places:
         """Return the file of that name, which the record holds too, whose SHA-256 begins with ``digest``."""
         others = []
         for path in (*self.files, *(folder / name for folder in self.folders)):
-            if path.is_file():
-                got = hash_file(path)
+            if path.exists():
+                got = content_hash(path)
                 if path.name == name and got.startswith(digest):
                     return path
                 others.append(f"{path} has sha256:{got[:16]}")
@@ -221,7 +221,7 @@ def _start(
 ) -> _Start:
     """Find the source, check that it is the recorded one, and build every stage before any runs."""
     places = _Places(files, [bundle.path.parent, Path()])
-    if source is not None and (Path(source) / MANIFEST).is_file():
+    if source is not None and is_bundle(source):
         begin, first = Bundle.open(source), None
         later = _from_bundle(begin, entries, bundle)
     elif not entries[0]["stage"].startswith("sources."):
@@ -341,7 +341,7 @@ def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> It
         except SourceError as error:
             refused = refused or error
             continue
-        yield str(folder / description)
+        yield from (str(folder / description), str(folder))
     if refused:
         raise SourceError(refused.message, f"name the policy: --source DIR; or {refused.fix}")
 

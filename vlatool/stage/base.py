@@ -19,6 +19,7 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import PluginError, RecipeError
 from vlatool.files.numbers import Numeric
+from vlatool.files.tree import hash_directory
 from vlatool.files.work import Store
 from vlatool.machine.instruction_sets import computed_in
 from vlatool.machine.version import VERSION
@@ -155,7 +156,7 @@ class Stage(Numeric):
         return self
 
     def inputs(self) -> tuple[Path, ...]:
-        """Files outside the source whose content changes the result; part of the cache key."""
+        """Files and directories outside the source whose content changes the result; part of the cache key."""
         return ()
 
     def used_packages(self) -> tuple[str, ...]:
@@ -169,7 +170,7 @@ class Stage(Numeric):
         records how far its engine is from its graphs.
         """
         versions = {package: installed_version(package) for package in self.used_packages()}
-        files = [_content(path) for path in self.inputs()]
+        files = [content_hash(path) for path in self.inputs()]
         content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, VERSION, RECORD]
         content += [] if self.name().partition(".")[0] in BEFORE_ENGINES else [computed_in()]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
@@ -238,7 +239,9 @@ class Transform(Stage):
         for name in options:
             value = getattr(self, name)
             if isinstance(value, Path):
-                options[name] = f"{value.name} sha256:{_content(value)[:16]}"
+                whole = value in self.inputs() or not value.is_dir()  # of a policy only some files count
+                digest = content_hash(value) if whole else f"absent:{value.name}"
+                options[name] = f"{value.name} sha256:{digest[:16]}"
         return options
 
     def made_by(self, seed: int | None = None, calibration: SampleSet | None = None) -> dict[str, Any]:
@@ -262,10 +265,10 @@ class Transform(Stage):
         return entry | ({} if calibration is None else {"calibration": calibration.record()})
 
     def input_hashes(self) -> dict[str, str]:
-        """Return name -> SHA-256 of the files outside the source; a second file of the same name is ``NAME (2)``."""
+        """Return name -> SHA-256 of the inputs outside the source; a second one of the same name is ``NAME (2)``."""
         hashes: dict[str, str] = {}
-        for path in (path for path in self.inputs() if path.is_file()):
-            digest, name, number = hash_file(path), path.name, 1
+        for path in (path for path in self.inputs() if path.is_file() or path.is_dir()):
+            digest, name, number = content_hash(path), path.name, 1
             while hashes.get(name, digest) != digest:
                 number += 1
                 name = f"{path.name} ({number})"
@@ -316,5 +319,12 @@ def installed_version(package: str) -> str | None:
         return None
 
 
-def _content(path: Path) -> str:
-    return hash_file(path) if path.is_file() else f"absent:{path.name}"
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a file as hex, or that of a directory with all files below it; ``absent:NAME`` of neither.
+
+    Raises:
+        DataError: for a directory that holds something else than files.
+    """
+    if path.is_file():
+        return hash_file(path)
+    return hash_directory(path) if path.is_dir() else f"absent:{path.name}"

@@ -13,7 +13,7 @@ from vlatool.accuracy.losses import drop, losses
 from vlatool.accuracy.moved import START
 from vlatool.accuracy.paired import few_starts, repeated_starts
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import EVALUATION, read_recording
+from vlatool.data import read_recording, recordings_of
 from vlatool.errors import DataError
 from vlatool.evaluate.recorded import alone, run_recorded
 from vlatool.gate.config import AccuracyClaim
@@ -117,8 +117,8 @@ def data_of(baseline: Bundle, claim: AccuracyClaim) -> Path | None:
     Raises:
         DataError: when there are none and no episodes are asked for.
     """
-    own = baseline.path / EVALUATION if EVALUATION in baseline.manifest.files else None
-    if (data := claim.data or own) is None and not claim.episodes:
+    data = claim.data or recordings_of(baseline).evaluation
+    if data is None and not claim.episodes:
         raise DataError(
             f"Accuracy is claimed, but the baseline {baseline.path} carries no evaluation data (those of the candidate "
             "do not count) and no episodes are asked for.",

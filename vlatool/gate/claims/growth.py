@@ -7,7 +7,7 @@ from dataclasses import replace
 from statistics import median
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
-from vlatool.data import CALIBRATION, EVALUATION, PLAYED
+from vlatool.data import PLAYED, is_of_recording
 from vlatool.files.written import LEDGER
 from vlatool.gate.config import GrowthClaim, LatencyClaim
 from vlatool.gate.inputs import MEMORY, Inputs
@@ -21,10 +21,10 @@ PROBES = 3
 """Fresh processes that load each bundle once."""
 OBSERVATIONS = 16
 """Observations that such a process answers, beside the golden one."""
-ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, CALIBRATION, EVALUATION, PLAYED, "recipe.yaml", "SIGNATURE",
+ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, PLAYED, "recipe.yaml", "SIGNATURE",
          "reports/report.html", "reports/report.md", "reports/report.json", "reports/difference.json",
          "reports/smooth_quant.json", "reports/weights.json")  # fmt: skip
-"""Files of a bundle that no robot needs, beside the golden one."""
+"""Files of a bundle that no robot needs, beside the golden one and recordings."""
 
 
 def examine_memory(
@@ -72,7 +72,12 @@ def deployed_bytes(bundle: Bundle) -> int:
     opened = {name for name in bundle.manifest.files if name.startswith(within)}
     spared = {*ABOUT, bundle.manifest.golden} - opened
     files = (path for path in bundle.path.rglob("*") if path.is_file())
-    return sum(path.stat().st_size for path in files if path.relative_to(bundle.path).as_posix() not in spared)
+    names = ((path.relative_to(bundle.path).as_posix(), path) for path in files)
+    return sum(
+        path.stat().st_size
+        for name, path in names
+        if name not in spared and (name in opened or not is_of_recording(name))
+    )
 
 
 def judged(name: str, baseline: float, measured: Measurement, claim: GrowthClaim) -> ClaimResult:
