@@ -65,8 +65,9 @@ def train(stage: Transform, launch: Launch, source: str, **arguments: Any) -> No
         return
 
     def named() -> None:
-        from vlatool.sources import open_source
+        from vlatool.sources import is_bundle, source_stage
 
-        open_source(source)  # what is typed may run here, too
+        if not is_bundle(source):  # what is typed may run here, too
+            source_stage(source)
 
     follow(launch, stage.name(), named)

@@ -1,4 +1,4 @@
-"""Readers of calibration and evaluation data, one file per format."""
+"""Recordings: readers, one file each format; what is selected of them, and observations that are drawn."""
 
 from __future__ import annotations
 
@@ -26,16 +26,13 @@ from vlatool.data._played import kept_rows as kept_rows
 from vlatool.data._played import played_observations as played_observations
 from vlatool.data._reader import Reader as Reader
 from vlatool.data._reader import read_recording as read_recording
-from vlatool.data._recording import RECORD_ALL as RECORD_ALL
 from vlatool.data._recording import Moment as Moment
 from vlatool.data._recording import Recording as Recording
 from vlatool.data._recording import build_recording as build_recording
 from vlatool.data._selections import PURPOSES as PURPOSES
-from vlatool.data._selections import Recordings as Recordings
-from vlatool.data._selections import Selection as Selection
 from vlatool.data._selections import calibration_recording as calibration_recording
+from vlatool.data._selections import carries_evaluation as carries_evaluation
 from vlatool.data._selections import carry_recording as carry_recording
 from vlatool.data._selections import evaluation_recording as evaluation_recording
 from vlatool.data._selections import is_of_recording as is_of_recording
-from vlatool.data._selections import no_evaluation as no_evaluation
 from vlatool.data._selections import recordings_of as recordings_of

@@ -97,8 +97,8 @@ class Recording:
         episodes = None if self.episodes is None else self.episodes[chosen]
         times = None if self.times is None else self.times[chosen]
         indices = np.flatnonzero(chosen) if self.indices is None else self.indices[chosen]
-        series = {"actions": actions, "episodes": episodes, "times": times}
-        return replace(self, inputs=inputs, **series, whole=self.whole or self, indices=indices)
+        series = replace(self, inputs=inputs, actions=actions, episodes=episodes, times=times)
+        return replace(series, whole=self.whole or self, indices=indices)
 
     def begins(self) -> NDArray[np.bool_]:
         """Say of each observation whether an episode begins with it, or none follows the one before: (N,)."""

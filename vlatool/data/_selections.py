@@ -18,8 +18,7 @@ from vlatool.data._recording import Recording
 from vlatool.errors import DataError
 from vlatool.files.kept import carry
 
-PURPOSES = ("calibration", "evaluation")
-CALIBRATES, HELD_OUT = 0, 1
+PURPOSES = CALIBRATION, EVALUATION = "calibration", "evaluation"
 _CARRIED = re.compile(rf"(?P<path>data/(?P<purpose>{'|'.join(PURPOSES)})(\.[^/]*)?)(/.+)?")
 """A file of a recording in a bundle; where that is a directory, one below it."""
 
@@ -30,7 +29,7 @@ class Selection:
 
     Args:
         path: Recording that they are of.
-        half: ``CALIBRATES`` or ``HELD_OUT`` of a recording for both purposes; None for all of it.
+        half: Index of a half, as ``halves`` gives them; None for the whole recording.
     """
 
     path: Path
@@ -53,24 +52,18 @@ class Recordings:
     calibration: Path | None = None
     evaluation: Path | None = None
 
-    def for_calibration(self, named: Path | None = None) -> Selection | None:
-        """Return what calibrates, None where there is nothing.
+    def select(self, purpose: str, named: Path | None = None) -> Selection | None:
+        """Return the observations for one of ``PURPOSES``, None where there are none.
 
         Args:
+            purpose: What they are for.
             named: Recording to use in the place of the bundle's own.
         """
-        if named is None and self.calibration is not None:
-            return Selection(self.calibration, None if self.evaluation else CALIBRATES)
-        return named and Selection(named)
-
-    def for_evaluation(self, named: Path | None = None) -> Selection | None:
-        """Return what evaluates, None where there is nothing.
-
-        Args:
-            named: Recording to use in the place of the bundle's own.
-        """
-        whole = named or self.evaluation
-        return Selection(whole) if whole else self.calibration and Selection(self.calibration, HELD_OUT)
+        if whole := named or (self.evaluation if purpose == EVALUATION else None):
+            return Selection(whole)
+        if self.calibration is None:
+            return None
+        return Selection(self.calibration, None if self.evaluation else PURPOSES.index(purpose))
 
 
 def recordings_of(bundle: Bundle) -> Recordings:
@@ -120,8 +113,8 @@ def calibration_recording(source: Bundle, path: Path | None = None) -> Recording
     Raises:
         DataError: when it is missing, corrupt, or does not fit the spec.
     """
-    selection = recordings_of(source).for_calibration(path)
-    return selection and selection.read(source.manifest.spec)
+    selection = recordings_of(source).select(CALIBRATION, path)
+    return None if selection is None else selection.read(source.manifest.spec)
 
 
 def evaluation_recording(source: Bundle, path: Path | None = None) -> tuple[Recording, str]:
@@ -134,16 +127,16 @@ def evaluation_recording(source: Bundle, path: Path | None = None) -> tuple[Reco
     Raises:
         DataError: when there is none, or it is missing, corrupt, or does not fit the spec.
     """
-    selection = recordings_of(source).for_evaluation(path)
+    selection = recordings_of(source).select(EVALUATION, path)
     if selection is None:
-        raise no_evaluation(source)
+        raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
     recording = selection.read(source.manifest.spec)
     return recording, "" if selection.half is None else _reservation(recording)
 
 
-def no_evaluation(source: Bundle) -> DataError:
-    """Return the error of a bundle that carries nothing to evaluate it on."""
-    return DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
+def carries_evaluation(source: Bundle) -> bool:
+    """Return whether a bundle carries what evaluates it: a recording for that, or one for calibration."""
+    return recordings_of(source).select(EVALUATION) is not None
 
 
 def _reservation(held_out: Recording) -> str:

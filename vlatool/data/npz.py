@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
@@ -14,7 +15,6 @@ from vlatool.machine.host import memory
 from vlatool.registry import Claim
 
 LIMIT = "recording_bytes"
-ARCHIVE = b"PK\3\4"
 
 
 class NpzReader(Reader):
@@ -28,7 +28,7 @@ class NpzReader(Reader):
         """Claim a .npz file, and perhaps what else is an archive."""
         if path.name.endswith(cls.suffix):
             return Claim.CERTAIN
-        return Claim.MAYBE if path.is_file() and _begins(path) == ARCHIVE else Claim.NONE
+        return Claim.MAYBE if path.is_file() and zipfile.is_zipfile(path) else Claim.NONE
 
     def open(self, path: Path, spec: PolicySpec, names: Mapping[str, str]) -> Recording:
         """Open a recording, large arrays as rows that stay on the disk.
@@ -41,11 +41,6 @@ class NpzReader(Reader):
         free = _free_mb()
         arrays = open_rows(path, LIMIT, free=None if free is None else free * 1e6)
         return build_recording(path, arrays, spec, names)
-
-
-def _begins(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(len(ARCHIVE))
 
 
 def _free_mb() -> float | None:

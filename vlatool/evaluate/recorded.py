@@ -18,7 +18,8 @@ from vlatool.accuracy.skill import skill, variation
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.bundle.program import keeps_values
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data import Moment, Recording, evaluation_recording, no_evaluation, recordings_of
+from vlatool.data import Moment, Recording, carries_evaluation, evaluation_recording
+from vlatool.errors import DataError
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._names import names_of
 from vlatool.machine.host import fingerprint
@@ -63,8 +64,8 @@ class Recorded(Measure):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is something to evaluate on."""
-        if source is not None and self.data is None and not carries_recordings(source):
-            raise no_evaluation(source)
+        if source is not None and self.data is None and not carries_evaluation(source):
+            raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Evaluate and return a row for the bundle, and one for the baseline when there is one."""
@@ -111,11 +112,6 @@ class Recorded(Measure):
             REFERENCES[key] = run_recorded(baseline, recording, indices, self.engine, context)
             REFERENCES[key].setflags(write=False)
         return REFERENCES[key]
-
-
-def carries_recordings(bundle: Bundle) -> bool:
-    """Say whether a bundle brings observations to evaluate it on: recorded for it, or for calibration."""
-    return recordings_of(bundle).for_evaluation() is not None
 
 
 def _summary(row: Row) -> str:

@@ -54,7 +54,7 @@ class TorchModule(Source):
     def of(cls, typed: str) -> Self:
         """Return the stage for a directory or YAML file that describes a policy, or ``path.py:make`` beside one."""
         where, _, function = typed.rpartition(":")
-        if not where.endswith(".py") or Path(typed).exists():
+        if not where.endswith(".py"):
             return cls(policy=Path(typed))
         if not Path(where).is_file():
             raise SourceError(f"No such file: {where} (from '{typed}').", "check the path")

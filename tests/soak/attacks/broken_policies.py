@@ -42,6 +42,7 @@ from vlatool.optimize.summary import verdict_of
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.report import Measurement, Row
 from vlatool.runtime.golden import load_goldens
+from vlatool.sources import source_stage
 from vlatool.stage.base import Context
 from vlatool.stage.finish import write_golden
 
@@ -92,7 +93,7 @@ def bundles(case: Case, folder: Path, kept: Path) -> dict[str, Bundle]:
     )
     place = kept / hashlib.sha256(code.encode()).hexdigest()[:16]
     if not place.exists():
-        baseline = exported(str(folder), place / "cache", Context())
+        baseline = exported(source_stage(str(folder)), place / "cache", Context())
         (place / "int8").mkdir()
         DynamicInt8().run(baseline, place / "int8", Context())
         shutil.copytree(baseline.path, place / "float32")

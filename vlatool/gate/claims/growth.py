@@ -70,14 +70,9 @@ def deployed_bytes(bundle: Bundle) -> int:
     folders = tuple(graph.file.rpartition("/")[0] for graph in bundle.manifest.graphs.values())
     within = tuple(f"{folder}/" if folder else "" for folder in folders)
     opened = {name for name in bundle.manifest.files if name.startswith(within)}
-    spared = {*ABOUT, bundle.manifest.golden} - opened
+    spared = {*ABOUT, bundle.manifest.golden, *filter(is_of_recording, bundle.manifest.files)} - opened
     files = (path for path in bundle.path.rglob("*") if path.is_file())
-    names = ((path.relative_to(bundle.path).as_posix(), path) for path in files)
-    return sum(
-        path.stat().st_size
-        for name, path in names
-        if name not in spared and (name in opened or not is_of_recording(name))
-    )
+    return sum(path.stat().st_size for path in files if path.relative_to(bundle.path).as_posix() not in spared)
 
 
 def judged(name: str, baseline: float, measured: Measurement, claim: GrowthClaim) -> ClaimResult:
