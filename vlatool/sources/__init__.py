@@ -1,4 +1,4 @@
-"""Sources: ways of obtaining a policy, one file each; and what a person means who names one."""
+"""Sources: ways of obtaining a policy, one file each; and which one reads what a person names."""
 
 from __future__ import annotations
 
