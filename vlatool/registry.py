@@ -130,6 +130,11 @@ def loadable(kind: str) -> Iterator[tuple[str, Any]]:
             yield name, load(kind, name)
 
 
+def is_certain(kind: str, named: Any) -> bool:
+    """Return whether an entry is certain to read what a person names."""
+    return any(entry.claims(named) is Claim.CERTAIN for _, entry in loadable(kind))
+
+
 def claimant(kind: str, named: Any, error: type[VlatoolError]) -> Any:
     """Return the entry that reads what a person names: the one that is certain, else the one that may; None if none.
 

@@ -63,6 +63,14 @@ def test_a_bundle_is_what_has_a_manifest(float_bundle: Bundle, tmp_path: Path):
         source_of_policy(bundle)
 
 
+def test_a_manifest_of_another_format_makes_no_bundle(policy_dir: Path, tmp_path: Path):
+    (policy_dir / "manifest.json").write_text('{"format": "of another tool"}')
+    assert not is_bundle(policy_dir)
+    assert source_of_policy(policy_dir).name() == "sources.torch_module"
+    (policy_dir / "policy.yaml").unlink()
+    assert is_bundle(policy_dir), "no source reads it, so it is said what a bundle needs"
+
+
 def test_what_has_no_description_is_told(tmp_path: Path):
     with pytest.raises(SourceError, match=r"a\.onnx has no description") as caught:
         describe(tmp_path / "a.onnx")

@@ -166,6 +166,12 @@ def test_its_directories_are_a_source_and_a_recording(run: Run, checkpoint: Path
     assert json.loads(whole)["title"] == f"tiny on {2 * samples} recorded observations"
     ok(run("evaluate", "closed-loop", str(float32), "--policy", str(checkpoint), "--episodes", "2"))
     assert "static_int8" in ok(run("optimize", str(checkpoint), "--dry-run", "-o", str(tmp_path / "o")))
+    assert "identical" in ok(run("rebuild", str(int8), "--check", "--trust", str(checkpoint)))
+    (checkpoint / "log/more/notes.txt").write_text("calm!\n")
+    done = run("rebuild", str(int8), "--check", "--source", str(checkpoint))
+    assert f"The source {checkpoint} is not what {int8} was made from: log: got sha256:" in " ".join(
+        done.stderr.split()
+    )
     (checkpoint / "log/log.json").unlink()
     assert "log is of an unknown format" in run("export", str(checkpoint), "-o", str(tmp_path / "again")).stderr
 

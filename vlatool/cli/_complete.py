@@ -63,12 +63,12 @@ def reports(incomplete: str) -> list[str]:
 
 def sources(incomplete: str) -> list[str]:
     """Return bundles, what a source is certain to read, and folders that may hold some."""
-    return _paths(incomplete, lambda path: _is_bundle(path) or _is_policy(path))
+    return _paths(incomplete, lambda path: _is_bundle(path) or registry.is_certain("sources", path))
 
 
 def policies(incomplete: str) -> list[str]:
     """Return folders that a source is certain to read, and folders that may hold some."""
-    return _paths(incomplete, lambda path: os.path.isdir(path) and _is_policy(path))
+    return _paths(incomplete, lambda path: os.path.isdir(path) and registry.is_certain("sources", path))
 
 
 OF_FIELDS: dict[str, Callable[[str], list[str]]] = {
@@ -88,11 +88,6 @@ def _starting(names: Iterable[str], incomplete: str) -> list[str]:
 
 def _is_bundle(path: str) -> bool:
     return _holds(path, MANIFEST)
-
-
-def _is_policy(path: str) -> bool:
-    sources = registry.loadable("sources")
-    return not _is_bundle(path) and any(source.claims(path) is registry.Claim.CERTAIN for _, source in sources)
 
 
 def _holds(path: str, name: str) -> bool:

@@ -18,7 +18,7 @@ Array = NDArray[Any]
 FEW = 8
 """Samples below which the extremes of activations are hardly seen."""
 FAR = 50.0
-"""Training deviations (or ranges) beyond which a value is no measurement of the same quantity."""
+"""Training deviations (or ranges) beyond which a value is not a measurement of the same quantity."""
 NAMED = 6
 """Channels that a message lists."""
 

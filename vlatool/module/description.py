@@ -169,7 +169,7 @@ def _check_label(file: Path, key: str, value: Any) -> None:
 
 
 def _check_timeout(file: Path, data: Mapping[str, Any]) -> None:
-    """Refuse what is no time that a call of the environment may take."""
+    """Refuse a timeout that a call of the environment cannot have."""
     seconds = (data.get("environment") or {}).get("timeout", 1)
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= 1e6:
         raise SourceError(

@@ -76,12 +76,12 @@ class Origin:
             file = Path(str(getattr(module, "__file__", None) or os.devnull))
             if path is None or name.startswith(OWN_NAME) or not file.resolve().is_relative_to(path.parent):
                 continue
-            place = file.resolve().relative_to(path.parent)
-            if place.suffix == ".py" and "site-packages" not in place.parts and place.as_posix() not in self.code:
+            beside = file.resolve().relative_to(path.parent)
+            if beside.suffix == ".py" and "site-packages" not in beside.parts and beside.as_posix() not in self.code:
                 raise SourceError(
-                    f"The factory '{self.factory}' imports {place}, which no import statement of its files names, so "
+                    f"The factory '{self.factory}' imports {beside}, which no import statement of its files names, so "
                     "its changes would not be noticed.",
-                    f"import it with an import statement, or name it in policy.yaml: files: [{place}]",
+                    f"import it with an import statement, or name it in policy.yaml: files: [{beside}]",
                 )
 
 

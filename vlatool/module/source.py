@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from vlatool import registry
-from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
 from vlatool.errors import SourceError
 from vlatool.module.description import Description
 from vlatool.registry import Claim
@@ -69,8 +69,9 @@ class Source(Transform):
 
 
 def is_bundle(typed: str | Path) -> bool:
-    """Return whether a path is a bundle: what has a manifest."""
-    return (Path(typed) / MANIFEST).is_file()
+    """Return whether a path is a bundle: what has a manifest, unless that is of a format that a source reads."""
+    path = Path(typed)
+    return (path / MANIFEST).is_file() and ((path / DIGEST).exists() or not registry.is_certain("sources", str(typed)))
 
 
 def claimed_source(typed: str | Path) -> Source | None:
@@ -81,8 +82,10 @@ def claimed_source(typed: str | Path) -> Source | None:
     Raises:
         SourceError: when several claim it, or it is wrong.
     """
+    if is_bundle(typed):
+        return None
     source: type[Source] | None = registry.claimant("sources", str(typed), SourceError)
-    return None if source is None or is_bundle(typed) else source.of(str(typed))
+    return None if source is None else source.of(str(typed))
 
 
 def source_of_policy(typed: str | Path) -> Source:
