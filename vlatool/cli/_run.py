@@ -114,7 +114,7 @@ def transform(
         elif stage.takes_modules:
             bundle = source_bundle(found, cache_directory(), context)
         else:
-            bundle = streamed(stage, found, context) or exported(found, cache_directory(), context)
+            bundle = stream_source(stage, found, context) or export_source(found, cache_directory(), context)
         context = replace(context, events=str(events.absolute()) if events else "")
         stage, bundle = first_steps(stage, bundle, cache_directory(), context)
         reports = None
@@ -203,7 +203,7 @@ def named_files(stage: Stage) -> tuple[Path, ...]:
     return tuple(item for item in items if isinstance(item, Path))
 
 
-def streamed(stage: Transform, source: Source, context: Context) -> Bundle | None:
+def stream_source(stage: Transform, source: Source, context: Context) -> Bundle | None:
     """Return the bundle of a policy whose weights the stage reads from their shards itself, None for any other."""
     from vlatool.sources import source_bundle
 
@@ -217,7 +217,7 @@ def streamed(stage: Transform, source: Source, context: Context) -> Bundle | Non
     return bundle
 
 
-def exported(source: Bundle | Source, cache: Path, context: Context) -> Bundle:
+def export_source(source: Bundle | Source, cache: Path, context: Context) -> Bundle:
     """Return a bundle as it is, and a float32 bundle with graphs of a policy, exported with the default options."""
     from vlatool.export.onnx import ExportOnnx
     from vlatool.sources import source_bundle
@@ -228,11 +228,11 @@ def exported(source: Bundle | Source, cache: Path, context: Context) -> Bundle:
     )
 
 
-def opened(source: str, context: Context) -> Bundle:
+def open_with_graphs(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or that of a policy, exported with the default options."""
     from vlatool.sources import open_source
 
-    return exported(open_source(source), cache_directory(), context)
+    return export_source(open_source(source), cache_directory(), context)
 
 
 def measure(
@@ -261,7 +261,7 @@ def measure(
         board = load_profile(profile)
     with progress(*crew(workers)) as context:
         context = replace(context, video=str(video.absolute()) if video else "", force=force)
-        bundle = opened(source, context)
+        bundle = open_with_graphs(source, context)
         stage.check(bundle, board)
         if target is not None:
             from vlatool.remote.ssh import measure_on

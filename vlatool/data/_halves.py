@@ -23,7 +23,7 @@ def halves(recording: Recording) -> tuple[Recording, Recording]:
     held_out = _whole_episodes(recording.episodes)
     if held_out is None:
         held_out = np.arange(len(recording)) * BLOCKS // len(recording) % 2 == 1
-    return recording.only(~held_out), recording.only(held_out)
+    return recording.subset(~held_out), recording.subset(held_out)
 
 
 def _whole_episodes(episodes: NDArray[np.int64] | None) -> NDArray[np.bool_] | None:

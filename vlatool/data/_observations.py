@@ -47,9 +47,9 @@ class Observations(Sequence[dict[str, Any]]):
             return Observations(self._recording, self._numbers[at])
         return self._recording.observation(self._numbers[at])
 
-    def along(self) -> Iterator[Moment]:
+    def with_history(self) -> Iterator[Moment]:
         """Yield them, each after those before it in its episode."""
-        return self._recording.along(self._numbers)
+        return self._recording.with_history(self._numbers)
 
 
 def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> Sequence[dict[str, Any]]:

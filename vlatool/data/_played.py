@@ -12,6 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import DataError
 from vlatool.files.npz import open_npz
+from vlatool.runtime.observation import EncodedObservation
 
 Array = NDArray[Any]
 PLAYED = "data/played.npz"
@@ -24,14 +25,14 @@ BYTES = 64 << 20
 """Of observations beyond ``MIN_PLAYED``, before they are compressed: large images are kept fewer."""
 
 
-class Encoded(dict[str, Array]):
+class Encoded(EncodedObservation):
     """An observation as the graphs take it, name -> (1, ...): normalised, text as ids."""
 
     begins = True
     """Whether an episode begins with it, or nothing before it is known."""
 
 
-AGAIN = "train again: quantize qat writes it"
+REMEDY = "train again: quantize qat writes it"
 
 
 def kept_rows(most: int, row_bytes: int) -> int:
@@ -48,7 +49,7 @@ def played_observations(source: Bundle) -> list[Encoded]:
     if PLAYED not in source.manifest.files:
         return []
     path = source.file(PLAYED)
-    arrays = open_npz(path, fix=AGAIN)
+    arrays = open_npz(path, fix=REMEDY)
     for tensor in source.manifest.spec.inputs:
         _check(path, tensor, arrays.get(tensor.name))
     names = [tensor.name for tensor in source.manifest.spec.inputs]
@@ -72,4 +73,4 @@ def _check(path: Path, tensor: TensorSpec, array: Array | None) -> None:
 
 
 def _broken(path: Path, why: str) -> DataError:
-    return DataError(f"{path} does not fit the policy: {why}.", AGAIN)
+    return DataError(f"{path} does not fit the policy: {why}.", REMEDY)

@@ -83,7 +83,7 @@ class Recording:
             for name, values in self.inputs.items()
         }
 
-    def only(self, chosen: NDArray[np.bool_]) -> Recording:
+    def subset(self, chosen: NDArray[np.bool_]) -> Recording:
         """Return some observations, in their order.
 
         Args:
@@ -106,7 +106,7 @@ class Recording:
         indices = np.arange(len(self)) if self.indices is None else self.indices
         return np.concatenate([[True], (numbers[1:] != numbers[:-1]) | (np.diff(indices) != 1)])
 
-    def along(self, numbers: Sequence[int]) -> Iterator[Moment]:
+    def with_history(self, numbers: Sequence[int]) -> Iterator[Moment]:
         """Yield observations, each after those of its episode that were recorded before it, held out or not.
 
         Args:
@@ -122,7 +122,7 @@ class Recording:
                 yield Moment(whole.observation(index), own.get(index, index), bool(begins[index]), index in own)
 
     @property
-    def unjudged(self) -> tuple[str, ...]:
+    def unjudged_steps(self) -> tuple[str, ...]:
         """A sentence when fewer steps than the policy's chunk are recorded, so that the others are not judged."""
         if self.actions is None or (steps := self.actions.shape[1]) == self.chunk:
             return ()

@@ -19,7 +19,7 @@ from vlatool.errors import DataError
 from vlatool.files.kept import carry
 
 PURPOSES = CALIBRATION, EVALUATION = "calibration", "evaluation"
-_CARRIED = re.compile(rf"(?P<path>data/(?P<purpose>{'|'.join(PURPOSES)})(\.[^/]*)?)(/.+)?")
+_RECORDING_FILE = re.compile(rf"(?P<path>data/(?P<purpose>{'|'.join(PURPOSES)})(\.[^/]*)?)(/.+)?")
 """A file of a recording in a bundle; where that is a directory, one below it."""
 
 
@@ -73,7 +73,7 @@ def recordings_of(bundle: Bundle) -> Recordings:
         DataError: when it carries two for one purpose.
     """
     found: dict[str, Path] = {}
-    for match in filter(None, map(_CARRIED.fullmatch, bundle.manifest.files)):
+    for match in filter(None, map(_RECORDING_FILE.fullmatch, bundle.manifest.files)):
         path = bundle.path / match["path"]
         if found.setdefault(match["purpose"], path) != path:
             raise DataError(
@@ -86,7 +86,7 @@ def recordings_of(bundle: Bundle) -> Recordings:
 
 def is_of_recording(name: str) -> bool:
     """Return whether a file of a bundle, by its name in the manifest, belongs to a recording that it carries."""
-    return _CARRIED.fullmatch(name) is not None
+    return _RECORDING_FILE.fullmatch(name) is not None
 
 
 def carry_recording(path: Path, purpose: str, spec: PolicySpec, out: Path) -> None:

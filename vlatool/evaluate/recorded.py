@@ -94,7 +94,7 @@ class Recorded(Measure):
         verdict = "inconclusive" if trust.fails else "info"
         sentences = (*trust.sentences, text)
         reserved = (reservation,) if reservation else ()
-        warnings = (*reserved, *trust.warnings, *recording.unjudged, *found_wrong(source))
+        warnings = (*reserved, *trust.warnings, *recording.unjudged_steps, *found_wrong(source))
         return Report("evaluate", title, verdict, sentences, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _reference(
@@ -152,6 +152,7 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
     try_out(bundle, engine)
     policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
     policy.warm_up(1)
+    policy.limit_s = FIRST_RUN_S
     chunks: list[Array] = []
     for moment in moments_of(recording, indices, keeps=keeps_values(bundle.manifest.program)):
         if len(chunks) % 16 == 0:
@@ -159,7 +160,7 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
         if moment.begins:
             policy.reset()
         answered = off_the_robot(f"sample {moment.number} of {recording.path}", MAKE_OTHERWISE)
-        with answered, policy.stopped_after(FIRST_RUN_S):
+        with answered:
             chunk = policy.infer(moment.observation).chunk
         chunks += [chunk] if moment.counts else []
     return np.stack(chunks)
@@ -168,7 +169,7 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
 def moments_of(recording: Recording, indices: Sequence[int], *, keeps: bool) -> Iterator[Moment]:
     """Yield the observations that a policy is given; one that keeps values is given all that come before them, too."""
     if keeps:
-        yield from recording.along(indices)
+        yield from recording.with_history(indices)
         return
     episode = None
     for index in indices:

@@ -18,7 +18,7 @@ from vlatool.module.factory import OWN_NAME, call_factory, factory_file, split_f
 from vlatool.module.source import describe
 from vlatool.user_code import trust
 
-AGAIN = "start again from the source"
+RESTART = "start again from the source"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Origin:
             if endings and not name.endswith(endings):
                 continue
             if not file.is_file() or hash_file(file) != digest:
-                raise SourceError(f"{file} has changed since the source bundle was made.", AGAIN)
+                raise SourceError(f"{file} has changed since the source bundle was made.", RESTART)
 
     def build(self) -> Any:
         """Call the factory.
@@ -120,7 +120,7 @@ def origin_of(bundle: Bundle) -> Origin:
     for key in own:
         if key in recorded and recorded[key] != own[key]:
             raise SourceError(
-                f"{bundle.path} says {key}: {recorded[key]!r}; the policy's description says {own[key]!r}.", AGAIN
+                f"{bundle.path} says {key}: {recorded[key]!r}; the policy's description says {own[key]!r}.", RESTART
             )
     return Origin(
         folder, factory, described.arguments, described.weights, _code(bundle), described.environment,
@@ -134,15 +134,17 @@ def _check_own(factory: str, folder: Path, bundle: Bundle) -> None:
     if file is None or not file.is_relative_to(folder.resolve()):
         raise SourceError(
             f"{bundle.path} names the factory {factory}, which the description in {folder} does not name.",
-            f"a factory is a function in the policy's own files, or what its policy.yaml names; {AGAIN}",
+            f"a factory is a function in the policy's own files, or what its policy.yaml names; {RESTART}",
         )
 
 
 def _code(bundle: Bundle) -> dict[str, str]:
     code = bundle.manifest.source.get("code", {})
     if not isinstance(code, Mapping):
-        raise SourceError(f"{bundle.path} has an invalid record of the policy's code.", AGAIN)
+        raise SourceError(f"{bundle.path} has an invalid record of the policy's code.", RESTART)
     for name in code:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or str(PurePosixPath(name)) != name:
-            raise SourceError(f"{bundle.path} records code as {name!r}, which is not a file beside the factory.", AGAIN)
+            raise SourceError(
+                f"{bundle.path} records code as {name!r}, which is not a file beside the factory.", RESTART
+            )
     return {str(name): str(digest) for name, digest in code.items()}

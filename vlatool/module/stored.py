@@ -17,7 +17,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
 from vlatool.module.edits import BLOCKS, holds_weights, is_changed, read_edits
 from vlatool.module.faked import Weightless, weightless
-from vlatool.module.origin import AGAIN, origin_of
+from vlatool.module.origin import RESTART, origin_of
 from vlatool.weights.shards import NUMPY_NAMES, Reader, StoredTensor, read_shards, reading, sampled_hash, shard_files
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def stored_modules(bundle: Bundle) -> StoredModules:
     shards = read_shards(folder, pattern)
     recorded = bundle.manifest.source.get("shards")
     if is_changed(bundle) and recorded != sampled_hash(shard_files(folder, pattern)):
-        raise SourceError(f"The weights in {folder} have changed since {bundle.path} was made.", AGAIN)
+        raise SourceError(f"The weights in {folder} have changed since {bundle.path} was made.", RESTART)
     made = weightless(bundle)
     places = {graph: _locate(graph, made, shards, folder / "policy.yaml") for graph in made.modules}
     return StoredModules(made.modules, places)

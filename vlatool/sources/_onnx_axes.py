@@ -84,8 +84,8 @@ def shapes_from(texts: Iterable[str]) -> dict[str, tuple[int | str, ...]]:
         right = all(axis.isidentifier() or (axis.isdecimal() and int(axis)) for axis in axes)
         if not equals or not name or not right:
             raise SourceError(
-                f"--shape {text!r} is not a shape of an input; wanted NAME=1,3,224,224: each axis a whole number from 1, "
-                "or a name for one that stays free.",
+                f"--shape {text!r} is not a shape of an input; wanted NAME=1,3,224,224: each axis a whole number from "
+                "1, or a name for one that stays free.",
                 "write it like --shape image=1,3,224,224",
             )
         shapes[name] = tuple(int(axis) if axis.isdecimal() else axis for axis in axes)

@@ -68,8 +68,8 @@ class HeldOut:
             next_round(self._frames, 0, partial(_required, instead, len(self._others)))
             return
         held = held_out(recording)
-        self._others = recording.only(~held)
-        self.recording = recording.only(held)
+        self._others = recording.subset(~held)
+        self.recording = recording.subset(held)
         next_round(self._frames, 0, partial(write, self.recording))
 
     def read(self) -> None:

@@ -97,10 +97,10 @@ def examine(
     baselines = tuple(number for lost in drops for number in lost.baseline if number.name in DECIDE)
     trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
     verdict = "inconclusive" if trust.fails else worst(lost.verdict(claim.max_drop) for lost in drops)
-    unjudged = [warning for lost in drops for warning in lost.warnings]
+    unjudged_steps = [warning for lost in drops for warning in lost.warnings]
     reservations = [sentence.rstrip(".") for sentence in trust.sentences]
     return ClaimResult(
-        "accuracy", verdict, "; ".join([*reservations, *words, *trust.warnings, *unjudged]), measured, baselines
+        "accuracy", verdict, "; ".join([*reservations, *words, *trust.warnings, *unjudged_steps]), measured, baselines
     )
 
 
@@ -155,4 +155,4 @@ def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context,
         off, before = losses(action, mine, expert), losses(action, theirs, expert)
         words = "more distance from the expert's actions than the baseline has:"
     lost = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
-    return _Drop("recorded_drop", words, *lost, len(indices), baselines, recording.unjudged)
+    return _Drop("recorded_drop", words, *lost, len(indices), baselines, recording.unjudged_steps)
