@@ -31,6 +31,8 @@ absent = acme_robotics.no_such_file
 
 [vlatool.engines]
 acme = acme_robotics.engine
+openvino-provider = acme_robotics.openvino_provider
+ggml-provider = acme_robotics.ggml_provider
 absent = acme_robotics.no_such_engine
 
 [vlatool.sources]
@@ -108,7 +110,7 @@ def test_doctor_says_what_it_adds(run: Run):
         assert added in finding
     for broken in ("'absent' (vlatool.quantize)", "'absent' (vlatool.engines)", "'a-first' (vlatool.sources)"):
         assert f"{broken}, cannot be imported" in finding
-    assert told["engine acme_robotics"]["finding"] == "acme-robotics 1.2: Acme"
+    assert told["engine acme_robotics"]["finding"] == "acme-robotics 1.2: Azure, CPU"
 
 
 def test_its_profile_is_found_by_name(run: Run):
@@ -121,8 +123,9 @@ def test_its_method_its_source_and_its_engine_run(run: Run, onnx_file: Path, tmp
     ok(run("quantize", "rounded", str(tmp_path / "tiny.acme"), "-o", str(tmp_path / "out"), "--bits", "8"))
     made = json.loads((tmp_path / "out/manifest.json").read_text())["made_by"]
     assert (made["stage"], made["options"]) == ("quantize.rounded", {"bits": 8})
-    told = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20"))
-    assert "latency_p50" in told or "p50" in told
+    done = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20", "--json"))
+    (row,) = json.loads(done)["rows"]
+    assert row["details"]["engine"][0]["providers"].startswith("AzureExecutionProvider {}; CPUExecutionProvider {}; ")
 
 
 @pytest.fixture
@@ -270,6 +273,24 @@ def test_a_search_begins_with_its_method_and_its_engines_plans(run: Run):
     found = ok(run(code=code))
     assert "'rounded'" in found
     assert "'acme_float16'" in found
+    assert "acme_int8" not in found
+
+
+def test_its_engine_knows_the_board_that_a_search_is_for(run: Run):
+    code = "from vlatool.hardware.profile import load_profile; from vlatool.optimize.search import variants_for; "
+    assert "acme_int8" in ok(run(code=f"{code}print(*variants_for(load_profile('acme-board'), True))"))
+
+
+def test_what_its_engine_is_built_against_is_in_keys_and_records(run: Run, float_bundle: Bundle):
+    code = (
+        "from vlatool.quantize.float16 import Float16; from vlatool.runtime import engine; "
+        "keys = Float16().key('a'); print(engine.identities()); "
+        "engine.engine_class('acme').providers = (('CPUExecutionProvider', {}),); print(keys == Float16().key('a'))"
+    )
+    identity, same = ok(run(code=code)).splitlines()
+    assert "'acme': 'AzureExecutionProvider {}; CPUExecutionProvider {}; onnxruntime " in identity
+    assert "acme-robotics 1.2" in identity
+    assert same == "False"
 
 
 def test_its_section_is_in_every_format_of_a_report(run: Run):
@@ -325,5 +346,6 @@ def test_it_replaces_nothing_of_vlatools_own(run: Run):
 
 def test_the_guide_shows_these_files():
     guide = (ROOT / "docs/guides/add-a-method.md").read_text()
-    for name in ("rounded", "engine", "source", "checkpoint", "log", "section", "every_step", "halved"):
+    files = ("rounded", "openvino_provider", "ggml_provider", "source", "checkpoint", "log", "section", "every_step")
+    for name in (*files, "halved"):
         assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide
