@@ -12,7 +12,7 @@ from typing import Any
 
 from vlatool.accuracy.paired import Outcome
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
-from vlatool.data import CALIBRATION
+from vlatool.data import recordings_of
 from vlatool.episodes import play
 from vlatool.episodes.content import circumstances, key_of
 from vlatool.episodes.disturbances import BUILT_IN_DISTURBANCES
@@ -168,8 +168,10 @@ def _work(
 
 def _needed(bundle: Bundle, jobs: Sequence[EpisodesJob]) -> list[str]:
     """Return the files of a bundle that its episodes read: of the recordings what controls and noise are drawn from."""
-    asked = (CALIBRATION,) if any(job.control or job.noise for job in jobs) else ()
-    return sorted(name for name in bundle.manifest.files if not name.startswith(RECORDINGS) or name in asked)
+    drawn_from = recordings_of(bundle).calibration if any(job.control or job.noise for job in jobs) else None
+    recorded = {name for name in bundle.manifest.files if name.startswith(RECORDINGS)}
+    asked = {name for name in recorded if drawn_from and (bundle.path / name).is_relative_to(drawn_from)}
+    return sorted({*bundle.manifest.files} - recorded | asked)
 
 
 def _placed(job: EpisodesJob) -> tuple[EpisodesJob, tuple[Folder, ...]]:
