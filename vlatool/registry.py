@@ -155,7 +155,9 @@ def claimant(kind: str, named: Any, error: type[VlatoolError]) -> Any:
 
 def requirements(kind: str) -> str:
     """Return what each entry of a kind needs to read something, for messages: ``onnx (a .onnx file)``."""
-    return _requirements(dict(loadable(kind)))
+    entries = dict(loadable(kind))
+    broken = [f"{name} (cannot be imported, vlatool doctor says why)" for name in names(kind) if name not in entries]
+    return "; ".join([_requirements(entries), *broken])
 
 
 def _requirements(entries: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from vlatool.data import Reader, build_recording
-from vlatool.files.rows import OpenFile, Plain, Rows
+from vlatool.files.rows import OpenFile, PlainSource, Rows
 from vlatool.registry import Claim
 
 
@@ -24,6 +24,6 @@ class AcmeLog(Reader):
         log = json.loads((path / "log.json").read_text())
         arrays = {name: np.array(values) for name, values in log["small"].items()}
         for name, signal in log["large"].items():
-            rows = Plain(OpenFile.at(path / f"{name}.raw"), start=0)
+            rows = PlainSource(OpenFile.at(path / f"{name}.raw"), start=0)
             arrays[name] = Rows(rows, tuple(signal["shape"]), np.dtype(signal["dtype"]), f"'{name}' in {path}")
         return build_recording(path, arrays, spec, names, times=np.array(log["times"]))
