@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import DataError
-from vlatool.files.kept import carry, tag
+from vlatool.files.blob_store import link_or_copy, mark_cache
 from vlatool.files.tree import files_below, hash_directory
 
 
@@ -59,11 +59,11 @@ def test_what_is_not_a_file_is_refused_by_name(folder: Path, kind: str):
 
 def test_a_directory_is_carried_file_by_file_and_large_ones_are_in_the_cache_once(folder: Path, tmp_path: Path):
     (folder / "large").write_bytes(bytes(1 << 20))
-    tag(tmp_path / "cache")
+    mark_cache(tmp_path / "cache")
     stages = [tmp_path / "cache/stages" / name / "data/calibration" for name in ("a", "b")]
     for target in stages:
         target.parent.mkdir(parents=True)
-        carry(folder, target)
+        link_or_copy(folder, target)
     assert os.path.samefile(*(target / "large" for target in stages))
     assert not (stages[0] / "linked").is_symlink()
     assert hash_directory(stages[0]) == hash_directory(stages[1]) == hash_directory(folder)

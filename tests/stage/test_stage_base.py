@@ -61,10 +61,10 @@ def test_options_are_those_that_differ_from_the_defaults_and_build_the_stage_aga
 
 def test_what_was_given_builds_the_stage_again_and_says_what_was_not():
     stage = build_stage("quantize.qat", {"layout": "ort", "steps": 8})
-    again = build_stage(stage.name(), stage.model_copy(update={"batch": 2}).given())
+    again = build_stage(stage.name(), stage.model_copy(update={"batch": 2}).explicit_options())
     assert again == stage.model_copy(update={"batch": 2})
     assert again.model_fields_set == {"layout", "steps", "batch"}
-    assert build_stage("quantize.qat", {}).given() == {}
+    assert build_stage("quantize.qat", {}).explicit_options() == {}
 
 
 def test_every_wrong_option_is_listed():
@@ -202,7 +202,7 @@ def test_made_by_names_stage_options_versions_and_seed():
 
 
 def test_a_context_may_be_silent():
-    Context().tell("working", 0.5)
+    Context().progress("working", 0.5)
 
 
 def test_a_plain_stage_checks_nothing_and_reads_nothing():

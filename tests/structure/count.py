@@ -24,7 +24,7 @@ ENTRIES = {
     "kind of source": ("vlatool.sources", ""),
     "source of a directory": ("vlatool.sources", '"a directory with'),
     "engine": ("vlatool.engines", ""),
-    "engine on another provider": ("vlatool.engines", "ExecutionProvider"),
+    "engine on another provider": ("vlatool.engines", "\n    providers = "),
     "reader of recordings": ("vlatool.data", ""),
     "reader of a directory": ("vlatool.data", '"a directory with'),
     "controller": ("vlatool.control", "def act("),

@@ -9,7 +9,7 @@ from typing import ClassVar
 from vlatool import registry
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data._recording import Recording
-from vlatool.errors import DataError, nearest
+from vlatool.errors import DataError, suggest
 from vlatool.registry import Claim
 
 
@@ -50,7 +50,7 @@ def reader_of(path: Path) -> Reader:
         raise DataError(f"Data file {path} not found.", "check the path, and record the file if there is none")
     reader: type[Reader] | None = registry.claimant("data", path, DataError)
     if reader is None:
-        known = nearest(path.suffix.removeprefix("."), registry.names("data"))
+        known = suggest(path.suffix.removeprefix("."), registry.names("data"))
         raise DataError(
             f"{path} is of an unknown format; {known}.",
             f"store it as .npz: np.savez(FILE, NAME=values); readers: {registry.requirements('data')}",

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.errors import DataError, nearest
+from vlatool.errors import DataError, suggest
 from vlatool.files.rows import Rows, blocks
 
 Array = NDArray[Any]
@@ -159,7 +159,7 @@ def build_recording(
     inputs = {}
     for tensor in spec.inputs:
         if tensor.name not in arrays:
-            raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.", RECORD_ALL)
+            raise DataError(f"{path} has no '{tensor.name}'; {suggest(tensor.name, arrays)}.", RECORD_ALL)
         inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name], spec)
     actions, episodes = _in_memory(arrays, spec.action.name, "action"), _in_memory(arrays, "episode")
     lengths = {name: len(values) for name, values in inputs.items()}

@@ -16,7 +16,7 @@ from vlatool.data._halves import MIN_HALF, halves
 from vlatool.data._reader import read_recording, reader_of
 from vlatool.data._recording import Recording
 from vlatool.errors import DataError
-from vlatool.files.kept import carry
+from vlatool.files.blob_store import link_or_copy
 
 PURPOSES = CALIBRATION, EVALUATION = "calibration", "evaluation"
 _RECORDING_FILE = re.compile(rf"(?P<path>data/(?P<purpose>{'|'.join(PURPOSES)})(\.[^/]*)?)(/.+)?")
@@ -104,7 +104,7 @@ def carry_recording(path: Path, purpose: str, spec: PolicySpec, out: Path) -> No
     reader = reader_of(path)
     reader.open(path, spec, {})
     (out / "data").mkdir(exist_ok=True)
-    carry(path, out / "data" / f"{purpose}{reader.suffix}")
+    link_or_copy(path, out / "data" / f"{purpose}{reader.suffix}")
 
 
 def calibration_recording(source: Bundle, path: Path | None = None) -> Recording | None:

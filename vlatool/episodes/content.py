@@ -19,7 +19,7 @@ from vlatool.episodes import play
 from vlatool.episodes.play import EpisodesJob
 from vlatool.files.messages import to_json
 from vlatool.machine.host import cpu_model, isa
-from vlatool.machine.instruction_sets import computed_in
+from vlatool.machine.instruction_sets import openvino_set
 from vlatool.machine.version import VERSION
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.module.imports import imported_files
@@ -45,7 +45,7 @@ def circumstances(bundle: Bundle, engine: str, job: EpisodesJob) -> dict[str, An
         "environment": environment_hash(job),
         "vlatool": VERSION,
         "steps": play.STEP_LIMIT,
-        "instruction set": computed_in(),
+        "instruction set": openvino_set(),
         **({"engine built against": built} if built else {}),
         "processor": [cpu_model(), isa()],
         "python": platform.python_version(),

@@ -8,8 +8,8 @@ import os
 from pathlib import Path
 
 from vlatool.errors import DataError
-from vlatool.files.sealed import LITTER
-from vlatool.files.written import hash_once
+from vlatool.files.ownership import cached_hash
+from vlatool.files.verified_read import DESKTOP_FILES
 
 
 def files_below(path: Path) -> dict[str, Path]:
@@ -24,7 +24,7 @@ def files_below(path: Path) -> dict[str, Path]:
         raise DataError(f"{error.filename} cannot be read: {error.strerror}.", "let this user read the directory")
 
     for root, folders, names in os.walk(path, onerror=unreadable):
-        for entry in (Path(root, name) for name in (*folders, *names) if name not in LITTER):
+        for entry in (Path(root, name) for name in (*folders, *names) if name not in DESKTOP_FILES):
             if entry.is_file():
                 files[entry.relative_to(path).as_posix()] = entry
             elif entry.is_symlink() or not entry.is_dir():
@@ -42,5 +42,5 @@ def hash_directory(path: Path) -> str:
         OSError: when a file cannot be read.
         DataError: as ``files_below``.
     """
-    contents = [[name, hash_once(file.resolve())] for name, file in files_below(path).items()]
+    contents = [[name, cached_hash(file.resolve())] for name, file in files_below(path).items()]
     return hashlib.sha256(json.dumps(contents).encode()).hexdigest()

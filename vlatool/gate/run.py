@@ -20,7 +20,7 @@ from vlatool.gate.timed import Timed
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
 from vlatool.measurement.pairs import PairJob
-from vlatool.measurement.validity import busy, throttled, validity
+from vlatool.measurement.validity import busy, throttling, validity
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context, content_hash
@@ -73,7 +73,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
             results.append(deadline.examine(timed, gate.deadline))
     if gate.answers:
         results.append(answers.examine(agreement, timed, gate.answers))
-    seen = (*throttled(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
+    seen = (*throttling(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
     seen = seen if gate.latency or gate.deadline else ()  # findings about times
     name = candidate.manifest.name
     row = _row("candidate", candidate, timed, results)
@@ -100,7 +100,7 @@ def _of_episodes(episodes: Episodes, gate: Gate) -> Iterator[ClaimResult]:
 def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:
     """Load both bundles as a robot does, golden action and all, and ask both where answers are claimed."""
     claim = gate.answers
-    timed.context.tell("both bundles, on observations that are not recorded", None)
+    timed.context.progress("both bundles, on observations that are not recorded", None)
     job = replace(timed.job, pairs=claim.observations if claim else 0, seconds=claim.seconds if claim else 0.0)
     if claim is None:
         return measure_agreement(job, timed.timeout)

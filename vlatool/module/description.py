@@ -16,14 +16,14 @@ from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.program import ProgramStep, check_program, program_from, single_graph
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import PURPOSES, carry_recording
-from vlatool.errors import MissingExtra, SourceError, SpecError, instead, nearest
-from vlatool.files.printable import one_line, shortened
+from vlatool.errors import MissingExtra, SourceError, SpecError, fix_for, suggest
+from vlatool.files.printable import one_line, truncate
 from vlatool.files.yaml import read_mapping
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 
 FILE = "policy.yaml"
-MAX_LABEL = 100
+MAX_LABEL_CHARACTERS = 100
 """Characters of a policy's name, and of its version."""
 KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
@@ -38,20 +38,20 @@ class Description:
     """What a source says of a policy.
 
     Args:
-        folder: Where relative paths start, and whose code runs once it is trusted.
+        folder: where relative paths start, and whose code runs once it is trusted.
         factory: ``path.py:make`` or ``package.module:make`` of the torch modules; empty for a policy that is graphs.
-        graphs: Graph name -> ONNX file, of a policy that is graphs already.
-        arguments: Keyword arguments of the factory.
-        program: How the graphs are run; one graph of all inputs and outputs when empty.
+        graphs: graph name -> ONNX file, of a policy that is graphs already.
+        arguments: keyword arguments of the factory.
+        program: how the graphs are run; one graph of all inputs and outputs when empty.
         environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation, and
             ``timeout``: seconds that a call of it may take.
-        parts: Part name -> globs of module names.
-        calibration, evaluation: Recordings, each a file or a directory, or None.
-        weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
+        parts: part name -> globs of module names.
+        calibration, evaluation: recordings, each a file or a directory, or None.
+        weights: glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
             module alone. Empty when the factory loads the weights.
         training: ``FILE.py:FUNCTION`` of the folder that yields batches of observations to train on; empty for none.
-        files: Globs of the files that the factory reads; None: every file of weights beside it.
-        read_from: Files that the description was read from, the one that names the policy first.
+        files: globs of the files that the factory reads; None: every file of weights beside it.
+        read_from: files that the description was read from, the one that names the policy first.
     """
 
     folder: Path
@@ -80,7 +80,7 @@ class Description:
             if where.endswith(".py") and not _inside(where):
                 raise SourceError(
                     f"{next(iter(self.read_from), self.folder)}: '{key}' names a file outside the folder of the "
-                    f"policy: {shortened(str(named), 200)}.",
+                    f"policy: {truncate(str(named), 200)}.",
                     "copy or link what runs into the folder, or name an importable package: package.module:make",
                 )
         if not self.program:
@@ -116,7 +116,7 @@ def read_description(path: Path) -> Description:
     for key in data:
         if key not in KEYS:
             raise SourceError(
-                f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.", instead(str(key), KEYS)
+                f"{file} has the unknown key '{key}'; {suggest(str(key), KEYS)}.", fix_for(str(key), KEYS)
             )
     if data.get("schema", 1) != 1:
         raise SourceError(f"{file} has the schema {data['schema']!r}; this vlatool reads 1.", "upgrade vlatool")
@@ -160,16 +160,16 @@ def read_description(path: Path) -> Description:
 def _check_label(file: Path, key: str, value: Any) -> None:
     """Refuse a name or version that could not stand in a line of a report."""
     label = str(value)
-    if not (0 < len(label) <= MAX_LABEL and one_line(label, MAX_LABEL) == label):
+    if not (0 < len(label) <= MAX_LABEL_CHARACTERS and one_line(label, MAX_LABEL_CHARACTERS) == label):
         raise SourceError(
-            f"{file}: '{key}' must be text of 1 to {MAX_LABEL} characters without control characters; got "
-            f"{shortened(label, 40)!r}.",
+            f"{file}: '{key}' must be text of 1 to {MAX_LABEL_CHARACTERS} characters without control characters; got "
+            f"{truncate(label, 40)!r}.",
             "give it a short name in one line",
         )
 
 
 def _check_timeout(file: Path, data: Mapping[str, Any]) -> None:
-    """Refuse a timeout that a call of the environment cannot have."""
+    """Refuse an invalid timeout for calls of the environment."""
     seconds = (data.get("environment") or {}).get("timeout", 1)
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= 1e6:
         raise SourceError(

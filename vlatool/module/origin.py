@@ -26,13 +26,13 @@ class Origin:
     """Where a policy's modules come from.
 
     Args:
-        folder: The policy's folder, which the user named or trusted.
+        folder: the policy's folder, which the user named or trusted.
         factory: ``path.py:make`` or ``package.module:make``.
-        arguments: Of the factory.
-        weights: Glob of the shards that vlatool loads; empty when the factory does.
-        code: File beside the factory -> its SHA-256 when the source bundle was made.
+        arguments: arguments of the factory.
+        weights: glob of the shards that vlatool loads; empty when the factory does.
+        code: file beside the factory -> its SHA-256 when the source bundle was made.
         environment: ``make`` and ``tasks`` of the environment that the policy's description names.
-        program: How the description lets its graphs run.
+        program: how the description lets its graphs run.
         training: ``FILE.py:FUNCTION`` that yields batches to train on, as the description has it; empty for none.
     """
 
@@ -76,12 +76,12 @@ class Origin:
             file = Path(str(getattr(module, "__file__", None) or os.devnull))
             if path is None or name.startswith(OWN_NAME) or not file.resolve().is_relative_to(path.parent):
                 continue
-            beside = file.resolve().relative_to(path.parent)
-            if beside.suffix == ".py" and "site-packages" not in beside.parts and beside.as_posix() not in self.code:
+            own = file.resolve().relative_to(path.parent)
+            if own.suffix == ".py" and "site-packages" not in own.parts and own.as_posix() not in self.code:
                 raise SourceError(
-                    f"The factory '{self.factory}' imports {beside}, which no import statement of its files names, so "
+                    f"The factory '{self.factory}' imports {own}, which no import statement of its files names, so "
                     "its changes would not be noticed.",
-                    f"import it with an import statement, or name it in policy.yaml: files: [{beside}]",
+                    f"import it with an import statement, or name it in policy.yaml: files: [{own}]",
                 )
 
 

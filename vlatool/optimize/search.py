@@ -26,7 +26,7 @@ from vlatool import registry
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations, recordings_of
-from vlatool.errors import NOT_MADE, GraphError, PluginError, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, GraphError, PluginError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
 from vlatool.machine.instruction_sets import board_set
@@ -162,8 +162,8 @@ class Search:
         self._planned = max(self._planned, done + 1)
         left = (time.monotonic() - self._begun) / done * (self._planned - done) if done else math.nan
         rest = f", about {left:.0f} s left" if done else ""
-        self.context.tell(f"search: plan {done + 1} of at most {self._planned}{rest}: {name}", done / self._planned)
-        quiet = replace(self.context, tell=lambda _what, _share: None)
+        self.context.progress(f"search: plan {done + 1} of at most {self._planned}{rest}: {name}", done / self._planned)
+        quiet = replace(self.context, progress=lambda _what, _share: None)
         try:
             bundle = self.baseline
             for stage in transforms(stages):
@@ -180,7 +180,7 @@ class Search:
             error = self._error(bundle, quiet)
             trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine, fastest)
         except VlatoolError as failure:
-            if failure.exit_code not in NOT_MADE:
+            if failure.exit_code not in NOT_POSSIBLE:
                 raise
             trial = Trial(name, stages, note=failure.message)
         self.trials.append(trial)
@@ -276,7 +276,7 @@ class Search:
             try:
                 self._layers = sensitivities_apart(self.baseline, stage, RECORDED, SAMPLES, self.context, SECONDS)
             except GraphError as error:  # the plans that were tried stand
-                self.context.tell(f"search: the layers could not be measured: {error.message}", None)
+                self.context.progress(f"search: the layers could not be measured: {error.message}", None)
                 self._layers = []
         return self._layers
 

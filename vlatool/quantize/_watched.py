@@ -11,7 +11,7 @@ from vlatool.data import Moment
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.graph_files import open_graph
@@ -39,7 +39,7 @@ class Watcher:
         self._outputs = [value.name for value in graph.graph.output]
         show(graph)
         self._about = f"the graph '{path.stem}' with further outputs"
-        with risky(engine_class(), f"opened {self._about}"):
+        with engine_call(engine_class(), f"opened {self._about}"):
             self._session = engine_class()(write_beside(graph.model, path, copy), 1)
 
     def watch(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
@@ -48,7 +48,7 @@ class Watcher:
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run, look at the values, return the graph's own outputs."""
-        with risky(engine_class(), f"ran {self._about}"):
+        with engine_call(engine_class(), f"ran {self._about}"):
             values = self._session.run(feeds)
         if self.counts:
             self.watch(feeds, values)
@@ -84,7 +84,7 @@ def run_watched(
         moment = each if isinstance(each, Moment) else Moment(each, numbers[place] if numbers else place)
         number = moment.number
         if place % 8 == 0:
-            context.tell(f"{what} sample {number}", place / len(numbers) if place < len(numbers) else None)
+            context.progress(f"{what} sample {number}", place / len(numbers) if place < len(numbers) else None)
         for watcher in watchers.values():
             watcher.sample, watcher.counts = number, moment.counts
         if moment.begins:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from vlatool import registry
-from vlatool.errors import GraphError, MissingExtra, PluginError, install, require
+from vlatool.errors import GraphError, MissingExtra, PluginError, pip_install, require
 
 if TYPE_CHECKING:
     from vlatool.machine.target import Target
@@ -116,7 +116,7 @@ class Engine:
     @classmethod
     def installation(cls) -> str:
         """Return the command that installs the library."""
-        return install(cls.extra) if cls.extra else f"pip install {(*cls.substitutes, cls.package)[0]}"
+        return pip_install(cls.extra) if cls.extra else f"pip install {(*cls.substitutes, cls.package)[0]}"
 
     @classmethod
     def is_installed(cls) -> bool:
@@ -157,7 +157,7 @@ class Engine:
         """Return what its answers depend on, part of cache keys and records: provider, device, driver, and versions.
 
         It is empty for an engine on the processor: keys and records have the instruction set that oneDNN computes in
-        (``machine.instruction_sets.computed_in``) and the versions of packages anyway.
+        (``machine.instruction_sets.openvino_set``) and the versions of packages anyway.
         """
         return ""
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import DataError, GraphError, VlatoolError, instead, nearest
+from vlatool.errors import DataError, GraphError, VlatoolError, fix_for, suggest
 from vlatool.runtime.contract import not_finite
 from vlatool.runtime.observation import all_finite
 
@@ -155,7 +155,7 @@ class Program:
         for name, value in noise.items():
             if name not in known:
                 raise DataError(
-                    f"The program draws no noise '{name}'; {nearest(str(name), known)}.", instead(str(name), known)
+                    f"The program draws no noise '{name}'; {suggest(str(name), known)}.", fix_for(str(name), known)
                 )
             array, shape = np.asarray(value), tuple(known[name]["shape"])
             if array.dtype.kind != "f":

@@ -28,7 +28,7 @@ def source_stage(typed: str) -> Source:
     Raises:
         SourceError: when no source reads it, or it is wrong.
     """
-    return source_of_policy(typed).named()
+    return source_of_policy(typed).trust_code()
 
 
 def source_bundle(source: Bundle | Source, cache: Path, context: Context) -> Bundle:

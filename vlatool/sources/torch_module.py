@@ -99,7 +99,7 @@ class TorchModule(Source):
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the spec, the assets and the recorded data."""
         described = self.describe()
-        self.named()
+        self.trust_code()
         copy_assets(described, out)
         factory = self._factory(described)
         root = self._root(described)
@@ -109,10 +109,10 @@ class TorchModule(Source):
         made_by = {**self.made_by(), "options": {}}
         return seal(out, described.manifest(made_by=made_by, source=source_record))
 
-    def named(self) -> Self:
+    def trust_code(self) -> Self:
         """Allow the policy's code to run in this process: the user named its folder."""
         folder = self.describe().folder
-        trust.name(folder, None if self.policy.resolve() == folder.resolve() else self.policy, self.factory)
+        trust.allow(folder, None if self.policy.resolve() == folder.resolve() else self.policy, self.factory)
         return self
 
     def _factory(self, described: Description) -> str:

@@ -8,7 +8,7 @@ from statistics import median
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
 from vlatool.data import PLAYED, is_of_recording
-from vlatool.files.written import LEDGER
+from vlatool.files.ownership import LEDGER
 from vlatool.gate.config import GrowthClaim, LatencyClaim
 from vlatool.gate.inputs import MEMORY, Inputs
 from vlatool.gate.result import ClaimResult
@@ -45,7 +45,7 @@ def examine_memory(
     """
     peaks: tuple[list[float], list[float]] = ([], [])
     for number in range(PROBES):
-        context.tell("memory of each in fresh processes", number / PROBES)
+        context.progress("memory of each in fresh processes", number / PROBES)
         with inputs.file(OBSERVATIONS, MEMORY, number) if inputs else contextlib.nullcontext() as path:
             for bundle, taken in zip((candidate, baseline), peaks, strict=True):
                 probed = cold_start(bundle.path, how.engine, how.threads, timeout=how.timeout, observations=path)

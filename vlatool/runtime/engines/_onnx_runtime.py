@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, MissingExtra, require
+from vlatool.machine.engine_calls import REMEDY
 from vlatool.machine.host import gpu_driver, gpus, versions
-from vlatool.machine.risky import REMEDY
 from vlatool.runtime.contract import Port, port
 from vlatool.runtime.engine import Engine, Node, Profiled, computing
 from vlatool.runtime.engines._ort_profile import OrtProfiled, precision

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import GraphError, instead, nearest, require
+from vlatool.errors import GraphError, fix_for, require, suggest
+from vlatool.machine.engine_calls import REMEDY
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
-from vlatool.machine.risky import REMEDY
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Stages
@@ -315,8 +315,8 @@ def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
     """
     if compute not in HINTS:
         raise GraphError(
-            f"OpenVINO on the CPU does not compute in {compute}; {nearest(compute, filter(None, HINTS))}.",
-            instead(compute, filter(None, HINTS)),
+            f"OpenVINO on the CPU does not compute in {compute}; {suggest(compute, filter(None, HINTS))}.",
+            fix_for(compute, filter(None, HINTS)),
         )
     return {
         "INFERENCE_PRECISION_HINT": HINTS[compute],
