@@ -22,14 +22,14 @@ from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.cli._run import exported
+from vlatool.cli._run import export_source
 from vlatool.errors import RecipeError, SourceError
 from vlatool.hardware.profile import load_profile
 from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
 from vlatool.report import Report, read_report
 from vlatool.runtime import load
-from vlatool.sources import brings_calibration, source_stage, sourced
+from vlatool.sources import brings_calibration, source_bundle, source_stage
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
@@ -517,8 +517,9 @@ def test_calibration_data_is_found_beside_the_description(policy_dir, model):
 
 
 def test_a_source_with_graphs_is_not_exported_again(model, tmp_path):
-    bundle = sourced(str(model), tmp_path, Context())
-    assert exported(str(model), tmp_path, Context()).path == bundle.path
+    stage = source_stage(str(model))
+    bundle = source_bundle(stage, tmp_path, Context())
+    assert export_source(stage, tmp_path, Context()).path == bundle.path
     assert list(bundle.manifest.graphs) == ["main"]
 
 

@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 from vlatool.accuracy.credibility import FAILS
-from vlatool.bundle.bundle import Bundle, hash_file
+from vlatool.bundle.bundle import Bundle
 from vlatool.gate.claims import accuracy, answers, deadline, disturbed, growth, latency, motion, task_time, worst_task
 from vlatool.gate.config import Gate, LatencyClaim
 from vlatool.gate.episodes import Episodes
@@ -23,7 +23,7 @@ from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.validity import busy, throttling, validity
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, content_hash
 from vlatool.telemetry import Recorder, open_all
 
 KIND = "gate"
@@ -114,12 +114,12 @@ def _measured_with(gate: Gate, inputs: Inputs, agreement: Agreement) -> list[dic
     table: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (how.threads, *how.also_threads)))}
     table |= dict(zip(("engine of the baseline", "engine of the candidate"), agreement.engines, strict=True))
     table |= {
-        f"recording {recording.path.name}": f"sha256:{hash_file(recording.path)}"
+        f"recording {recording.path.name}": f"sha256:{content_hash(recording.path)}"
         for recording in inputs.recordings
-        if recording.path.is_file()
+        if recording.path.exists()
     }
-    if gate.accuracy and (data := accuracy.data_of(inputs.baseline, gate.accuracy)) is not None and data.is_file():
-        table["evaluation data"] = f"sha256:{hash_file(data)}"
+    if gate.accuracy and (data := accuracy.data_of(inputs.baseline, gate.accuracy)) is not None and data.exists():
+        table["evaluation data"] = f"sha256:{content_hash(data)}"
     return [{"what": what, "value": value} for what, value in table.items()]
 
 
