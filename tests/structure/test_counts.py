@@ -68,7 +68,7 @@ def test_an_entry_is_the_files_that_its_module_imports(tmp_path: Path):
     package.mkdir(parents=True)
     (package / "one.py").write_text("import numpy\nfrom acme import _part\n")
     (package / "_part.py").write_text("from acme.other import x\n")
-    (package / "other.py").write_text("x = 'AcmeExecutionProvider'\n")
+    (package / "other.py").write_text("class X:\n    providers = ()\n")
     points = tmp_path / "tests/plugins/test_plugins.py"
     points.write_text('ENTRY_POINTS = """\n[vlatool.engines]\na = acme.one\nb = acme.other:X\nc = acme.gone\n"""\n')
     assert entry_points(points) == {"vlatool.engines": ["acme.one", "acme.other", "acme.gone"]}
