@@ -410,7 +410,7 @@ SOURCES = [
     Row("an unknown dtype", "did you mean 'uint8'", 3, lambda at: ["export", at.policy("uint8", "unit8"), *at.to]),
     Row("an unknown normalisation", "did you mean 'mean_std'", 3,
         lambda at: ["export", at.policy("mean_std", "mean_sdt"), *at.to]),
-    Row("a shape with a zero", "each axis is a whole number", 3,
+    Row("a shape with a zero", "an axis is a whole number", 3,
         lambda at: ["export", at.policy("[1, 8, 8, 3]", "[1, 0, 8, 3]"), *at.to]),
     Row("a rate in words", "control_hz", 3,
         lambda at: ["export", at.policy("control_hz: 10", "control_hz: fast"), *at.to]),

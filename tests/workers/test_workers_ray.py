@@ -116,7 +116,7 @@ def test_a_worker_that_is_killed_loses_nothing(nodes: Nodes, bundle: Bundle):
     def tell(what: str, _share: float | None) -> None:
         told.append(what)
         if sum("succeed" in line for line in told) == 1 and "succeed" in what:
-            below(os.getpid(), "ray::Seat")[0].kill()
+            below(os.getpid(), "ray::RemoteWorker")[0].kill()
 
     assert run_jobs(bundle, asked, "", Context(tell, launcher="ray", workers=0)) == alone(bundle, asked)
     assert any("a worker of the Ray cluster was lost" in line for line in told)
