@@ -150,7 +150,7 @@ def source_bundle(policy_template: Path) -> Bundle:
     """The source bundle of the tiny policy; read only."""
     from vlatool.sources.torch_module import TorchModule
 
-    trust.name(policy_template)  # as making the bundle does, in the process that makes it
+    trust.allow(policy_template)  # as making the bundle does, in the process that makes it
     return made_once("source", TorchModule(policy=policy_template), None)
 
 

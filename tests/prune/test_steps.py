@@ -19,7 +19,7 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.gate.claims.accuracy import Accuracy
 from vlatool.gate.config import Gate
 from vlatool.gate.same import check
-from vlatool.module import stage, stored
+from vlatool.module import sharded_weights, stage
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune.steps import Steps, fewer
 from vlatool.rebuild.rebuild import rebuild
@@ -106,9 +106,9 @@ def test_weights_in_shards_stay_there(sharded: Bundle, one: Bundle, tmp_path: Pa
 
 def test_weights_in_large_shards_are_not_read(sharded: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     read = list[str]()
-    monkeypatch.setattr(stored, "read_tensor", lambda _reader, tensor, _dtype: read.append(tensor.name))
+    monkeypatch.setattr(sharded_weights, "read_tensor", lambda _reader, tensor, _dtype: read.append(tensor.name))
     monkeypatch.setattr("vlatool.module.torch_policy.shard_files", lambda *_: read.append("all") or [])
-    monkeypatch.setattr(stage, "RUN_BELOW", 0)
+    monkeypatch.setattr(stage, "MAX_RUN_BYTES", 0)
     (tmp_path / "out").mkdir()
     made = Steps(to=2).run(sharded, tmp_path / "out", Context())
     assert made.manifest.program[1].repeat == 2

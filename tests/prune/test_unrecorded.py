@@ -39,5 +39,7 @@ def test_random_observations_are_told(
     source = replace(two_blocks, manifest=replace(two_blocks.manifest, files=files))
     context = Context()
     build_stage(stage, {"samples": 3, **options}).change(load_modules(source), source, context)
-    told = [line for line in context.said if line.startswith("nothing is recorded: chosen by 3 random observations")]
+    told = [
+        line for line in context.messages if line.startswith("nothing is recorded: chosen by 3 random observations")
+    ]
     assert len(told) == (looks and not recorded)

@@ -13,9 +13,9 @@ from vlatool.boards.select import Choice, Wants, choose, in_the_cloud
 from vlatool.boards.simulate import Change, bounds, changes, parts_of, timeline
 from vlatool.boards.torch_workload import counted_apart
 from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.errors import DataError, OutputError, SourceError, UsageError, instead, nearest
+from vlatool.errors import DataError, OutputError, SourceError, UsageError, fix_for, suggest
 from vlatool.export.onnx import ExportOnnx
-from vlatool.files.written import note_file
+from vlatool.files.ownership import add_to_ledger
 from vlatool.graph.stored import digest, read_workload, refuse_other, write_workload
 from vlatool.graph.workload import PRECISIONS, Workload, workload
 from vlatool.hardware.platforms import load_platform
@@ -64,7 +64,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     for precision in asked.precisions:
         if precision not in PRECISIONS:
             raise UsageError(
-                f"--precision is '{precision}'; {nearest(precision, PRECISIONS)}.", instead(precision, PRECISIONS)
+                f"--precision is '{precision}'; {suggest(precision, PRECISIONS)}.", fix_for(precision, PRECISIONS)
             )
     if asked.platform:
         sheet = load_platform(asked.platform)
@@ -84,7 +84,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     model = shipped().conditioned(measured_questions(calibration))
     owned = [board for board in boards if board.price_usd_per_hour is None]
     rented = [board for board in boards if board.price_usd_per_hour is not None]
-    context.tell("predicting", None)
+    context.progress("predicting", None)
     cloud = _cheapest(rented, load, model, asked) if asked.cloud else None
     choices = choose(owned or rented, load, model, asked)
     return boards_report(source, load, choices, asked, cloud, context.command)
@@ -132,10 +132,10 @@ def _counted_source(bundle: Bundle, context: Context) -> Workload:
 
     A factory that reads its own weights cannot fill modules that have none, and may look at their values.
     """
-    context.tell("counting the policy's work, without its weights", None)
+    context.progress("counting the policy's work, without its weights", None)
     with contextlib.suppress(SourceError):  # what is wrong with the policy itself, the export says
-        return counted_apart(bundle, context.tell)
-    context.tell("it cannot be counted so; exporting the policy to count its graphs", None)
+        return counted_apart(bundle, context.progress)
+    context.progress("it cannot be counted so; exporting the policy to count its graphs", None)
     return _counted_export(bundle, context)
 
 
@@ -172,7 +172,7 @@ def carry_count(source: str, context: Context) -> Path:
     load = counted(bundle, context)
     try:
         write_workload(file, load, digest(bundle))
-        note_file(file)
+        add_to_ledger(file)
     except OSError as error:
         raise OutputError(f"{file} cannot be written: {error.strerror}.", "make the folder writable") from error
     return file
@@ -206,8 +206,8 @@ def simulated(
     asked = Candidate(profile, name, engine or profile.engine, precision)
     if precision and precision not in asked.figures.dtypes:
         raise UsageError(
-            f"--precision is '{precision}'; {nearest(precision, asked.figures.dtypes)}.",
-            instead(precision, asked.figures.dtypes),
+            f"--precision is '{precision}'; {suggest(precision, asked.figures.dtypes)}.",
+            fix_for(precision, asked.figures.dtypes),
         )
     bundle = opened(source, context)
     spec, load = bundle.manifest.spec, counted(bundle, context)

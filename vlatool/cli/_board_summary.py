@@ -73,7 +73,7 @@ def board_summary(bundle: Bundle, source: Bundle | None, profile: Profile, conte
     numbers: tuple[Measurement, ...] = ()
     error = None
     if bundle.manifest.graphs:
-        context.tell(f"predicting for {profile.name}", None)
+        context.progress(f"predicting for {profile.name}", None)
         with _noting(missing, f"nothing is predicted for {profile.name}"):
             numbers = _predicted(bundle, profile)
         with _noting(missing, "the actions were not compared with the source's"):

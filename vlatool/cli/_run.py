@@ -27,9 +27,9 @@ from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
-from vlatool.stage.controls import PRUNED, controls
+from vlatool.stage.controls import PRUNED_KEY, controls
 from vlatool.stage.finish import read_difference
-from vlatool.stage.run import cache_directory, cached_transform, first_steps, measured, measured_with, run_transform
+from vlatool.stage.run import cache_directory, cached_transform, first_steps, measure_in_child, report_of, run_transform
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -119,8 +119,8 @@ def transform(
         reports = None
         for other in then:
             bundle = cached_transform(stage, bundle, cache_directory(), context)
-            if told := stage.told(bundle):
-                context.said.extend((*told, f"loss curve: {out / REPORTS_FOLDER / 'report.html'}"))
+            if told := stage.summary(bundle):
+                context.messages.extend((*told, f"loss curve: {out / REPORTS_FOLDER / 'report.html'}"))
                 reports = bundle.path / REPORTS_FOLDER
             stage = other
         result = run_transform(stage, bundle, out, context, force=force, reports=reports)
@@ -130,7 +130,7 @@ def transform(
     if as_json:
         document({
             "bundle": str(out), "hash": result.hash, "bytes": result.size_bytes, "precision": precision,
-            "findings": result.manifest.findings, "pruned": result.manifest.made_by.get(PRUNED),
+            "findings": result.manifest.findings, "pruned": result.manifest.made_by.get(PRUNED_KEY),
             "board": on_board.values() if on_board else None,
             "difference": asdict(difference) if (difference := read_difference(result)) else None,
         })  # fmt: skip
@@ -139,7 +139,7 @@ def transform(
     graphs = f"graphs {result.graph_bytes / 1e6:.2f} MB, " if result.manifest.graphs else ""
     sizes = f"{graphs}in all {result.size_bytes / 1e6:.1f} MB"
     typer.echo(f"{out}: {one_line(result.manifest.name)} {one_line(result.manifest.version)}, {sizes}")
-    for line in (*map(printable, context.said), *stage.lines(result), *(controls(bundle) if bundle else ())):
+    for line in (*map(printable, context.messages), *stage.lines(result), *(controls(bundle) if bundle else ())):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
         if not shares:
@@ -168,7 +168,7 @@ def _moved(bundle: Bundle) -> Iterator[str]:
 
 def following(stage: Transform, board: Profile | None) -> list[Transform]:
     """Return the stages that the command line runs after one, with the options that the board needs."""
-    stages = [cast(Transform, build_stage(name, options)) for name, options in stage.then()]
+    stages = [cast(Transform, build_stage(name, options)) for name, options in stage.following_stages()]
     return [each.on(board) if board else each.on_this_host() for each in stages]
 
 
@@ -263,7 +263,7 @@ def measure(
         if target is not None:
             from vlatool.remote.ssh import measure_on
 
-            context = replace(context, elsewhere=partial(measure_on, target, python=remote_python or ""))
+            context = replace(context, measure_remotely=partial(measure_on, target, python=remote_python or ""))
         report = _measured(stage if board is None else stage.on(board), bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
@@ -274,10 +274,10 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
     """Run a stage here; evaluate a bundle of OpenVINO in the board's instruction set, where this host has that."""
     engine = getattr(stage, "engine", "") or bundle.manifest.engine
     if board is None or stage.kind() != "evaluate" or engine != ENGINE:
-        return measured(stage, bundle, context)
+        return report_of(stage, bundle, context)
     computes = board_set(board)
     confine = {MAX_CPU_ISA: computes.to_set}
-    report = measured_with(confine, stage, bundle, context) if computes.to_set else stage.run(bundle, context)
+    report = measure_in_child(confine, stage, bundle, context) if computes.to_set else stage.run(bundle, context)
     summary, warnings = (*report.summary, *computes.about_errors()), (*report.warnings, *computes.warnings())
     return replace(report, summary=summary, warnings=warnings)
 

@@ -16,7 +16,7 @@ from vlatool.cli._document import document
 from vlatool.cli._options import BundlePath
 from vlatool.errors import BundleError, GraphError
 from vlatool.files.printable import printable
-from vlatool.files.sealed import open_inside
+from vlatool.files.verified_read import open_inside
 from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded
 from vlatool.runtime.policy import FIRST_RUN_S

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._recording import Recording
-from vlatool.errors import nearest
+from vlatool.errors import suggest
 from vlatool.runtime.statistics import load_normaliser
 
 Array = NDArray[Any]
@@ -70,7 +70,7 @@ def _of_names(recording: Recording, spec: PolicySpec) -> Iterator[str]:
     for name in recording.ignored:
         yield (
             f"{recording.path} has the array '{name}', which is not an input of the policy and is ignored; "
-            + nearest(name, known)
+            + suggest(name, known)
         )
 
 

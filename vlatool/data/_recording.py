@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vlatool import registry
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.errors import DataError, nearest
+from vlatool.errors import DataError, suggest
 from vlatool.files.rows import Rows, blocks
 
 Array = NDArray[Any]
@@ -149,7 +149,7 @@ def read_recording(path: Path, spec: PolicySpec) -> Recording:
     suffix = path.suffix.removeprefix(".")
     if suffix not in known:
         raise DataError(
-            f"{path} is of an unknown format; {nearest(suffix, known)}.",
+            f"{path} is of an unknown format; {suggest(suffix, known)}.",
             "store it as .npz: np.savez(FILE, NAME=values)",
         )
     reader: Any = registry.load("data", suffix)
@@ -165,7 +165,7 @@ def checked(path: Path, arrays: Mapping[str, Values], spec: PolicySpec) -> Recor
     inputs = {}
     for tensor in spec.inputs:
         if tensor.name not in arrays:
-            raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.", RECORD_ALL)
+            raise DataError(f"{path} has no '{tensor.name}'; {suggest(tensor.name, arrays)}.", RECORD_ALL)
         inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name], spec)
     actions, episodes = _in_memory(arrays, spec.action.name, "action"), _in_memory(arrays, "episode")
     lengths = {name: len(values) for name, values in inputs.items()}

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from vlatool.episodes.disturbed import OWN
 from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.module.factory import RAISED, exits_caught
+from vlatool.module.factory import CORRECT_CODE, map_user_exceptions
 
 
 def under_way(task: str, seed: int) -> str:
@@ -32,7 +32,7 @@ def named(task: str, seed: int | None = None, under: tuple[str, float] | None = 
     """
     at = "" if seed is None else f" at seed {seed}{_under(under)}"
     try:
-        with exits_caught(f"the environment of task '{task}'{at and f',{at},'}"):
+        with map_user_exceptions(f"the environment of task '{task}'{at and f',{at},'}"):
             yield
     except VlatoolError as error:
         locate(error, task, seed, under=under)
@@ -65,7 +65,7 @@ def locate(
     if words:
         start = " ".join(words)
         error.message = f"{start[:1].upper()}{start[1:]}: {message}"
-    if error.fix in ("", RAISED) and isinstance(error, DataError | SourceError):
+    if error.fix in ("", CORRECT_CODE) and isinstance(error, DataError | SourceError):
         error.fix = _remedy(task, seed, under)
 
 

@@ -60,7 +60,7 @@ def run_jobs(
             part = kept.found[number] if number in kept.found else kept.whole(number, next(played))
             outcomes += part
             tally.add(part)
-            context.tell(tally.sentence(), tally.share)
+            context.progress(tally.sentence(), tally.share)
         next(played, None)  # what is open is closed
     kept.say()
     return outcomes
@@ -85,7 +85,7 @@ def _played(
         if what.startswith(ENDED):
             kept.one(what.removeprefix(ENDED))
         else:
-            begun.add(what) if what in ours else context.tell(what, share)
+            begun.add(what) if what in ours else context.progress(what, share)
 
     work = _work("play", bundle, jobs, engine, PRELOAD, "close", away=name != PROCESSES)
     answers = launcher(name, count).answers(work, tell, done, context.notes.append)
@@ -126,7 +126,7 @@ def check_opens(bundles: Sequence[Bundle], job: EpisodesJob, engine: str, contex
     for bundle in bundles:
         name = context.launcher if bundle.manifest.graphs else PROCESSES
         work = _work("opened", bundle, [job], engine, PRELOAD, away=name != PROCESSES)
-        list(launcher(name, 1).answers(work, context.tell, lambda _number, _answer: None, context.notes.append))
+        list(launcher(name, 1).answers(work, context.progress, lambda _number, _answer: None, context.notes.append))
 
 
 def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
@@ -138,7 +138,7 @@ def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple
     """
     work = _work("disturbances", bundle, [job], "", away=context.launcher != PROCESSES)
     who = launcher(context.launcher, context.workers)
-    (own,) = who.answers(work, context.tell, lambda _number, _answer: None, context.notes.append)
+    (own,) = who.answers(work, context.progress, lambda _number, _answer: None, context.notes.append)
     if not isinstance(own, list) or not all(isinstance(kind, str) for kind in own):
         raise DataError(
             "The process that asked the environment for its disturbances did not answer with names.", OWN_FILES
@@ -229,7 +229,7 @@ class _Kept:
         self._jobs = jobs
         self._single: dict[tuple[str, int], Outcome] = {}
         self._context = context
-        self._store = None if context.kept is None or jobs[0].record else context.kept
+        self._store = None if context.store is None or jobs[0].record else context.store
         if self._store is None:
             return
         around = circumstances(bundle, engine, jobs[0])
@@ -244,7 +244,7 @@ class _Kept:
         self._store.taken += taken
         self._store.asked += sum(len(job.seeds) for job in jobs)
         if taken:
-            context.tell(f"{taken} episodes are of an interrupted run", None)
+            context.progress(f"{taken} episodes are of an interrupted run", None)
 
     def _found(self, key: str, job: EpisodesJob) -> Outcomes:
         """Return what is kept of a job; nothing where there is none, or it is not what that job gives."""
@@ -299,4 +299,4 @@ class _Kept:
     def say(self) -> None:
         """Say it where outcomes cannot be kept."""
         if self._store is not None and self._store.problem:
-            self._context.tell(self._store.problem, None)
+            self._context.progress(self._store.problem, None)

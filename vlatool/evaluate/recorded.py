@@ -27,7 +27,7 @@ from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context, Measure
-from vlatool.stage.tried import try_out
+from vlatool.stage.first_run import run_once_in_child
 from vlatool.stats.intervals import wilson
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class Recorded(Measure):
         file = (recording.path, state.st_mtime_ns, state.st_size, len(recording))
         key = (baseline.hash, spec, file, tuple(indices), self.engine)
         if key not in REFERENCES:
-            context.tell("running the baseline", None)
+            context.progress("running the baseline", None)
             while len(REFERENCES) >= KEPT:
                 REFERENCES.pop(next(iter(REFERENCES)))
             REFERENCES[key] = run_recorded(baseline, recording, indices, self.engine, context)
@@ -154,17 +154,18 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
         GraphError: when this machine computes another golden action than recorded, an inference takes longer than
             ``FIRST_RUN_S``, or the engine crashes.
     """
-    try_out(bundle, engine)
+    run_once_in_child(bundle, engine)
     policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
     policy.warm_up(1)
+    policy.limit_s = FIRST_RUN_S
     chunks: list[Array] = []
     for moment in moments_of(recording, indices, keeps=keeps_values(bundle.manifest.program)):
         if len(chunks) % 16 == 0:
-            context.tell("running recorded observations", len(chunks) / len(indices))
+            context.progress("running recorded observations", len(chunks) / len(indices))
         if moment.begins:
             policy.reset()
         answered = off_the_robot(f"sample {moment.number} of {recording.path}", MAKE_OTHERWISE)
-        with answered, policy.stopped_after(FIRST_RUN_S):
+        with answered:
             chunk = policy.infer(moment.observation).chunk
         chunks += [chunk] if moment.counts else []
     return np.stack(chunks)

@@ -78,7 +78,7 @@ def _without(
     bundle: Bundle, baseline: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context
 ) -> Phases:
     """Run float32, the bundle with its cut, and the whole float32 graph in bfloat16."""
-    context.tell(f"measuring what the phases of {phase.graph} would be in bfloat16", None)
+    context.progress(f"measuring what the phases of {phase.graph} would be in bfloat16", None)
     graphs = baseline.manifest.graphs
     try:
         plain = _actions(baseline, {}, observations, dict.fromkeys(graphs, ""))
@@ -92,7 +92,7 @@ def _without(
 
 def _measured(bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context) -> Phases:
     """Run float32, the bundle as it is, and the bundle with the cut."""
-    context.tell(f"measuring what bfloat16 does to the phases of {phase.graph}", None)
+    context.progress(f"measuring what bfloat16 does to the phases of {phase.graph}", None)
     manifest = bundle.manifest
     note = ""
     with scratch_directory() as scratch:

@@ -15,7 +15,7 @@ from vlatool.graph.precision import FLOATS
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage.base import Stage
-from vlatool.stage.build import stage_class, validated
+from vlatool.stage.build import stage_class, stage_from
 from vlatool.stage.run import cache_directory
 
 EVALUATION = "data/evaluation.npz"
@@ -79,7 +79,7 @@ def _stage(name: str, options: Mapping[str, Any]) -> tuple[Stage | None, tuple[s
     kept = {key: value for key, value in options.items() if key in kind.model_fields and key != "calibration"}
     notes = tuple(f"the option {key}: {value} was not taken over" for key, value in options.items() if key not in kept)
     try:
-        return validated(kind, kept, name), notes
+        return stage_from(kind, kept, name), notes
     except VlatoolError as error:
         return None, (*notes, error.message)
 

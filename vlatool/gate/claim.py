@@ -73,7 +73,7 @@ class Claim(Numeric):
 
     def sentence(self, verdict: Verdict) -> str:
         """Return what was found in words, without a full stop."""
-        return "; ".join(map(measured_words, verdict.decisive))
+        return "; ".join(map(measured_words, verdict.decisive)) or verdict.reason.value
 
 
 def measured_words(judged: Judgement) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ConfigDict, Field, ValidationError, create_model, model_validator
 
 from vlatool import registry
-from vlatool.errors import PluginError, RecipeError, require
+from vlatool.errors import PluginError, RecipeError, VlatoolError, require
 from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
 from vlatool.gate.claim import KIND, Claim
@@ -87,7 +87,7 @@ def claim_classes() -> Mapping[str, type[Claim]]:
     """
     classes: dict[str, type[Claim]] = {}
     for name in registry.names(KIND):
-        with contextlib.suppress(PluginError):
+        with contextlib.suppress(VlatoolError):
             classes[name] = _claim_class(name)
     return dict(sorted(classes.items(), key=lambda item: item[1].order))
 

@@ -20,7 +20,7 @@ from vlatool.gate.verdict import Outcome, Reason, Verdict, worst
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
 from vlatool.measurement.pairs import PairJob
-from vlatool.measurement.validity import busy, throttled, validity
+from vlatool.measurement.validity import busy, throttling, validity
 from vlatool.report import Finding, Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context
@@ -87,13 +87,13 @@ def _examined(gate: Gate, evidence: Evidence) -> tuple[list[_Result], tuple[Find
             for claim in claims:
                 found = claim.verdicts(evidence).items()
                 results += (_Result(title, verdict, claim.sentence(verdict)) for title, verdict in found)
-        findings += tuple(throttled(board.recorded.throttling))
+        findings += tuple(throttling(board.recorded.throttling))
     return results, findings
 
 
 def _agreement(timed: Timed, plan: Plan, inputs: Inputs) -> Agreement:
     """Load both bundles as a robot does, golden action and all, and ask both where a claim looks at their answers."""
-    timed.context.tell("both bundles, on observations that are not recorded", None)
+    timed.context.progress("both bundles, on observations that are not recorded", None)
     if Need.AGREEMENT not in plan.needs:
         return measure_agreement(replace(timed.job, pairs=0, seconds=0.0), timed.timeout)
     job = replace(timed.job, pairs=plan.observations, seconds=plan.answer_seconds)

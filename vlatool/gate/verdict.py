@@ -78,7 +78,8 @@ class Verdict:
     def of(cls, judgements: Sequence[Judgement], baseline: tuple[Measurement, ...] = (), **facts: Any) -> Verdict:
         """Return the verdict that the worst of the judgements gives, with their numbers for the report."""
         measured = tuple(each.measured for each in judgements if each.measured is not None)
-        return cls(worst(each.outcome for each in judgements), tuple(judgements), measured, baseline, facts=facts)
+        reason = Reason.LIMIT if judgements else Reason.NO_EVIDENCE
+        return cls(worst(each.outcome for each in judgements), tuple(judgements), measured, baseline, reason, facts)
 
     @property
     def decisive(self) -> tuple[Judgement, ...]:
@@ -88,8 +89,8 @@ class Verdict:
 
 
 def worst(outcomes: Iterable[Outcome]) -> Outcome:
-    """Return ``fail`` when one fails, else ``inconclusive`` when one is, else ``pass``."""
-    return min(outcomes, key=list(Outcome).index, default=Outcome.PASS)
+    """Return ``fail`` when one fails, else ``inconclusive`` when one is, or there is none, else ``pass``."""
+    return min(outcomes, key=list(Outcome).index, default=Outcome.INCONCLUSIVE)
 
 
 def judge_interval(measured: Measurement, limit: float, title: str = "", **facts: Any) -> Judgement:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.measurement.measured import Phase
+from vlatool.measurement.results import Phase
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program, Session
 
@@ -35,28 +35,22 @@ def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], secon
     """Return the parts of an inference, in their order.
 
     Args:
-        policy: Left as it was.
-        observations: In turns.
-        seconds: After which no further action begins, once ``FEWEST`` are timed.
+        policy: left as it was.
+        observations: observations, used in turns.
+        seconds: time after which no further action begins, once ``FEWEST`` are timed.
     """
     sessions = {name: _Timed(session) for name, session in policy.program.sessions.items()}
     timed = Policy(policy.bundle, Program(policy.program.steps, sessions, seed=0), policy.engine)
-    encode, encoded = timed.encode, []
-
-    def noted(observation: Mapping[str, Any]) -> dict[str, Any]:
-        start = time.perf_counter_ns()
-        values = encode(observation)
-        encoded.append((time.perf_counter_ns() - start) / 1e6)
-        return values
-
-    timed.encode = noted  # type: ignore[assignment]
+    encoded: list[float] = []
     whole: list[float] = []
     end = time.monotonic() + seconds
     for number in range(ACTIONS):
         if number >= FEWEST and time.monotonic() > end:
             break
         start = time.perf_counter_ns()
-        timed.infer(observations[number % len(observations)])
+        values = timed.encode(observations[number % len(observations)])
+        encoded.append((time.perf_counter_ns() - start) / 1e6)
+        timed.infer(values)
         whole.append((time.perf_counter_ns() - start) / 1e6)
     return _phases(whole, encoded, {name: session.taken for name, session in sessions.items()})
 

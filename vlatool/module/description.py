@@ -17,15 +17,15 @@ from vlatool.bundle.program import ProgramStep, check_program, program_from, sin
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import checked
 from vlatool.data.npz import NpzReader
-from vlatool.errors import MissingExtra, SourceError, SpecError, instead, nearest
-from vlatool.files.kept import carry
-from vlatool.files.printable import one_line, shortened
+from vlatool.errors import MissingExtra, SourceError, SpecError, fix_for, suggest
+from vlatool.files.blob_store import link_or_copy
+from vlatool.files.printable import one_line, truncate
 from vlatool.files.yaml import read_mapping
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 
 FILE = "policy.yaml"
-LONGEST = 100
+MAX_LABEL_CHARACTERS = 100
 """Characters of a policy's name, and of its version."""
 KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
@@ -40,18 +40,18 @@ class Description:
     """What ``policy.yaml`` says.
 
     Args:
-        folder: Where relative paths start.
+        folder: where relative paths start.
         factory: ``path.py:make`` or ``package.module:make``; empty for a policy that is an ONNX file.
-        arguments: Keyword arguments of the factory.
-        program: How the graphs are run.
+        arguments: keyword arguments of the factory.
+        program: how the graphs are run.
         environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation, and
             ``timeout``: seconds that a call of it may take.
-        parts: Part name -> globs of module names.
-        calibration, evaluation: Recorded observations, or None.
-        weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
+        parts: part name -> globs of module names.
+        calibration, evaluation: recorded observations, or None.
+        weights: glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
             module alone. Empty when the factory loads the weights.
         training: ``FILE.py:FUNCTION`` of the folder that yields batches of observations to train on; empty for none.
-        files: Globs of the files that the factory reads; None: every file of weights beside it.
+        files: globs of the files that the factory reads; None: every file of weights beside it.
     """
 
     folder: Path
@@ -106,7 +106,7 @@ def read_description(path: Path) -> Description:
     for key in data:
         if key not in KEYS:
             raise SourceError(
-                f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.", instead(str(key), KEYS)
+                f"{file} has the unknown key '{key}'; {suggest(str(key), KEYS)}.", fix_for(str(key), KEYS)
             )
     if data.get("schema", 1) != 1:
         raise SourceError(f"{file} has the schema {data['schema']!r}; this vlatool reads 1.", "upgrade vlatool")
@@ -150,10 +150,10 @@ def read_description(path: Path) -> Description:
 def _check_label(file: Path, key: str, value: Any) -> None:
     """Refuse a name or version that could not stand in a line of a report."""
     label = str(value)
-    if not (0 < len(label) <= LONGEST and one_line(label, LONGEST) == label):
+    if not (0 < len(label) <= MAX_LABEL_CHARACTERS and one_line(label, MAX_LABEL_CHARACTERS) == label):
         raise SourceError(
-            f"{file}: '{key}' must be text of 1 to {LONGEST} characters without control characters; got "
-            f"{shortened(label, 40)!r}.",
+            f"{file}: '{key}' must be text of 1 to {MAX_LABEL_CHARACTERS} characters without control characters; got "
+            f"{truncate(label, 40)!r}.",
             "give it a short name in one line",
         )
 
@@ -165,13 +165,13 @@ def _check_code(file: Path, data: Mapping[str, Any]) -> None:
         where = str(factory or "").rpartition(":")[0]
         if where.endswith(".py") and not _inside(where):
             raise SourceError(
-                f"{file}: '{key}' names a file outside the folder of the policy: {shortened(str(factory), 200)}.",
+                f"{file}: '{key}' names a file outside the folder of the policy: {truncate(str(factory), 200)}.",
                 "copy or link what runs into the folder, or name an importable package: package.module:make",
             )
 
 
 def _check_timeout(file: Path, data: Mapping[str, Any]) -> None:
-    """Refuse what is no time that a call of the environment may take."""
+    """Refuse an invalid timeout for calls of the environment."""
     seconds = (data.get("environment") or {}).get("timeout", 1)
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= 1e6:
         raise SourceError(
@@ -294,7 +294,7 @@ def copy_assets(described: Description, out: Path) -> None:
     for key, path in described.recordings().items():
         checked(path, NpzReader().read(path), described.spec)  # while it has the name that the user knows
         (out / "data").mkdir(exist_ok=True)
-        carry(path, out / "data" / f"{key}.npz")
+        link_or_copy(path, out / "data" / f"{key}.npz")
 
 
 def check_assets(described: Description, copies: Path) -> None:

@@ -13,9 +13,9 @@ from vlatool.accuracy.paired import compare_success
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.play import EVALUATION_SEEDS
-from vlatool.errors import NOT_MADE, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, VlatoolError
 from vlatool.evaluate.recorded import Recorded, carries_recordings
-from vlatool.files.work import work_directory
+from vlatool.files.resumable_work import work_directory
 from vlatool.machine.version import VERSION
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.made import candidate
@@ -79,7 +79,7 @@ class PrunedSearch:
         while (asked := study.ask(pruning.trials)) is not None:
             number, shape = asked
             place = len(study.tried()) + 1  # numbers of the study count shapes that were asked for twice, too
-            self.context.tell(f"trial {place} of {pruning.trials}: {space.name(shape)}", None)
+            self.context.progress(f"trial {place} of {pruning.trials}: {space.name(shape)}", None)
             study.tell(number, self._try(shape, space))
         tried = study.tried()
         chosen = self._finalists(tried, space)
@@ -105,7 +105,7 @@ class PrunedSearch:
             try:
                 speeds[name] = self._speedup(self._made(stages)[-1])
             except VlatoolError as failure:
-                if failure.exit_code not in NOT_MADE:
+                if failure.exit_code not in NOT_POSSIBLE:
                     raise
         return {name: found[name] for name in sorted(speeds, key=lambda name: -speeds[name])}
 
@@ -117,7 +117,7 @@ class PrunedSearch:
             return Tried(shape, self._speedup(made[-1]), drop, _training_s(made), miss=moves.miss,
                          refused="; ".join(miss.words for miss in moves.missed))  # fmt: skip
         except VlatoolError as failure:
-            if failure.exit_code not in NOT_MADE:
+            if failure.exit_code not in NOT_POSSIBLE:
                 raise
             return Tried(shape, note=failure.message)
 

@@ -9,7 +9,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import FallsShort
 from vlatool.module.axes import Walk
 from vlatool.prune._units import Work
-from vlatool.stage.controls import PRUNED
+from vlatool.stage.controls import PRUNED_KEY
 
 SHORT = 0.9
 """Share of what was asked for below which a result falls short of it."""
@@ -59,7 +59,7 @@ def refuse_short(bundle: Bundle) -> None:
     Raises:
         FallsShort: naming who keeps the rest, and how much of the work that is left.
     """
-    record = bundle.manifest.made_by[PRUNED]
+    record = bundle.manifest.made_by[PRUNED_KEY]
     if record["reached"] >= SHORT * record["asked"]:
         return
     shown = [f"{name} ({share:.1%})" for name, share in list(record["keeps"].items())[:NAMED]]

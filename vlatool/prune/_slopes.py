@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 from vlatool.errors import require
-from vlatool.module.batched import no_gradient
+from vlatool.module.batched_program import no_gradient_error
 
 SEED = 0
 PROBES = 4
@@ -29,7 +29,7 @@ def slopes_of(actions: Iterable[Any], values: Mapping[Key, Any]) -> Iterator[dic
     random = torch.Generator().manual_seed(SEED)
     for action in actions:
         if not action.requires_grad:
-            raise no_gradient(FIX)
+            raise no_gradient_error(FIX)
         for probe in range(PROBES):
             direction = torch.randn(action.shape, generator=random)
             slopes = torch.autograd.grad(

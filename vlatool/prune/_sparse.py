@@ -11,10 +11,10 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
-from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.carried import passages
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.batched_program import BatchedProgram, draw_noise
+from vlatool.module.episode_context import passages
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._last import last_layers
 from vlatool.prune._products import is_product, looking
@@ -50,7 +50,7 @@ class Sparse(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")
     exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Set weights to zero.
 
         Raises:
@@ -58,15 +58,15 @@ class Sparse(ModuleStage):
         """
         check_pattern(self.pattern, self.ratio)
         found = sparse_layers(modules, source, self.include, self.exclude)
-        context.said.extend(found.told())
+        context.messages.extend(found.told())
         layers = found.chosen
-        context.said.extend(unrecorded(source, self.samples) if self.looks else ())
+        context.messages.extend(unrecorded_note(source, self.samples) if self.looks else ())
         given = self._given(layers, modules, source, context) if self.looks else {}
         for number, (name, layer) in enumerate(layers.items()):
-            context.tell(f"pruning {name}", number / len(layers))
+            context.progress(f"pruning {name}", number / len(layers))
             flat = layer.weight.detach().reshape(len(layer.weight), -1)
             layer.weight.data = self.sparse(flat, given.get(name)).reshape(layer.weight.shape).to(layer.weight.dtype)
-        return Changed()
+        return ModuleChanges()
 
     def sparse(self, weight: Tensor, given: Tensor | None) -> Tensor:
         """Return a weight with zeros.
@@ -95,7 +95,7 @@ class Sparse(ModuleStage):
     ) -> dict[str, Tensor]:
         """Return name of a layer -> mean of x xT over what it is given on recorded observations."""
         program = BatchedProgram(source.manifest.program, modules)
-        noise = drawn(program.noise, 1, np.random.default_rng(0))
+        noise = draw_noise(program.noise, 1, np.random.default_rng(0))
         sums: dict[str, Any] = {}
         counts: dict[str, int] = {}
         names = {id(layer.weight): name for name, layer in layers.items()}
@@ -108,7 +108,7 @@ class Sparse(ModuleStage):
         recorded = passages(source, program, noise, self.samples, 1)
         with require("torch", "build").no_grad(), looking(look):
             for number, passage in enumerate(recorded):
-                context.tell("looking at what layers are given", number / len(recorded))
+                context.progress("looking at what layers are given", number / len(recorded))
                 passage.run(program, noise)
         return {name: total / counts[name] for name, total in sums.items()}
 

@@ -12,8 +12,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import BLOCKS, Edit, refuse_traced
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._ranking import Place, Ranking, Stack
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.stage.base import Context
@@ -74,7 +74,7 @@ class Depth(ModuleStage):
         """A backward pass needs all weights; one after the other would be read very often for ``error``."""
         return bool(self.keep) or self.rank in ("even", "cosine")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the blocks that stay.
 
         Raises:
@@ -82,13 +82,13 @@ class Depth(ModuleStage):
         """
         sizes = self._chosen(self._sizes(modules), source)
         left = _listed_blocks(sizes, self.keep) if self.keep else self._left(sizes, modules, source, context)
-        context.said.extend(
+        context.messages.extend(
             f"kept {len(kept)} of {sizes[graph, name]} blocks of {name or 'the module itself'}: "
             f"{', '.join(map(str, kept))}"
             for (graph, name), kept in left.items()
         )
         edits = [Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items()]
-        return Changed(tuple(sorted(edits, key=lambda edit: -len(edit.module))))  # stacks within blocks first
+        return ModuleChanges(tuple(sorted(edits, key=lambda edit: -len(edit.module))))  # stacks within blocks first
 
     def _sizes(self, modules: Mapping[str, nn.Module]) -> dict[Stack, int]:
         """Return how many blocks each stack has; one that several graphs share is the first one's."""
@@ -105,7 +105,7 @@ class Depth(ModuleStage):
             raise RecipeError(f"{asked} removes no block of {_listed(sizes)}.", "ask for more")
         if self.rank == "even":
             return {stack: spread(sizes[stack], sizes[stack] - count) for stack, count in goes.items()}
-        context.said.extend(unrecorded(source, self.samples))
+        context.messages.extend(unrecorded_note(source, self.samples))
         ranking = Ranking(modules, source, self.samples)
         left = {stack: list(range(sizes[stack])) for stack in goes}
         for (graph, name), block in self._going(ranking, left, goes, context):
@@ -125,7 +125,7 @@ class Depth(ModuleStage):
         scores: dict[Place, float] = {}
         for done in range(total):
             places = [(*stack, block) for stack, count in open_.items() if count for block in left[stack]]
-            context.tell(f"ranking {len(places)} blocks", done / total)
+            context.progress(f"ranking {len(places)} blocks", done / total)
             if not scores or self.rank == "error":
                 scores = rank(places, removed)
             graph, name, block = least = min(places, key=scores.__getitem__)

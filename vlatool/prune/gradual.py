@@ -10,7 +10,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
-from vlatool.module.stage import Changed
+from vlatool.module.stage import ModuleChanges
 from vlatool.prune._sparse import Pattern, check_pattern, least, sparse_layers, zeros_told
 from vlatool.stage.base import Context
 from vlatool.training.constraint import GrowingZeros
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vlatool.hardware.profile import Profile
-    from vlatool.training.lesson import Lesson
+    from vlatool.training.objective import Objective
     from vlatool.training.teacher import Teacher
 
 
@@ -69,16 +69,16 @@ class Gradual(ImitationStage):
         numbers = [*range(self.interval, last, self.interval), last]
         return {number: self.ratio * (1 - (1 - number / last) ** 3) for number in numbers}
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Train, and say which layers stay dense."""
-        context.said.extend(sparse_layers(modules, source, self.include, self.exclude).told())
+        context.messages.extend(sparse_layers(modules, source, self.include, self.exclude).told())
         return super().change(modules, source, context)
 
-    def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
+    def objective(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Objective:
         """The student does what the teacher does, with more and more zeros."""
         layers = sparse_layers(modules, source, self.include, self.exclude).chosen.values()
         zeros = GrowingZeros([layer.weight for layer in layers], self._goes, self.shares())
-        return replace(super().lesson(modules, source, teacher), constraint=zeros)
+        return replace(super().objective(modules, source, teacher), constraint=zeros)
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Say how many weights are zero, and what was learnt."""

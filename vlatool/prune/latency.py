@@ -19,8 +19,8 @@ from vlatool.latency_model.measured import calibrations
 from vlatool.machine.host import fingerprint, matches
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import Edit, edits_from
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._clock import BoardClock, Clock
 from vlatool.prune._prices import (
     Stack,
@@ -130,7 +130,7 @@ class LatencyPruning(ModuleStage):
         predicted = f"predicted, not measured: {self.target_ms:g} ms or up to {CLOSE:.0%} less on {self.board}"
         return (*super().lines(bundle), *([predicted] if self.board and not self.chosen else []))
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the blocks and units that stay.
 
         Raises:
@@ -139,16 +139,16 @@ class LatencyPruning(ModuleStage):
             DataError: when the latency is not met: it changes from run to run.
         """
         if self.chosen:
-            return Changed(_edits_chosen(self.chosen))
+            return ModuleChanges(_edits_chosen(self.chosen))
         if self.board:
             self._predict_whole(source, context)
-        context.tell("tracing the policy", None)
+        context.progress("tracing the policy", None)
         walks = walks_of(modules, source)
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         if not groups:
             raise nothing(source.manifest.name)
-        context.tell(f"ranking the units of {len(groups)} groups", None)
-        context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
+        context.progress(f"ranking the units of {len(groups)} groups", None)
+        context.messages.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
         work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
@@ -156,11 +156,11 @@ class LatencyPruning(ModuleStage):
             clock = self._clock(source, scratch, context)
             edits = self._met(groups, blocks, work, clock, context)
         board = {"board": load_profile(self.board).name} if self.board else {}
-        return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
+        return ModuleChanges(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
 
     def _predict_whole(self, source: Bundle, context: Context) -> None:
         """Say at once, and not after the ranking, that there is nothing to do."""
-        context.tell(f"predicting for {self.board}", None)
+        context.progress(f"predicting for {self.board}", None)
         with scratch_directory() as scratch:
             whole, _ = self._clock(source, scratch, context).times([])
         self._refuse_met(whole)
@@ -199,7 +199,7 @@ class LatencyPruning(ModuleStage):
         self, groups: Sequence[Group], blocks: Sequence[Stack], work: Work, clock: Clock, context: Context
     ) -> tuple[Edit, ...]:
         """Return edits that meet the target, choosing again as long as what was chosen does not."""
-        context.tell(f"what {len({role_of(group) for group in groups})} kinds of layers take", None)
+        context.progress(f"what {len({role_of(group) for group in groups})} kinds of layers take", None)
         whole, prices = measured_prices(groups, blocks, work, clock)
         self._refuse_met(whole)
         choice = _Choice(groups, blocks, work, prices, self.least)
@@ -211,7 +211,7 @@ class LatencyPruning(ModuleStage):
             if self._is_met(trials.measured(edits)):  # once may be luck
                 trials.measured(edits)
             ms = trials.seen(edits, wanted)
-            context.tell(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / ROUNDS)
+            context.progress(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / ROUNDS)
             if self._is_met(ms):
                 return edits
             next_one = AIM * self.target_ms / trials.for_each

@@ -8,7 +8,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, VlatoolError, require
 from vlatool.graph.nodes import name_each
-from vlatool.module.stored import policy_weights, takes_shards
+from vlatool.module.sharded_weights import policy_weights, takes_shards
 from vlatool.quantize._compute import as_float32
 from vlatool.quantize._fake_export import Skeleton, export_skeletons
 from vlatool.quantize._rewrite import INLINE

@@ -20,7 +20,7 @@ from vlatool.quantize._records import Record
 from vlatool.weights.shards import reading
 
 if TYPE_CHECKING:
-    from vlatool.stage.base import Tell
+    from vlatool.stage.base import OnProgress
 
 COMMIT_BYTES = 1 << 28
 """Bytes after which data and journal are flushed to the disk."""
@@ -55,7 +55,7 @@ def work_root() -> Path:
     return cache_directory() / "streams"
 
 
-def write_records(records: list[Record], plan: str, place: Path, processes: int, tell: Tell) -> Written:
+def write_records(records: list[Record], plan: str, place: Path, processes: int, tell: OnProgress) -> Written:
     """Write all records to ``place/data``, continuing what an earlier run of the same plan left.
 
     Args:

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Encoded, Moment
+from vlatool.data import Moment
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context
@@ -40,7 +39,7 @@ class Watcher:
         self._outputs = [value.name for value in graph.graph.output]
         show(graph)
         self._about = f"the graph '{path.stem}' with further outputs"
-        with risky(engine_class(), f"opened {self._about}"):
+        with engine_call(engine_class(), f"opened {self._about}"):
             self._session = engine_class()(write_beside(graph.model, path, copy), 1)
 
     def watch(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
@@ -49,22 +48,11 @@ class Watcher:
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run, look at the values, return the graph's own outputs."""
-        with risky(engine_class(), f"ran {self._about}"):
+        with engine_call(engine_class(), f"ran {self._about}"):
             values = self._session.run(feeds)
         if self.counts:
             self.watch(feeds, values)
         return {name: values[name] for name in self._outputs}
-
-
-class _Passing(ObservationEncoder):
-    """An encoder that hands on what is encoded already."""
-
-    def __init__(self, encode: ObservationEncoder) -> None:
-        self.names, self._encode = encode.names, encode
-
-    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Encode an observation, as ``ObservationEncoder`` does, where that is to be done."""
-        return observation if isinstance(observation, Encoded) else self._encode(observation)
 
 
 def run_watched(
@@ -92,12 +80,11 @@ def run_watched(
     graphs = bundle.manifest.graphs
     others = {name: open_graph(bundle, graphs[name], engine_class(), 1) for name in graphs if name not in watchers}
     policy = Policy(bundle, Program(bundle.manifest.program, {**others, **watchers}, seed=0), DEFAULT_ENGINE)
-    policy.encode = _Passing(policy.encode)
     for place, each in enumerate(observations):
         moment = each if isinstance(each, Moment) else Moment(each, numbers[place] if numbers else place)
         number = moment.number
         if place % 8 == 0:
-            context.tell(f"{what} sample {number}", place / len(numbers) if place < len(numbers) else None)
+            context.progress(f"{what} sample {number}", place / len(numbers) if place < len(numbers) else None)
         for watcher in watchers.values():
             watcher.sample, watcher.counts = number, moment.counts
         if moment.begins:

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, instead, nearest
+from vlatool.errors import RecipeError, fix_for, suggest
 from vlatool.quantize._fake_export import Skeleton
 from vlatool.quantize._records import padded
 from vlatool.quantize._rewrite import (
@@ -156,7 +156,7 @@ def _chosen(products: dict[str, list[Product]], stage: WeightOptions, bundle: Bu
     for pattern in stage.graphs:
         if not fnmatch.filter(products, pattern):
             raise RecipeError(
-                f"No graph matches '{pattern}'; {nearest(pattern, products)}.", instead(pattern, products)
+                f"No graph matches '{pattern}'; {suggest(pattern, products)}.", fix_for(pattern, products)
             )
     graphs = {
         name for name in products if not stage.graphs or any(fnmatch.fnmatch(name, glob) for glob in stage.graphs)

@@ -56,7 +56,7 @@ class DynamicInt8(Quantization):
 
         def quantize(name: str, original: Path, target: Path) -> None:
             model = load(original)
-            context.said.extend(left_whole(name, model))
+            context.messages.extend(left_whole(name, model))
             self._quantize(model, target, layers[name])
 
         return self.transform(bundle, out, context, quantize)

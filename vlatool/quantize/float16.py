@@ -15,7 +15,7 @@ from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import check_opset
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
 from vlatool.quantize._moments import recorded_moments
@@ -80,7 +80,7 @@ class Float16(Quantization):
             for value, excess in values.items():
                 size = float(f"{excess.largest:.4g}")
                 report["beyond"].append({"graph": graph, "value": value, "sample": excess.sample, "largest": size})
-                context.tell(
+                context.progress(
                     f"{value} reaches {size:g} in sample {excess.sample}, beyond float16: it stays float32", None
                 )
 
@@ -130,7 +130,7 @@ def _written(original: Path, target: Path, kept: set[str], feeds: Sequence[Mappi
     before, after = engine_class()(original, 1), engine_class()(target, 1)
     moved = 0.0
     for fed in feeds:
-        with risky(engine_class(), f"ran {target.name}"):
+        with engine_call(engine_class(), f"ran {target.name}"):
             expected, got = before.run(fed), after.run(fed)
         floats = [name for name, value in expected.items() if value.dtype.kind == "f"]
         errors = [relative_error(got[name], expected[name]) for name in floats]

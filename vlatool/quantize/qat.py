@@ -51,11 +51,11 @@ class Qat(ImitationStage):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """What follows takes the layout."""
-        for name, options in self.then():
+        for name, options in self.following_stages():
             build_stage(name, options)
         super().check(source, profile)
 
-    def then(self) -> tuple[tuple[str, dict[str, Any]], ...]:
+    def following_stages(self) -> tuple[tuple[str, dict[str, Any]], ...]:
         """Export, and quantize to the grid that the weights were trained for, in the layout that was asked for."""
         layout = {"layout": self.layout} if "layout" in self.model_fields_set else {}
         if self.weights == "int4":

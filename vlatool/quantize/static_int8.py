@@ -176,7 +176,7 @@ class StaticInt8(Calibrated):
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
-            context.said.extend(left_whole(name, model))
+            context.messages.extend(left_whole(name, model))
             pixels: dict[str, Range] = {}
             if self.form.integer:
                 split_gemm(model)

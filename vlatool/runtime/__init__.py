@@ -10,8 +10,9 @@ from collections.abc import Iterable
 
 from vlatool.errors import refuse_two_distributions
 from vlatool.runtime.arguments import check_load
-from vlatool.runtime.chunks import ChunkQueue
-from vlatool.runtime.policy import FIRST_RUN_S, Action, Policy, refuse_findings
+from vlatool.runtime.control.chunked import ChunkQueue
+from vlatool.runtime.interface import Action
+from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 
@@ -68,7 +69,7 @@ def load(
 
     refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
-    bundle = Bundle.described(path)
+    bundle = Bundle.open_lazily(path)
     refuse_findings(bundle, accept)
     bundle.verify("data/")
     if probe:

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vlatool.errors import SourceError, instead, nearest, require
+from vlatool.errors import SourceError, fix_for, require, suggest
 
 Shapes = Mapping[str, tuple[int | str, ...]]
 INFERRED_BYTES = 1_500_000_000
@@ -155,7 +155,7 @@ def _check_given(inputs: list[Any], shapes: Shapes) -> None:
     for name, given in shapes.items():
         if name not in known:
             raise SourceError(
-                f"--shape names '{name}', which is no input of the file; {nearest(name, known)}.", instead(name, known)
+                f"--shape names '{name}', which is no input of the file; {suggest(name, known)}.", fix_for(name, known)
             )
         own = [_length(axis, place) for place, axis in enumerate(_axes(known[name]))]
         fits = len(own) == len(given) and all(

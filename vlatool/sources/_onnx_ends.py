@@ -12,7 +12,7 @@ from vlatool.data import random_observations
 from vlatool.errors import SourceError
 from vlatool.graph.files import save
 from vlatool.graph.onnx_graph import type_name
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
 
@@ -68,7 +68,7 @@ def complete_outputs(model: Any, path: Path, inputs: Sequence[TensorSpec]) -> No
     if not unknown:
         return
     save(model, path)
-    with risky(engine_class(), f"ran {path.name}"):
+    with engine_call(engine_class(), f"ran {path.name}"):
         session = engine_class()(path, threads=1)
         runs = [session.run(_drawn(inputs, length)) for length in LENGTHS]
     for value in unknown:

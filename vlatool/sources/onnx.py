@@ -16,13 +16,13 @@ from vlatool.bundle.manifest import Graph, Manifest
 from vlatool.bundle.program import single_graph
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, InputError, SourceError, nearest, require
+from vlatool.errors import GraphError, InputError, SourceError, require, suggest
 from vlatool.graph.as_float32 import ROUNDING, as_float32, float32_text
 from vlatool.graph.draws import refuse_drawing_file
 from vlatool.graph.files import save
 from vlatool.graph.layers import LOWEST_OPSET
 from vlatool.graph.onnx_graph import type_name
-from vlatool.machine.risky import REMEDY, risky
+from vlatool.machine.engine_calls import REMEDY, engine_call
 from vlatool.module.description import FILE, Description, copy_assets, description_file, read_description
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
@@ -34,8 +34,8 @@ from vlatool.sources._onnx_ends import complete_outputs, refuse_types
 from vlatool.sources._onnx_plain import plain
 from vlatool.sources._source import Source
 from vlatool.stage.base import Context
-from vlatool.stage.counted import counted_shares
 from vlatool.stage.finish import SEED, finish
+from vlatool.stage.precision_shares import count_shares
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -118,7 +118,7 @@ class OnnxFile(Source):
         with _named_after(self.model, file):
             opset = self._store(model, out, manifest, changes, context)
             observations = observations_for(Bundle(out, manifest), 2)
-            graphs = {"main": Graph("graphs/main.onnx", counted_shares(file, context), opset)}
+            graphs = {"main": Graph("graphs/main.onnx", count_shares(file, context), opset)}
             return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
 
     def _prepare(self, model: Any, description: Description | None, context: Context) -> _Changes:
@@ -130,7 +130,7 @@ class OnnxFile(Source):
                 "leave --shape out, or change them there",
             )
         if gone := as_float32(model):
-            context.said.append(float32_text(gone))
+            context.messages.append(float32_text(gone))
         declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
         fixed = axes_text(fix_axes(model, declared or shapes_from(self.shape), declared is not None, str(self.model)))
         further = [] if description else add_batch_axes(model, opset_of(model))
@@ -138,7 +138,7 @@ class OnnxFile(Source):
             axes = f"{', '.join(further)} of the file have no batch axis: one of 1 is put in front"
             fixed = f"{fixed}; {axes}" if fixed else axes
         if fixed:
-            context.tell(fixed, None)
+            context.progress(fixed, None)
         return _Changes(further, max(TOLERANCE, *(ROUNDING.get(kind, 0) for kind in gone), 0))
 
     def _store(self, model: Any, out: Path, manifest: Manifest, changes: _Changes, context: Context) -> int:
@@ -156,13 +156,13 @@ class OnnxFile(Source):
             try:
                 save(with_opset(model, wanted), file)
                 self._compare(before, unbatched, out, manifest, changes.tolerance)
-                context.said.append(f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations")
+                context.messages.append(f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations")
                 return wanted
             except InputError as error:
                 if self.opset:
                     raise
                 words = f"opset {opset} stays, in which nothing can be quantized to int8 ({LOWEST_OPSET} or later): "
-                context.said.append(f"{words}{error.message}")
+                context.messages.append(f"{words}{error.message}")
                 save(model, file)
         self._compare(before, unbatched, out, manifest, changes.tolerance)
         return opset
@@ -171,7 +171,7 @@ class OnnxFile(Source):
         """Open the file itself, or where ONNX Runtime refuses it what is written of it; and what has no batch axis."""
         for path, unbatched in ((self.model, further), (file, [])):
             try:
-                with risky(engine_class(), f"opened {path.name}"):
+                with engine_call(engine_class(), f"opened {path.name}"):
                     return engine_class()(path, threads=1), unbatched
             except GraphError:
                 if path == file:
@@ -190,7 +190,7 @@ class OnnxFile(Source):
         Raises:
             SourceError: when ONNX Runtime computes something else.
         """
-        with risky(engine_class(), "opened main.onnx"):
+        with engine_call(engine_class(), "opened main.onnx"):
             after = engine_class()(out / "graphs/main.onnx", threads=1)
         programs = [Program(manifest.program, {"main": session}, SEED) for session in (before, after)]
         encode = ObservationEncoder(manifest.spec, out / "assets")
@@ -271,7 +271,7 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
         for tensor in tensors:
             if tensor.name not in names:
                 raise SourceError(
-                    f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}.",
+                    f"The ONNX file has no '{tensor.name}', which the spec names; {suggest(tensor.name, names)}.",
                     "name inputs and outputs in policy.yaml as the file does",
                 )
 

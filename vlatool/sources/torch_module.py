@@ -42,13 +42,13 @@ class TorchModule(Source):
         """Take a directory or YAML file that describes a policy, or ``path.py:make`` beside one."""
         path = Path(typed)
         if path.is_dir() or path.suffix in (".yaml", ".yml"):
-            return cls(policy=path).named()
+            return cls(policy=path).trust_code()
         where, _, function = typed.rpartition(":")
         if not where.endswith(".py") or not function:
             return None
         if not Path(where).is_file():
             raise SourceError(f"No such file: {where} (from '{typed}').", "check the path")
-        return cls(policy=Path(where).parent, factory=f"{Path(where).name}:{function}").named()
+        return cls(policy=Path(where).parent, factory=f"{Path(where).name}:{function}").trust_code()
 
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Take the factory of the record: a function in the policy's own files, or what its description names."""
@@ -85,7 +85,7 @@ class TorchModule(Source):
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the spec, the assets and the recorded data."""
         described = read_description(self.policy)
-        self.named()
+        self.trust_code()
         copy_assets(described, out)
         factory = self._factory(described)
         root = self._root(described)
@@ -95,9 +95,9 @@ class TorchModule(Source):
         made_by = {**self.made_by(), "options": {}}
         return seal(out, described.manifest(made_by=made_by, source=source_record))
 
-    def named(self) -> Self:
+    def trust_code(self) -> Self:
         """Allow the policy's code to run in this process: the user named its folder."""
-        trust.name(read_description(self.policy).folder, None if self.policy.is_dir() else self.policy, self.factory)
+        trust.allow(read_description(self.policy).folder, None if self.policy.is_dir() else self.policy, self.factory)
         return self
 
     def _factory(self, described: Description) -> str:

@@ -1,4 +1,4 @@
-"""Who says what a student should have done."""
+"""The teacher of a training."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vlatool.bundle.bundle import ASSETS, MANIFEST, Bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.machine import host
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.module.description import description_file
 from vlatool.module.edits import Edit, read_edits
 from vlatool.module.origin import origin_of
@@ -65,7 +65,7 @@ def check_teacher(path: Path) -> None:
         stage.check(None, None)
         return
     try:
-        Bundle.described(path)
+        Bundle.open_lazily(path)
     except BundleError as error:
         raise BundleError(f"The teacher cannot be opened: {error.message}", TEACHES) from error
 
@@ -75,9 +75,9 @@ class Teacher:
     """A policy in torch that fits the student's.
 
     Args:
-        bundle: Its source bundle.
-        edits: What was done to its structure.
-        program: Its modules, and how they run.
+        bundle: its source bundle.
+        edits: what was done to its structure.
+        program: its modules, and how they run.
     """
 
     bundle: Bundle
@@ -89,9 +89,9 @@ class Teacher:
         """Open the teacher of a student.
 
         Args:
-            student: The student's bundle.
-            path: The teacher's bundle, or its policy; what the student was before any edit when None.
-            modules: The student's, which the teacher's must not share weights with.
+            student: the student's bundle.
+            path: the teacher's bundle, or its policy; what the student was before any edit when None.
+            modules: the student's, which the teacher's must not share weights with.
 
         Raises:
             RecipeError: when it is exported, takes or gives something else, or is the student.

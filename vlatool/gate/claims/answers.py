@@ -12,7 +12,7 @@ from vlatool.gate.claim import Claim
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Need, Plan
 from vlatool.gate.verdict import Judgement, Outcome, Reason, Verdict
-from vlatool.measurement.agreement import SEQUENCE, Followed
+from vlatool.measurement.agreement import SEQUENCE, OutputAgreement
 from vlatool.report import Measurement
 
 KINDS = {
@@ -56,7 +56,7 @@ class Answers(Claim):
         found = Verdict.of([steady, *([follows] if follows else [])])
         return replace(found, measurements=tuple(map(_measured, _least(evidence.agreement.followed))))
 
-    def _follows(self, followed: Sequence[Followed]) -> Judgement:
+    def _follows(self, followed: Sequence[OutputAgreement]) -> Judgement:
         """Judge the output that follows the baseline's least."""
         if not (least := _least(followed)):
             return Judgement(Outcome.INCONCLUSIVE, "follows", reason=Reason.NO_EVIDENCE)
@@ -78,7 +78,7 @@ def _steady(evidence: Evidence) -> Judgement:
     return Judgement(differs if facts["strays"] else Outcome.PASS, "steady", facts=facts)
 
 
-def _measured(followed: Followed) -> Measurement:
+def _measured(followed: OutputAgreement) -> Measurement:
     note = f"least correlation with the baseline's answers: {followed.output}, {KINDS[followed.kind]}"
     return Measurement("follows", followed.correlation, "1", samples=followed.samples, note=note)
 
@@ -99,7 +99,7 @@ def _steady_words(outcome: Outcome, looked: int, strays: int, unsteady: int) -> 
 
 
 def _follows_words(judged: Judgement) -> str:
-    lowest: Followed = judged.facts["followed"]
+    lowest: OutputAgreement = judged.facts["followed"]
     words = f"on observations that nobody could know, its {lowest.output} follows the baseline's with a correlation of "
     words += f"{lowest.correlation:.2f} ({lowest.samples} {KINDS[lowest.kind]}; allowed: from {judged.limit:.2f})"
     if judged.outcome is Outcome.PASS:
@@ -107,7 +107,7 @@ def _follows_words(judged: Judgement) -> str:
     return f"{words}; a policy that was trained anew may need another limit, or none: answers: {{follows: null}}"
 
 
-def _least(followed: Sequence[Followed]) -> list[Followed]:
+def _least(followed: Sequence[OutputAgreement]) -> list[OutputAgreement]:
     """Return the one of least correlation; none when there is none.
 
     Where there are recordings, observations that are drawn without any are far from what the policy is for, and say

@@ -30,7 +30,7 @@ class Memory(Growth):
         plan, inputs = evidence.plan, evidence.inputs
         peaks: tuple[list[float], list[float]] = ([], [])
         for number in range(PROBES):
-            evidence.context.tell("memory of each in fresh processes", number / PROBES)
+            evidence.context.progress("memory of each in fresh processes", number / PROBES)
             with inputs.file(OBSERVATIONS, MEMORY, number) as path:
                 for bundle, taken in zip((evidence.candidate, evidence.baseline), peaks, strict=True):
                     probed = cold_start(bundle.path, plan.engine, plan.threads, timeout=plan.timeout, observations=path)

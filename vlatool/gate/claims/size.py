@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
 from vlatool.data import CALIBRATION, EVALUATION, PLAYED
-from vlatool.files.written import LEDGER
+from vlatool.files.ownership import LEDGER
 from vlatool.gate.claims._growth import Growth
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.verdict import Verdict

@@ -1,0 +1,74 @@
+"""A controller that waits for each chunk and plays it one control step at a time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import UsageError
+from vlatool.runtime.arguments import check_whole
+from vlatool.runtime.interface import Policy
+
+
+class ChunkQueue:
+    """Gives one action for each control step and infers when the executed part of the chunk is used up.
+
+    Steps that overlap are refused: the actions of one chunk are one robot's. A reset waits for the step under way.
+
+    Args:
+        policy: The policy that infers.
+        execute: Actions taken from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
+
+    Raises:
+        UsageError: when ``execute`` is not a whole number from 0.
+    """
+
+    def __init__(self, policy: Policy, execute: int = 0) -> None:
+        check_whole("execute", execute, 0)
+        self.policy = policy
+        self.execute = execute or policy.spec.execute or policy.spec.chunk
+        self._pending: list[NDArray[Any]] = []
+        self.fresh = False
+        """Whether the last action was the first of a chunk."""
+        self._turn = threading.RLock()  # a signal handler may strike between lock and owner
+        self._owner = 0
+
+    def act(self, observation: Mapping[str, Any]) -> NDArray[Any]:
+        """Return the action of this control step: (A,) float32, or a 0-d int64 index of a discrete action.
+
+        The observation is read only when a new chunk is needed. When the inference raises, the next step tries again.
+
+        Raises:
+            UsageError: when another step is under way.
+            DataError, GraphError: as the policy's ``infer`` does.
+        """
+        if self._owner:
+            raise UsageError("A control step begins before the last one has ended.", "make one queue for each thread")
+        with self._turn:
+            try:
+                self._owner = threading.get_ident()
+                self.fresh = not self._pending
+                if self.fresh:
+                    self._pending = list(self.policy.infer(observation).chunk[: self.execute])
+                return np.asarray(self._pending.pop(0))
+            finally:
+                self._owner = 0
+
+    def reset(self, seed: int | None = None) -> None:
+        """Forget the pending actions and what the policy carries from step to step.
+
+        Args:
+            seed: Seed of the noise of the new episode; see ``Policy.reset``.
+
+        Raises:
+            UsageError: when this thread's own step is under way, or as ``Policy.reset`` does.
+        """
+        if self._owner == threading.get_ident():
+            raise UsageError("The queue is reset within its own step (a signal handler?).", "reset between two steps")
+        with self._turn:
+            self._pending = []
+            self.policy.reset(seed)
