@@ -7,14 +7,18 @@ its folder and is not an entry. Another package adds an entry by an entry point 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.util
 import inspect
 import pkgutil
 import traceback
+from collections.abc import Iterator, Mapping
+from enum import IntEnum
 from importlib import metadata
 from types import ModuleType
+from typing import Any
 
 from vlatool.errors import PluginError, UsageError, VlatoolError, fix_for, suggest
 
@@ -33,6 +37,17 @@ NOUNS = {
 }  # fmt: skip
 _PLUGIN_CLASSES: dict[type, str] = {}
 """Loaded class of another package -> ``kind.name``."""
+
+
+class Claim(IntEnum):
+    """How sure an entry is that it reads what a person names.
+
+    ``claims`` of an entry looks at names and first bytes alone: it is asked about every path that a shell completes.
+    """
+
+    NONE = 0
+    MAYBE = 1
+    CERTAIN = 2
 
 
 def package_of(kind: str) -> str:
@@ -107,6 +122,45 @@ def load(kind: str, name: str) -> type:
         raise _plugin_error(entry, f"does not name a class: {error}") from error
     _PLUGIN_CLASSES[entry_class] = f"{kind}.{own_name}"
     return entry_class
+
+
+def loadable(kind: str) -> Iterator[tuple[str, Any]]:
+    """Yield the name and the class of each entry, without those that cannot be imported, which ``doctor`` names."""
+    for name in names(kind):
+        with contextlib.suppress(PluginError):
+            yield name, load(kind, name)
+
+
+def is_certain(kind: str, named: Any) -> bool:
+    """Return whether an entry is certain to read what a person names."""
+    return any(entry.claims(named) is Claim.CERTAIN for _, entry in loadable(kind))
+
+
+def claimant(kind: str, named: Any, error: type[VlatoolError]) -> Any:
+    """Return the entry that reads what a person names: the one that is certain, else the one that may; None if none.
+
+    Raises:
+        VlatoolError: (of the type ``error``) when several are equally sure.
+    """
+    claims = {name: (entry, Claim(entry.claims(named))) for name, entry in loadable(kind)}
+    surest = max((claim for _, claim in claims.values()), default=Claim.NONE)
+    found = {name: entry for name, (entry, claim) in claims.items() if claim is surest is not Claim.NONE}
+    if len(found) > 1:
+        raise error(
+            f"{named} is ambiguous; each {noun_of(kind)} of these reads it: {_requirements(found)}.",
+            "name the file that is meant, or move what the other one reads elsewhere; a package that is not needed can "
+            "be uninstalled",
+        )
+    return next(iter(found.values()), None)
+
+
+def requirements(kind: str) -> str:
+    """Return what each entry of a kind needs to read something, for messages: ``onnx (a .onnx file)``."""
+    return _requirements(dict(loadable(kind)))
+
+
+def _requirements(entries: Mapping[str, Any]) -> str:
+    return "; ".join(f"{name} ({entry.needs})" for name, entry in entries.items())
 
 
 def entry_of(entry_class: type) -> str:

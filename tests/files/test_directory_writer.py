@@ -52,7 +52,7 @@ if sys.argv[2] != "exchange":
 if sys.argv[3] == "between":
     module._replace = last_rename_is_missing
 else:
-    module.prune = kill
+    module.remove_owned = kill
 with module.write_directory(Path(sys.argv[1]), force=True) as draft:
     (draft / "new").touch()
 """

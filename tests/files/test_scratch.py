@@ -14,10 +14,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from vlatool.data.npz import NpzReader
 from vlatool.errors import BundleError, GraphError, OutputError, VlatoolError
 from vlatool.files import scratch as scratch_module
 from vlatool.files.directory_writer import write_directory
+from vlatool.files.npz import open_rows
 from vlatool.files.scratch import scratch_directory
 from vlatool.files.user_files import atomic_file
 from vlatool.measurement.child import end_error
@@ -42,7 +42,7 @@ def refused_by_openvino(place: Path) -> None:
 def corrupt(place: Path) -> None:
     (place / "graphs").mkdir()
     (place / "graphs/main.onnx").write_bytes(b"PK not an archive")
-    NpzReader().read(place / "graphs/main.onnx")
+    open_rows(place / "graphs/main.onnx")
 
 
 def last_words(place: Path) -> None:

@@ -334,7 +334,7 @@ def test_a_directory_with_an_onnx_file_is_told_to_name_the_file(tmp_path: Path, 
             "  control_hz: 9\n"
         )
     with pytest.raises(SourceError, match=r"holds ONNX files \(walker.onnx\)") as caught:
-        source_stage(str(tmp_path))
+        source_stage(str(tmp_path)).check(None, None)
     assert str(path) in caught.value.fix
     assert "--factory" not in str(caught.value)
     assert not is_bundle(str(tmp_path))

@@ -148,11 +148,11 @@ def test_episodes_of_a_recording(tmp_path: Path):
     numbers = np.array([4, 4, 4, 1, 1, 1, 4, 4, 4])
     whole = Recording(tmp_path / "r.npz", rows, None, numbers)
     assert np.flatnonzero(episode_begins(whole)).tolist() == [0, 3, 6]
-    chosen = whole.only(numbers == 4)
+    chosen = whole.subset(numbers == 4)
     assert np.flatnonzero(episode_begins(chosen)).tolist() == [0, 3], "two of the same number that do not touch"
-    assert len(episode_begins(whole.only(np.arange(9) < 5))) == 5, "the end of one may be missing"
+    assert len(episode_begins(whole.subset(np.arange(9) < 5))) == 5, "the end of one may be missing"
     with pytest.raises(DataError, match=r"too few episodes to hold whole ones out \(3\)"):
-        episode_begins(whole.only(np.arange(9) > 4))
+        episode_begins(whole.subset(np.arange(9) > 4))
     with pytest.raises(DataError, match="does not say where episodes begin"):
         episode_begins(Recording(tmp_path / "r.npz", rows, None, None))
 

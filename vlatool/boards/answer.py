@@ -12,7 +12,7 @@ from vlatool.boards.report import boards_report
 from vlatool.boards.select import Choice, Wants, choose, in_the_cloud
 from vlatool.boards.simulate import Change, bounds, changes, parts_of, timeline
 from vlatool.boards.torch_workload import counted_apart
-from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, OutputError, SourceError, UsageError, fix_for, suggest
 from vlatool.export.onnx import ExportOnnx
 from vlatool.files.ownership import add_to_ledger
@@ -28,7 +28,7 @@ from vlatool.module.description import read_location
 from vlatool.module.edits import is_changed
 from vlatool.module.origin import origin_of
 from vlatool.report import Report
-from vlatool.sources import sourced
+from vlatool.sources import open_source, source_bundle
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_transform
 
@@ -101,9 +101,7 @@ def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wa
 
 def opened(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or the source bundle of a policy."""
-    if (Path(source) / MANIFEST).is_file():
-        return Bundle.open(Path(source))
-    return sourced(source, cache_directory(), context)
+    return source_bundle(open_source(source), cache_directory(), context)
 
 
 def counted(bundle: Bundle, context: Context) -> Workload:

@@ -23,7 +23,7 @@ from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
 from vlatool.stage.controls import controls
 
-LONG = 120
+MAX_OPTION = 120
 """Characters of an option of a build record that are shown."""
 
 
@@ -131,7 +131,7 @@ def _tensor(tensor: TensorSpec) -> str:
 
 def _short(value: str) -> str:
     """Return a value, of a long one its beginning: what a stage chose may be a list of thousands of units."""
-    return value if len(value) <= LONG else f"{value[: LONG - 20]}… ({len(value)} characters)"
+    return value if len(value) <= MAX_OPTION else f"{value[: MAX_OPTION - 20]}… ({len(value)} characters)"
 
 
 def _lineage(manifest: Manifest) -> list[str]:

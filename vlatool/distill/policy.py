@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import CALIBRATION
+from vlatool.data import recordings_of
 from vlatool.distill._student import DEPTH, student_steps
 from vlatool.errors import DataError, RecipeError
 from vlatool.stage.base import Context, Transform
@@ -104,7 +104,7 @@ class PolicyDistillation(ImitationStage):
                 f"elsewhere; got --{asked[0].replace('_', '-')} {getattr(self, asked[0])}.",
                 "leave it out",
             )
-        if self.alpha < 1 and source is not None and CALIBRATION not in source.manifest.files:
+        if self.alpha < 1 and source is not None and recordings_of(source).calibration is None:
             raise DataError(
                 f"--alpha {self.alpha:g} needs an expert's actions, and {source.path} has no recording.", RECORD
             )

@@ -12,12 +12,12 @@ from typing import Any
 
 from vlatool.accuracy.paired import Outcome
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
-from vlatool.data import CALIBRATION
+from vlatool.data import recordings_of
 from vlatool.episodes import play
 from vlatool.episodes.content import circumstances, key_of
-from vlatool.episodes.disturbed import OWN
+from vlatool.episodes.disturbances import BUILT_IN_DISTURBANCES
 from vlatool.episodes.faults import locate, under_way
-from vlatool.episodes.play import ENDED, PRELOAD, RECORDINGS, EpisodesJob, Played, Request
+from vlatool.episodes.play import OUTCOME_PREFIX, PRELOAD, RECORDINGS, EpisodesJob, Played, Request
 from vlatool.episodes.progress import Tally
 from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.messages import from_json, to_json
@@ -82,8 +82,8 @@ def _played(
     ours = {under_way(job.task, seed) for job in jobs for seed in job.seeds}
 
     def tell(what: str, share: float | None) -> None:
-        if what.startswith(ENDED):
-            kept.one(what.removeprefix(ENDED))
+        if what.startswith(OUTCOME_PREFIX):
+            kept.one(what.removeprefix(OUTCOME_PREFIX))
         else:
             begun.add(what) if what in ours else context.progress(what, share)
 
@@ -125,7 +125,7 @@ def check_opens(bundles: Sequence[Bundle], job: EpisodesJob, engine: str, contex
     """
     for bundle in bundles:
         name = context.launcher if bundle.manifest.graphs else PROCESSES
-        work = _work("opened", bundle, [job], engine, PRELOAD, away=name != PROCESSES)
+        work = _work("open_bundle", bundle, [job], engine, PRELOAD, away=name != PROCESSES)
         list(launcher(name, 1).answers(work, context.progress, lambda _number, _answer: None, context.notes.append))
 
 
@@ -143,7 +143,7 @@ def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple
         raise DataError(
             "The process that asked the environment for its disturbances did not answer with names.", OWN_FILES
         )
-    return (*OWN, *(kind for kind in own if kind not in OWN))
+    return (*BUILT_IN_DISTURBANCES, *(kind for kind in own if kind not in BUILT_IN_DISTURBANCES))
 
 
 def _work(
@@ -168,8 +168,10 @@ def _work(
 
 def _needed(bundle: Bundle, jobs: Sequence[EpisodesJob]) -> list[str]:
     """Return the files of a bundle that its episodes read: of the recordings what controls and noise are drawn from."""
-    asked = (CALIBRATION,) if any(job.control or job.noise for job in jobs) else ()
-    return sorted(name for name in bundle.manifest.files if not name.startswith(RECORDINGS) or name in asked)
+    drawn_from = recordings_of(bundle).calibration if any(job.control or job.noise for job in jobs) else None
+    recorded = {name for name in bundle.manifest.files if name.startswith(RECORDINGS)}
+    asked = {name for name in recorded if drawn_from and (bundle.path / name).is_relative_to(drawn_from)}
+    return sorted({*bundle.manifest.files} - recorded | asked)
 
 
 def _placed(job: EpisodesJob) -> tuple[EpisodesJob, tuple[Folder, ...]]:
@@ -214,7 +216,7 @@ def _impossible(outcome: Outcome, job: EpisodesJob) -> str:
     """Return why no episode ends like that; nothing when one may."""
     if not 1 <= outcome.steps <= play.STEP_LIMIT:
         return f"{outcome.steps:.3g} steps (allowed: 1 to {play.STEP_LIMIT:,})"
-    if len(outcome.instruction) > play.LONGEST:
+    if len(outcome.instruction) > play.MAX_INSTRUCTION_LENGTH:
         return f"an instruction of {len(outcome.instruction):,} characters"
     if not all(map(math.isfinite, outcome.motion.values())):
         return "a motion that is infinite or NaN"

@@ -32,8 +32,8 @@ from vlatool.evaluate._shown import check_video_of, played_again
 from vlatool.evaluate._told import told
 from vlatool.files.resumable_work import Store
 from vlatool.machine.host import cache_directory, fingerprint
-from vlatool.module.description import read_description
 from vlatool.module.factory import factory_file, split_factory
+from vlatool.module.source import describe
 from vlatool.report import Report, Row
 from vlatool.runtime.control import layers
 from vlatool.stage.base import Context, Measure
@@ -134,7 +134,7 @@ class ClosedLoop(Measure):
 
     def inputs(self) -> tuple[Path, ...]:
         """The baseline's manifest, and the environment's file with its neighbours, which it may import."""
-        described = read_description(self.policy) if self.policy else None
+        described = describe(self.policy) if self.policy else None
         where = self.environment or str((described.environment if described else {}).get("make", ""))
         folder = described.folder if described else Path()
         file = folder / where.rpartition(":")[0]
@@ -349,7 +349,7 @@ class ClosedLoop(Measure):
         return base or own
 
     def _jobs(self, source: Bundle | None) -> list[EpisodesJob]:
-        described = read_description(self.policy) if self.policy else None
+        described = describe(self.policy) if self.policy else None
         named = described.environment if described else self._scene(source)
         known = tuple(named.get("tasks", ()))
         tasks = self.tasks or known

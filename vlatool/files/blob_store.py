@@ -17,6 +17,7 @@ import uuid
 from pathlib import Path
 
 from vlatool.files.ownership import cache_hash, cached_hash
+from vlatool.files.tree import files_below
 
 TAG = "CACHEDIR.TAG"
 SIGNATURE = "Signature: 8a477f597d28d172789f06886806bc55"
@@ -59,16 +60,21 @@ def cache_containing(path: Path) -> Path | None:
 
 
 def link_or_copy(source: Path, target: Path, sha256: str = "") -> None:
-    """Create ``target`` with the content of ``source``: a hard link among the stages of a cache, else a copy.
+    """Give ``target`` the content of ``source``: links among the stages of a cache, else copies.
 
     Args:
-        source: existing file, or a symbolic link to it.
-        target: new file.
-        sha256: SHA-256 of the source, if known.
+        source: a file or a directory; a link leads to it.
+        target: a new file or directory.
+        sha256: SHA-256 of a file, where it is known.
 
     Raises:
-        OSError: when the source cannot be read, or the target cannot be written.
+        OSError: when the source cannot be read, or the target not be written.
     """
+    if source.is_dir():
+        for name, file in files_below(source).items():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            link_or_copy(file, target / name)
+        return
     source = source.resolve()
     share = source.stat().st_size >= MIN_SHARED_BYTES and (not sha256 or DIGEST.fullmatch(sha256))
     cache = cache_containing(target) if share else None

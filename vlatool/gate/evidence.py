@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import EVALUATION
+from vlatool.data import recordings_of
 from vlatool.errors import PluginError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.gate.inputs import Inputs
@@ -81,4 +81,4 @@ def recorded_data(baseline: Bundle, plan: Plan) -> Path | None:
 
     They are the gate's or the baseline's, never the candidate's: it would choose what it is judged on.
     """
-    return plan.data or (baseline.path / EVALUATION if EVALUATION in baseline.manifest.files else None)
+    return plan.data or recordings_of(baseline).evaluation

@@ -9,7 +9,7 @@ from itertools import groupby
 from statistics import median
 from typing import Any
 
-from vlatool.bundle.bundle import Bundle, hash_file
+from vlatool.bundle.bundle import Bundle
 from vlatool.gate.config import Gate
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.inputs import AGREEMENT, Inputs
@@ -23,7 +23,7 @@ from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.validity import busy, throttling, validity
 from vlatool.report import Finding, Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, content_hash
 from vlatool.telemetry import Recorder, open_all
 
 KIND = "gate"
@@ -108,12 +108,12 @@ def _measured_with(evidence: Evidence) -> list[dict[str, Any]]:
     engines = ("engine of the baseline", "engine of the candidate")
     table |= dict(zip(engines, evidence.answers.engines, strict=True))
     table |= {
-        f"recording {recording.path.name}": f"sha256:{hash_file(recording.path)}"
+        f"recording {recording.path.name}": f"sha256:{content_hash(recording.path)}"
         for recording in inputs.recordings
-        if recording.path.is_file()
+        if recording.path.exists()
     }
-    if Need.RECORDINGS in plan.needs and (data := evidence.recording_path) is not None and data.is_file():
-        table["evaluation data"] = f"sha256:{hash_file(data)}"
+    if Need.RECORDINGS in plan.needs and (data := evidence.recording_path) is not None and data.exists():
+        table["evaluation data"] = f"sha256:{content_hash(data)}"
     return [{"what": what, "value": value} for what, value in table.items()]
 
 

@@ -78,7 +78,7 @@ def _moments(bundle: Bundle, count: int) -> Iterator[Moment]:
     """Yield recorded observations with all before them, or synthetic ones, which are one episode."""
     recording = calibration_recording(bundle)
     if recording is not None:
-        yield from recording.along(recording.spread(count))
+        yield from recording.with_history(recording.spread(count))
         return
     for number, observation in enumerate(synthetic_observations(bundle, count)):
         yield Moment(observation, number, begins=not number)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import CALIBRATION, observations_for
+from vlatool.data import observations_for, recordings_of
 from vlatool.errors import require
 from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.runtime.observation import ObservationEncoder
@@ -29,7 +29,7 @@ def recorded_inputs(bundle: Bundle, count: int) -> list[dict[str, Tensor]]:
 
 def unrecorded_note(bundle: Bundle, count: int) -> tuple[str, ...]:
     """Say that a choice rests on random observations, where nothing is recorded."""
-    if CALIBRATION in bundle.manifest.files:
+    if recordings_of(bundle).calibration is not None:
         return ()
     words = f"nothing is recorded: chosen by {count} random observations, which are none that the robot meets"
     return (f"{words}; record some, and name them in policy.yaml (calibration: FILE.npz)",)

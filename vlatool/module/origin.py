@@ -13,8 +13,9 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError
-from vlatool.module.description import read_description, read_location
+from vlatool.module.description import read_location
 from vlatool.module.factory import OWN_NAME, call_factory, factory_file, split_factory
+from vlatool.module.source import describe
 from vlatool.user_code import trust
 
 RESTART = "start again from the source"
@@ -111,7 +112,7 @@ def origin_of(bundle: Bundle) -> Origin:
     folder = read_location(bundle.path)
     where, function = split_factory(factory)
     named = trust.require(folder, f"{function}() of {where}")
-    described = read_description(Path(named.description) if named.description else folder)
+    described = describe(Path(named.description) if named.description else folder)
     installed = factory == described.factory and factory_file(factory, folder) is None
     if not installed and (named.remembered or factory not in (described.factory, named.factory)):
         _check_own(factory, folder, bundle)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from vlatool.accuracy.paired import ABSENT, compare_success, with_chance
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import EVALUATION
+from vlatool.data import carries_evaluation, recordings_of
 from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.evaluate.recorded import Recorded, carries_recordings
+from vlatool.evaluate.recorded import Recorded
 from vlatool.optimize.budget import distance_of
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
@@ -95,7 +95,7 @@ def _distance(row: Row) -> float:
 
 def is_recorded(bundle: Bundle, loop: ClosedLoop | None) -> bool:
     """Say whether recordings judge a bundle: its own, or where nothing else would, half of its calibration data."""
-    return EVALUATION in bundle.manifest.files or (loop is None and carries_recordings(bundle))
+    return recordings_of(bundle).evaluation is not None or (loop is None and carries_evaluation(bundle))
 
 
 def _recorded(

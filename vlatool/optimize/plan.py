@@ -12,7 +12,6 @@ from vlatool.files.printable import mask_passwords
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import fingerprint, matches
 from vlatool.machine.instruction_sets import BoardSet, board_set
-from vlatool.module.description import read_description
 from vlatool.optimize.place import check_place
 from vlatool.optimize.recipe import Limits, Pruning, Recipe, StageList, stage_entries
 from vlatool.sources import Source, source_stage
@@ -64,10 +63,8 @@ class Plan:
     @property
     def closed_loop(self) -> ClosedLoop | None:
         """The closed-loop evaluation, None when the policy names no environment or no episodes are wanted."""
-        if self.source.policy is None or not self.recipe.effort.episodes:
-            return None
-        described = read_description(self.source.policy)
-        if not described.environment:
+        described = self.source.describe() if self.recipe.effort.episodes else None
+        if described is None or not described.environment:
             return None
         effort = self.recipe.effort
         return ClosedLoop(

@@ -12,9 +12,10 @@ from typing import Any
 from vlatool.accuracy.paired import compare_success
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import carries_evaluation
 from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import NOT_POSSIBLE, VlatoolError
-from vlatool.evaluate.recorded import Recorded, carries_recordings
+from vlatool.evaluate.recorded import Recorded
 from vlatool.files.resumable_work import work_directory
 from vlatool.machine.version import VERSION
 from vlatool.optimize.budget import budget_of
@@ -146,7 +147,7 @@ class PrunedSearch:
         return compared.value("success_drop"), judge_moves(compared, self.plan.recipe.limits)
 
     def _error(self, bundle: Bundle) -> float:
-        if not carries_recordings(self.baseline):
+        if not carries_evaluation(self.baseline):
             return math.inf
         recorded = Recorded(baseline=self.baseline.path)
         row = cached_measure(recorded, bundle, self.plan.cache, self.context).rows[-1]

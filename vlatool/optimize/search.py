@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from vlatool import registry
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import recorded_observations
+from vlatool.data import recorded_observations, recordings_of
 from vlatool.errors import NOT_POSSIBLE, GraphError, PluginError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
@@ -44,7 +44,6 @@ from vlatool.stage.run import cached_measure, cached_transform
 if TYPE_CHECKING:
     from vlatool.sensitivity.layers import LayerError
 
-CALIBRATION = "data/calibration.npz"
 FINALISTS = 3
 FINE = 0.9
 """Share of the budget that a plan may use on calibration observations: those that it is judged on are others."""
@@ -189,7 +188,8 @@ class Search:
 
     def _error(self, bundle: Bundle, context: Context) -> float:
         count = max(8, min(len(self._observations), 64))
-        recorded = Recorded(data=self.baseline.path / CALIBRATION, baseline=self.baseline.path, samples=count)
+        whole = recordings_of(self.baseline).calibration
+        recorded = Recorded(data=whole, baseline=self.baseline.path, samples=count)
         row = cached_measure(recorded, bundle, self.cache, context).rows[-1]
         error = self.budget.of(row)
         return math.inf if error is None or not error.known else error.value

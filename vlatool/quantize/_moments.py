@@ -24,7 +24,7 @@ def recorded_moments(bundle: Bundle, recording: Recording, numbers: Sequence[int
     """
     keeps = keeps_values(bundle.manifest.program)
     plain = (Moment(recording.observation(number), number) for number in numbers)
-    return _hashed(recording.along(numbers) if keeps else plain, seen)
+    return _hashed(recording.with_history(numbers) if keeps else plain, seen)
 
 
 def played_moments(bundle: Bundle, seen: SampleSet) -> list[Moment]:

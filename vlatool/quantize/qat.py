@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from vlatool.data import MOST
+from vlatool.data import MAX_PLAYED
 from vlatool.runtime.engine import layouts
 from vlatool.stage.build import build_stage
 from vlatool.training.fake_quantization import BLOCK, fake_quantization
@@ -35,7 +35,7 @@ class Qat(ImitationStage):
     """
 
     changed_first: ClassVar[bool] = False
-    keeps: ClassVar[int] = MOST
+    keeps: ClassVar[int] = MAX_PLAYED
 
     weights: Literal["int8", "int4"] = Field("int8", description="int8 with int8 activations; int4 weights alone")
     learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")

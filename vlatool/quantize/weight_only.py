@@ -72,7 +72,7 @@ class WeightOnly(WeightOptions):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is something to quantize, and calibration data for the methods that need it."""
-        if self.calibration and not self.calibration.is_file():
+        if self.calibration and not self.calibration.exists():
             raise DataError(
                 f"The calibration file {self.calibration} does not exist.",
                 "check the path, or leave --calibration out for the bundle's own recording",

@@ -20,8 +20,8 @@ from vlatool.module.description import read_location
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
 from vlatool.rebuild.differences import FileMatch, compare_bundles
 from vlatool.runtime.engine import identities
-from vlatool.sources import source_stage
-from vlatool.stage.base import Context, Transform, installed_version, source_of
+from vlatool.sources import is_bundle, source_stage
+from vlatool.stage.base import Context, Transform, content_hash, installed_version, source_of
 from vlatool.stage.build import build_stage, stage_class
 from vlatool.stage.finish import FINALIZED_FIELDS, OPTIMIZE, history, reseal
 from vlatool.stage.run import run_transform
@@ -115,8 +115,8 @@ class _FileSearch:
         """Return the file of that name, which the record holds too, whose SHA-256 begins with ``digest``."""
         others = []
         for path in (*self.files, *(folder / name for folder in self.folders)):
-            if path.is_file():
-                got = hash_file(path)
+            if path.exists():
+                got = content_hash(path)
                 if path.name == name and got.startswith(digest):
                     return path
                 others.append(f"{path} has sha256:{got[:16]}")
@@ -223,7 +223,7 @@ def _start(
 ) -> _Start:
     """Find the source, check that it is the recorded one, and build every stage before any runs."""
     search = _FileSearch(files, [bundle.path.parent, Path()])
-    if source is not None and (Path(source) / MANIFEST).is_file():
+    if source is not None and is_bundle(source):
         begin, first = Bundle.open(source), None
         later = _from_bundle(begin, entries, bundle)
     elif not entries[0]["stage"].startswith("sources."):
@@ -343,7 +343,7 @@ def _noted_folders(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> I
         except SourceError as error:
             refused = refused or error
             continue
-        yield str(folder / description)
+        yield from (str(folder / description), str(folder))
     if refused:
         raise SourceError(refused.message, f"name the policy: --source DIR; or {refused.fix}")
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
@@ -25,7 +24,7 @@ from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
 from vlatool.runtime.golden import GOLDEN_STEPS, golden_arrays, golden_chunks, golden_steps
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.interface import Action
+from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import Program, Session
 
@@ -33,7 +32,6 @@ FLOAT_ROUNDING = 1e-3
 """Relative difference of a golden action in float32 that sums in another order explain; seen up to 6e-7."""
 FIRST_RUN_S = 60.0
 """How long an inference of the warm-up may take before it is stopped: far more than a policy that a robot could use."""
-Array = NDArray[Any]
 
 
 class BundlePolicy:

@@ -217,7 +217,7 @@ class Switchboard:
         if not (self.policy.program.keeps and isinstance(observations, Observations)):
             yield from observations
             return
-        for moment in observations.along():
+        for moment in observations.with_history():
             self._kept = {} if moment.begins else self._kept
             if moment.counts:
                 yield moment.observation

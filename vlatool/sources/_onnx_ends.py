@@ -23,9 +23,9 @@ ZIPMAP = "a classifier of skl2onnx is converted with options={'zipmap': False}"
 
 
 def refuse_types(model: Any, described: bool) -> None:
-    """Refuse what is no tensor, or of a type that numpy lacks; bfloat16 is none of them.
+    """Refuse what is not a tensor, or of a type that numpy lacks; bfloat16 is not refused.
 
-    An output that is no tensor, and not the first, is left out where there is a description, which cannot name it.
+    An output that is not a tensor, and not the first, is left out where there is a description, which cannot name it.
 
     Raises:
         SourceError: naming the value, its type, and what helps.

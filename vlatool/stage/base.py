@@ -20,6 +20,7 @@ from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import PluginError, RecipeError
 from vlatool.files.numbers import Numeric
 from vlatool.files.resumable_work import Store
+from vlatool.files.tree import hash_directory
 from vlatool.machine.instruction_sets import openvino_set
 from vlatool.machine.version import VERSION
 from vlatool.report import Report
@@ -156,7 +157,7 @@ class Stage(Numeric):
         return self
 
     def inputs(self) -> tuple[Path, ...]:
-        """Files outside the source whose content changes the result; part of the cache key."""
+        """Files and directories outside the source whose content changes the result; part of the cache key."""
         return ()
 
     def used_packages(self) -> tuple[str, ...]:
@@ -170,7 +171,7 @@ class Stage(Numeric):
         answer depends on what they say themselves, and a bundle records how far its engine is from its graphs.
         """
         versions = {package: installed_version(package) for package in self.used_packages()}
-        files = [_content(path) for path in self.inputs()]
+        files = [content_hash(path) for path in self.inputs()]
         content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, VERSION, RECORD_VERSION]
         content += [] if self.kind() in BEFORE_ENGINES else [openvino_set(), *identities().items()]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
@@ -239,7 +240,9 @@ class Transform(Stage):
         for name in options:
             value = getattr(self, name)
             if isinstance(value, Path):
-                options[name] = f"{value.name} sha256:{_content(value)[:16]}"
+                whole = value in self.inputs() or not value.is_dir()  # of a policy only some files count
+                digest = content_hash(value) if whole else f"absent:{value.name}"
+                options[name] = f"{value.name} sha256:{digest[:16]}"
         return options
 
     def made_by(self, seed: int | None = None, calibration: SampleSet | None = None) -> dict[str, Any]:
@@ -263,10 +266,10 @@ class Transform(Stage):
         return entry | ({} if calibration is None else {"calibration": calibration.record()})
 
     def input_hashes(self) -> dict[str, str]:
-        """Return name -> SHA-256 of the files outside the source; a second file of the same name is ``NAME (2)``."""
+        """Return name -> SHA-256 of the inputs outside the source; a second one of the same name is ``NAME (2)``."""
         hashes: dict[str, str] = {}
-        for path in (path for path in self.inputs() if path.is_file()):
-            digest, name, number = hash_file(path), path.name, 1
+        for path in (path for path in self.inputs() if path.is_file() or path.is_dir()):
+            digest, name, number = content_hash(path), path.name, 1
             while hashes.get(name, digest) != digest:
                 number += 1
                 name = f"{path.name} ({number})"
@@ -317,5 +320,12 @@ def installed_version(package: str) -> str | None:
         return None
 
 
-def _content(path: Path) -> str:
-    return hash_file(path) if path.is_file() else f"absent:{path.name}"
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a file as hex, or that of a directory with all files below it; ``absent:NAME`` of neither.
+
+    Raises:
+        DataError: for a directory that holds something else than files.
+    """
+    if path.is_file():
+        return hash_file(path)
+    return hash_directory(path) if path.is_dir() else f"absent:{path.name}"

@@ -69,7 +69,7 @@ class Expert:
         else:
             used = np.zeros(len(recording), np.bool_)
             used[order(len(recording))[: max(1, round(share * len(recording)))]] = True
-        chosen = recording.only(used)
+        chosen = recording.subset(used)
         self.counts = {"used": len(chosen), "recorded": len(recording)}
 
         def write(target: Path) -> None:
@@ -107,10 +107,10 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
         return None
     if whole:
         order = np.random.default_rng(CHOICE).permutation
-        return recording.only(select_episodes(episode_begins(recording), most / len(recording), order))
+        return recording.subset(select_episodes(episode_begins(recording), most / len(recording), order))
     used = np.zeros(len(recording), np.bool_)
     used[recording.spread(most)] = True
-    return recording.only(used)
+    return recording.subset(used)
 
 
 def encoded_actions(action: TensorSpec, source: Bundle, actions: Any) -> Array:

@@ -68,8 +68,8 @@ class HeldOut:
             next_round(self._frames, 0, partial(_write_required, other, len(self._training_part)))
             return
         held = held_out_mask(recording)
-        self._training_part = recording.only(~held)
-        self.recording = recording.only(held)
+        self._training_part = recording.subset(~held)
+        self.recording = recording.subset(held)
         next_round(self._frames, 0, partial(write, self.recording))
 
     def read(self) -> None:

@@ -184,7 +184,7 @@ def episode_begins(recording: Recording) -> Array:
 
 
 def _places(recording: Recording) -> Array:
-    return np.arange(len(recording)) if recording.places is None else recording.places
+    return np.arange(len(recording)) if recording.indices is None else recording.indices
 
 
 def select_episodes(begins: Array, share: float, order: Callable[[int], Array]) -> Array:

@@ -17,8 +17,8 @@ from vlatool.errors import OutputError, RecipeError, require
 from vlatool.files.printable import file_of
 from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.machine import host
-from vlatool.module.description import description_file
 from vlatool.module.edits import is_changed
+from vlatool.module.source import claimed_source
 from vlatool.module.stage import TRAINING, ModuleChanges, ModuleStage
 from vlatool.module.zeros import has_zeros, sparse_weights, zero_share
 from vlatool.stage.base import Context, source_of
@@ -34,10 +34,9 @@ from vlatool.training.report import along_lines, write_training_report
 from vlatool.training.rounds import scene_of
 from vlatool.training.session import Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
-from vlatool.training.teacher import Teacher, check_teacher, teacher_source
+from vlatool.training.teacher import Teacher, check_teacher
 from vlatool.training.torchrun import current_launch
 from vlatool.training.user_batches import requested_rows
-from vlatool.user_code import trust
 
 if TYPE_CHECKING:
     from torch import nn
@@ -107,18 +106,18 @@ class TrainingStage(ModuleStage):
         """The teacher's manifest, or all that it is made of where it is a policy."""
         if self.teacher is None:
             return ()
-        source = teacher_source(self.teacher)
+        source = claimed_source(self.teacher)
         return (self.teacher / MANIFEST,) if source is None else source.inputs()
 
     def key(self, source_hash: str) -> str:
         """Return the cache key, with that of a teacher that is a policy: it knows its large weights."""
-        teacher = teacher_source(self.teacher) if self.teacher else None
+        teacher = claimed_source(self.teacher) if self.teacher else None
         return super().key(f"{source_hash} {teacher.key('')}" if teacher else source_hash)
 
     def trust_code(self) -> Self:
         """Allow the code of a teacher that is a policy to run in this process: the user named its folder."""
-        if self.teacher and teacher_source(self.teacher):
-            trust.allow(description_file(self.teacher).parent, None if self.teacher.is_dir() else self.teacher)
+        if self.teacher and (source := claimed_source(self.teacher)):
+            source.trust_code()
         return self
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:

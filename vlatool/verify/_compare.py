@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
-from vlatool.data import CALIBRATION, EVALUATION, Recording, read_recording, synthetic_observations
+from vlatool.data import Recording, read_recording, recordings_of, synthetic_observations
 from vlatool.module.torch_policy import torch_policy
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import draw
@@ -52,8 +52,8 @@ def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
 
 
 def _recording(bundle: Bundle, data: Path | None) -> Recording | None:
-    own = [bundle.path / name for name in (EVALUATION, CALIBRATION) if name in bundle.manifest.files]
-    path = data or next(iter(own), None)
+    own = recordings_of(bundle)
+    path = data or own.evaluation or own.calibration
     return None if path is None else read_recording(path, bundle.manifest.spec)
 
 

@@ -152,11 +152,12 @@ def observations(bundle: Path, count: int) -> tuple[dict[str, Any], int]:
         VariantError: when the bundle carries none.
     """
     from vlatool.bundle.bundle import Bundle
-    from vlatool.data import EVALUATION, read_recording
+    from vlatool.data import read_recording, recordings_of
 
     opened = Bundle.open(bundle)
-    if EVALUATION not in opened.manifest.files:
+    evaluation = recordings_of(opened).evaluation
+    if evaluation is None:
         raise VariantError(f"{bundle} carries no recorded observations.")
-    recording = read_recording(opened.path / EVALUATION, opened.manifest.spec)
+    recording = read_recording(evaluation, opened.manifest.spec)
     rows = recording.spread(count or len(recording))
     return {name: values[rows] for name, values in recording.inputs.items()}, len(recording)

@@ -114,7 +114,7 @@ class Accuracy(Claim):
             title = "more distance from the expert's actions than the baseline has:"
         interval = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
         judged = self._held("recorded_drop", title, interval, len(indices))
-        return _Part(judged, tuple(alone(action, theirs, expert, episodes)), notes=recording.unjudged)
+        return _Part(judged, tuple(alone(action, theirs, expert, episodes)), notes=recording.unjudged_steps)
 
     def _held(
         self, name: str, title: str, drop: tuple[float, float, float], samples: int, starts: int = 0

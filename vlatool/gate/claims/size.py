@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
-from vlatool.data import CALIBRATION, EVALUATION, PLAYED
+from vlatool.data import PLAYED, is_of_recording
 from vlatool.files.ownership import LEDGER
 from vlatool.gate.claims._growth import Growth
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.verdict import Verdict
 from vlatool.report import Measurement
 
-ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, CALIBRATION, EVALUATION, PLAYED, "recipe.yaml", "SIGNATURE",
+ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, PLAYED, "recipe.yaml", "SIGNATURE",
          "reports/report.html", "reports/report.md", "reports/report.json", "reports/difference.json",
          "reports/smooth_quant.json", "reports/weights.json")  # fmt: skip
-"""Files of a bundle that no robot needs, beside the golden one."""
+"""Files of a bundle that no robot needs, beside the golden one and recordings."""
 
 
 class Size(Growth):
@@ -37,6 +37,6 @@ def deployed_bytes(bundle: Bundle) -> int:
     folders = tuple(graph.file.rpartition("/")[0] for graph in bundle.manifest.graphs.values())
     within = tuple(f"{folder}/" if folder else "" for folder in folders)
     opened = {name for name in bundle.manifest.files if name.startswith(within)}
-    spared = {*ABOUT, bundle.manifest.golden} - opened
+    spared = {*ABOUT, bundle.manifest.golden, *filter(is_of_recording, bundle.manifest.files)} - opened
     files = (path for path in bundle.path.rglob("*") if path.is_file())
     return sum(path.stat().st_size for path in files if path.relative_to(bundle.path).as_posix() not in spared)

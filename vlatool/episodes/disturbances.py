@@ -8,16 +8,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec
-from vlatool.runtime.interface import Controller
+from vlatool.runtime.interface import Array, Controller
 
-DELAY, DROPPED = "delay", "dropped_frames"
-OWN = (DELAY, DROPPED)
+DELAY, DROPPED_FRAMES = "delay", "dropped_frames"
+BUILT_IN_DISTURBANCES = (DELAY, DROPPED_FRAMES)
 DELAY_S = 0.05
 """How old an observation is at strength 1: a camera's exposure, transfer and decoding; one control step at least."""
-DROPPED_SHARE, MOST_DROPPED = 0.1, 0.9
+DROPPED_SHARE, MAX_DROPPED_SHARE = 0.1, 0.9
 """How many observations are lost at strength 1, and at most."""
 
 
@@ -38,14 +37,14 @@ class DisturbedController:
         self._controller, self.fresh = controller, False
         self._names = [tensor.name for tensor in spec.inputs]
         self._delay = max(1, round(DELAY_S * strength * spec.control_hz)) if kind == DELAY and strength else 0
-        self._lost = min(MOST_DROPPED, DROPPED_SHARE * strength) if kind == DROPPED else 0.0
+        self._lost = min(MAX_DROPPED_SHARE, DROPPED_SHARE * strength) if kind == DROPPED_FRAMES else 0.0
         self._forget(None)
 
     def _forget(self, seed: int | None) -> None:
         self._random = np.random.default_rng((seed or 0, 31))
         self._observed: deque[Mapping[str, Any]] = deque(maxlen=self._delay + 1)
 
-    def act(self, observation: Mapping[str, Any]) -> NDArray[Any]:
+    def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of the controller for what it is given at the step at which this was observed."""
         if self._delay or self._lost:
             if not self._observed or self._random.random() >= self._lost:
