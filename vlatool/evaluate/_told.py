@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from vlatool.accuracy.disturbed import worst_record
-from vlatool.accuracy.moved import ADDED, RATIO, STEPS, WORST, pairs_above_none
+from vlatool.accuracy.moved import ADDED, RATIO, STEPS, WORST, pairs_above_none, worst_task
 from vlatool.evaluate._loop_latency import LOOP_LATENCY
 from vlatool.report import Measurement, Row
 
@@ -25,7 +25,7 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
     row = rows[-1]
     worst, steps = row.get(WORST), row.get(STEPS)
     if worst and worst.value > 0:
-        yield f"The task that loses most is {worst.note.partition(',')[0]}: {100 * worst.value:.3g} points."
+        yield f"The task that loses most is {worst_task(worst)}: {100 * worst.value:.3g} points."
     changed = [item for item in row.measurements if item.name.endswith(RATIO) and item is not steps]
     if rougher := [item for item in changed if _is_more(item)]:
         words = (f"{item.name.removesuffix(RATIO).replace('_', ' ')} {_times(item.value)}" for item in rougher)
