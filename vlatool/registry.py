@@ -15,6 +15,7 @@ import pkgutil
 import traceback
 from importlib import metadata
 from types import ModuleType
+from typing import Any
 
 from vlatool.errors import PluginError, UsageError, VlatoolError, instead, nearest
 
@@ -106,6 +107,21 @@ def load(kind: str, name: str) -> type:
         raise _plugin_error(entry, f"does not name a class: {error}") from error
     _FOREIGN[entry_class] = f"{kind}.{own_name}"
     return entry_class
+
+
+def values(kind: str, *classes: type) -> list[Any]:
+    """Return the values of some classes that the files of a kind hold, those of vlatool's own files first.
+
+    Raises:
+        PluginError: when the file of another package cannot be imported, or holds none.
+    """
+    found: list[Any] = []
+    for name in (*_own(kind), *plugins(kind)):
+        held = [value for value in vars(module(kind, name)).values() if isinstance(value, classes)]
+        if not held and name in plugins(kind):
+            raise _plugin_error(plugins(kind)[name], f"holds no {noun_of(kind)}")
+        found += held
+    return found
 
 
 def entry_of(entry_class: type) -> str:

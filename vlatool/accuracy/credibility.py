@@ -6,10 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from vlatool.measures import actions
+from vlatool.measures.success import SUCCESS, SUCCESS_CHANCE
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import wilson
 
-DECIDE = ("success", "success_chance", "skill_expert", "variation")
+DECIDE = (SUCCESS.name, SUCCESS_CHANCE.name, actions.SKILL_EXPERT.name, actions.VARIATION.name)
 """The measurements that the credibility rests on."""
 FAILS = "The reference fails"
 """How the sentence about a reference begins that does not do its task."""
@@ -83,7 +85,7 @@ def _failing(reason: str, look_at: str, table: tuple[dict[str, Any], ...] = ()) 
 
 
 def _played(row: Row, name: str) -> Credibility:
-    own, chance = row.get("success"), row.get("success_chance")
+    own, chance = row.get(SUCCESS), row.get(SUCCESS_CHANCE)
     if own is None:
         return Credibility("unknown")
     if own.value == 0.0:
@@ -92,7 +94,7 @@ def _played(row: Row, name: str) -> Credibility:
         return Credibility("unknown", warnings=("what succeeds by chance in this environment was not measured",))
     gain = above(own, chance)
     line = {
-        "measure": "success", "reference": round(own.value, 4), "by chance": round(chance.value, 4),
+        "measure": SUCCESS.name, "reference": round(own.value, 4), "by chance": round(chance.value, 4),
         "floor": "the difference is above 0 with 95 % confidence", "found": f"at least {gain:+.1%}",
     }  # fmt: skip
     if gain > 0:
@@ -122,10 +124,10 @@ def above(own: Measurement, chance: Measurement) -> float:
 
 
 def _recorded(row: Row, name: str) -> Credibility:
-    skill, varied = row.get("skill_expert"), row.get("variation")
+    skill, varied = row.get(actions.SKILL_EXPERT), row.get(actions.VARIATION)
     if varied is not None and varied.value == 0.0:
         reason = f"{name} gives the same action to all of {varied.samples} recorded observations"
-        return _failing(reason, LOOK_AT, (_line("variation", varied, "above 0"),))
+        return _failing(reason, LOOK_AT, (_line(actions.VARIATION.name, varied, "above 0"),))
     if skill is None:
         return Credibility("unknown")
     table: tuple[dict[str, Any], ...] = (
@@ -139,7 +141,7 @@ def _recorded(row: Row, name: str) -> Credibility:
             f"observations (at most {1 - (skill.low or 0.0):.1%}; a policy that looks makes less than {1 - SKILL:.0%})"
         )
         return _failing(reason, LOOK_AT, table)
-    if varied is not None and row.get("error_expert") is not None:
+    if varied is not None and row.get(actions.ERROR_EXPERT) is not None:
         table = (*table, _line("variation by that of the expert", varied, f"{VARIATION:g}"))
         if varied.value < VARIATION:
             reason = f"the actions of {name} hardly vary: {varied.value:.1%} of the expert's standard deviation"

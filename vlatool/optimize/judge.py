@@ -6,6 +6,10 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from vlatool.measures import actions
+from vlatool.measures.latency import LATENCY_P50, LATENCY_P90
+from vlatool.measures.resources import MEMORY, PEAK_RSS
+from vlatool.measures.success import SUCCESS, SUCCESS_DROP
 from vlatool.optimize.budget import Budget, distance_of
 from vlatool.optimize.moves import judge_moves
 from vlatool.optimize.recipe import Limits
@@ -16,10 +20,19 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-12
 AGAINST_FLOAT32 = "against float32"
-FROM_FLOAT32 = ("relative_error", "disagreement", "error_baseline", "gripper_flips_baseline")
-"""Beginnings of the measurements that are distances from float32 themselves."""
-DROPS = ("success_drop", "agreement_drop", "error_increase")
-"""Which accuracy decides: the closed loop where there is one, else recorded observations."""
+FROM_FLOAT32 = {
+    actions.RELATIVE_ERROR.name,
+    actions.DISAGREEMENT.name,
+    actions.ERROR_BASELINE.name,
+    actions.GRIPPER_FLIPS_BASELINE.name,
+}
+"""The measurements that are distances from float32 themselves, beside the errors by element."""
+DROPS = {
+    SUCCESS_DROP: "success",
+    actions.AGREEMENT_DROP: "agreement with the expert",
+    actions.ERROR_INCREASE: "action error",
+}
+"""Which accuracy decides, and in words of what: the closed loop where there is one, else recorded observations."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +71,14 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_b
     """
     is_baseline = row is baseline
     row = _with_drop(row, baseline)
-    decisive = next((measured for name in DROPS if (measured := row.get(name)) is not None), None)
+    decisive = next((measured for drop in DROPS if (measured := row.get(drop)) is not None), None)
     if limits.metric:
         decisive = Budget(limits.metric, 0.0).of(row)
     rate = _both(_judge_rate(row, limits, profile, on_board), _judge_memory(row, limits, profile, on_board))
     if is_baseline:
         reason = "; ".join(rate.reasons) or "the reference"
         return Judged(replace(row, reason=reason), not rate.reasons, 0.0, rate.miss, (), rate.warnings)
-    if row.reason and baseline.get("success") is not None and row.get("success") is None:
+    if row.reason and baseline.get(SUCCESS) is not None and row.get(SUCCESS) is None:
         return Judged(row, False, math.nan, math.inf)  # its episodes were not played, and the reason says why
     accuracy = _both(_judge_accuracy(row, decisive, limits), _judge_distance(row, decisive, limits))
     moves = judge_moves(row, limits)
@@ -126,11 +139,12 @@ def _judge_distance(row: Row, decisive: Measurement | None, limits: Limits) -> _
 
 def _is_distance(decisive: Measurement) -> bool:
     """Say whether what decides is a distance from float32 itself, so that the limit on it is the user's."""
-    return decisive.note == AGAINST_FLOAT32 or decisive.name.startswith(FROM_FLOAT32)
+    known = decisive.name in FROM_FLOAT32 or actions.ERROR_BASELINE_OF.pattern.part(decisive.name) is not None
+    return known or decisive.note == AGAINST_FLOAT32
 
 
 def _distance_words(distance: Measurement) -> str:
-    if distance.name == "disagreement":
+    if distance.name == actions.DISAGREEMENT.name:
         return f"{_percent(distance.value)} of the answers are not those of float32"
     return f"the action differs from float32's by {_percent(distance.value)} of its standard deviation"
 
@@ -144,27 +158,22 @@ def _with_drop(row: Row, baseline: Row) -> Row:
     if row is baseline:
         return row
     drops: list[Measurement] = []
-    for name, drop, sign in (("agreement_expert", "agreement_drop", -1.0), ("error_expert", "error_increase", 1.0)):
-        own, base = row.get(name), baseline.get(name)
+    for quantity, drop, sign in (
+        (actions.AGREEMENT_EXPERT, actions.AGREEMENT_DROP, -1.0),
+        (actions.ERROR_EXPERT, actions.ERROR_INCREASE, 1.0),
+    ):
+        own, base = row.get(quantity), baseline.get(quantity)
         if own is not None and base is not None and own.known:
-            drops.append(
-                Measurement(
-                    drop,
-                    sign * (own.value - base.value),
-                    "1",
-                    where=own.where,
-                    samples=own.samples,
-                    note="recorded observations",
-                )
-            )
+            value, note = sign * (own.value - base.value), "recorded observations"
+            drops.append(drop.measurement(value, where=own.where, samples=own.samples, note=note))
     if not drops:
-        against = row.get("agreement_baseline") or row.get("error_baseline")
+        agreement = row.get(actions.AGREEMENT_BASELINE)
+        against = agreement or row.get(actions.ERROR_BASELINE)
         if against is not None and against.known:
-            agreement = against.name == "agreement_baseline"
-            value = 1.0 - against.value if agreement else against.value
-            name = "agreement_drop" if agreement else "error_increase"
-            where, count = against.where, against.samples
-            drops.append(Measurement(name, value, "1", where=where, samples=count, note=AGAINST_FLOAT32))
+            value, drop = (
+                (1.0 - against.value, actions.AGREEMENT_DROP) if agreement else (against.value, actions.ERROR_INCREASE)
+            )
+            drops.append(drop.measurement(value, where=against.where, samples=against.samples, note=AGAINST_FLOAT32))
     return replace(row, measurements=(*row.measurements, *drops))
 
 
@@ -178,7 +187,7 @@ def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: b
     if limits.max_memory_mb is None:
         return _Verdict()
     measured = profile is None or on_board
-    memory = row.get("peak_rss") if measured else row.get("memory", "predicted")
+    memory = row.get(PEAK_RSS) if measured else row.get(MEMORY, "predicted")
     if memory is None or not memory.known:
         return _Verdict(warnings=(f"{row.name}: its memory is not known, so {limits.max_memory_mb:g} MB is unjudged",))
     if memory.value <= limits.max_memory_mb:
@@ -193,11 +202,11 @@ def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: boo
     if budget_ms is None:
         return _Verdict()
     if on_board or profile is None:
-        latency = row.get("latency_p90") or row.get("latency_p50")
+        latency = row.get(LATENCY_P90) or row.get(LATENCY_P50)
         p90 = latency.value if latency else math.inf
         late = (f"p90 latency {p90:.3g} ms > {budget_ms:.3g} ms",)
         return _Verdict(late, p90 / budget_ms - 1) if p90 > budget_ms else _Verdict()
-    predicted = row.get("latency_p50", "predicted")
+    predicted = row.get(LATENCY_P50, "predicted")
     if predicted is None or not predicted.known:
         unjudged = f"{row.name}: no latency can be predicted for {profile.name}, so {_rate(limits)} is unjudged"
         return _Verdict(warnings=(unjudged,))
@@ -223,20 +232,15 @@ def _allowed(limits: Limits, drop: Measurement) -> str:
 
 
 def _drop_words(drop: Measurement) -> str:
-    if drop.name not in DROPS:
+    name = next((words for quantity, words in DROPS.items() if quantity.name == drop.name), "")
+    if not name:
         return f"{drop.name} is {drop.value:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
-    subject = {
-        "success_drop": "success",
-        "agreement_drop": "agreement with the expert",
-        "error_increase": "action error",
-    }
-    name = subject[drop.name]
     if drop.note == AGAINST_FLOAT32:
-        return _distance_words(drop if drop.name == "error_increase" else replace(drop, name="disagreement"))
-    if drop.name == "error_increase":
+        return _distance_words(drop if drop.name == actions.ERROR_INCREASE.name else actions.DISAGREEMENT.renamed(drop))
+    if drop.name == actions.ERROR_INCREASE.name:
         return f"{name} {'rises' if drop.value >= 0 else 'falls'} by {_points(abs(drop.value))}"
     verb = "drops" if drop.value > 0 else ("is unchanged" if drop.value == 0 else "rises")
-    note = f" ({drop.note})" if drop.note and drop.name == "success_drop" else ""
+    note = f" ({drop.note})" if drop.note and drop.name == SUCCESS_DROP.name else ""
     return f"{name} {verb}{'' if drop.value == 0 else f' by {_points(abs(drop.value))}'}{note}"
 
 
@@ -247,5 +251,5 @@ def _points(share: float) -> str:
 
 def p50(row: Row, origin: str = "measured") -> float:
     """Return the median latency of a row in ms, infinite when it is not known."""
-    latency = row.get("latency_p50", origin)
+    latency = row.get(LATENCY_P50, origin)
     return latency.value if latency is not None and latency.known else math.inf

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from vlatool.accuracy.moved import RATIO, SPEEDUP, STEPS, WORST
+from vlatool.measures.latency import SPEEDUP
+from vlatool.measures.motion import RATIO, STEPS_RATIO, TASK_SPEEDUP
+from vlatool.measures.success import SUCCESS_DROP, WORST_TASK_DROP
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
@@ -34,7 +36,7 @@ class Moves:
 
 def limited(row: Row) -> dict[str, str]:
     """Return the metrics that a limit on motion is about, for what is known of a row -> their names in sentences."""
-    of_body = any(row.get(f"{name}{RATIO}") for name in LIMITED if name != "task_time")
+    of_body = any(row.get(RATIO.quantity(name)) for name in LIMITED if name != "task_time")
     return LIMITED if of_body else OF_ACTIONS
 
 
@@ -46,9 +48,11 @@ def judge_moves(row: Row, limits: Limits) -> Moves:
 
 
 def _motion(row: Row, limits: Limits) -> Iterator[Moves]:
-    if limits.max_motion is None or row.get("success_drop") is None:
+    if limits.max_motion is None or row.get(SUCCESS_DROP) is None:
         return
-    known = {words: ratio for name, words in limited(row).items() if (ratio := row.get(f"{name}{RATIO}")) is not None}
+    known = {
+        words: ratio for name, words in limited(row).items() if (ratio := row.get(RATIO.quantity(name))) is not None
+    }
     if not known:
         yield Moves(("its motion is unknown: it shares no success with float32",), 1.0)
     for words, ratio in known.items():
@@ -63,7 +67,7 @@ def _motion(row: Row, limits: Limits) -> Iterator[Moves]:
 
 def _steps(row: Row, limits: Limits) -> Iterator[Moves]:
     """Yield a reason against a candidate that needs so many more steps that little of its speed-up is left."""
-    steps = row.get(STEPS)
+    steps = row.get(STEPS_RATIO)
     if steps is None or steps.low is None or steps.low <= 1 or 1 / steps.value >= limits.min_task_share:
         return
     span = f" ({steps.low:.2f} to {steps.high or steps.value:.2f})"
@@ -73,10 +77,10 @@ def _steps(row: Row, limits: Limits) -> Iterator[Moves]:
 
 
 def _worst(row: Row, limits: Limits) -> Iterator[Moves]:
-    worst = row.get(WORST) or row.get("success_drop")  # of one task there is none worse
+    worst = row.get(WORST_TASK_DROP) or row.get(SUCCESS_DROP)  # of one task there is none worse
     if limits.worst_task is None or worst is None:
         return
-    where = f"in {worst.note.partition(',')[0]}" if worst.name == WORST else "in its only task"
+    where = f"in {worst.note.partition(',')[0]}" if worst.name == WORST_TASK_DROP.name else "in its only task"
     span = "" if worst.low is None else f" ({100 * worst.low:.3g} to {100 * (worst.high or worst.value):.3g})"
     drop = f"success {where} drops by {100 * worst.value:.3g} points{span}"
     allowed = f"allowed {100 * limits.worst_task:.3g} (--worst-task)"
@@ -93,7 +97,7 @@ def _grows(ratio: Measurement) -> str:
 
 def slower_task(row: Row) -> str:
     """Return what is said of a candidate whose task gains less than its inferences; empty where it gains as much."""
-    task, speed, steps = row.get(SPEEDUP), row.get("speedup"), row.get(STEPS)
+    task, speed, steps = row.get(TASK_SPEEDUP), row.get(SPEEDUP), row.get(STEPS_RATIO)
     if task is None or speed is None or steps is None:
         return ""
     words = f"{row.name} does its task {task.value:.2f}x as fast as float32, where inferences set the pace: its "

@@ -10,7 +10,6 @@ import numpy as np
 
 from vlatool.accuracy.credibility import DECIDE, credibility
 from vlatool.accuracy.losses import drop, losses
-from vlatool.accuracy.moved import START
 from vlatool.accuracy.paired import few_starts, repeated_starts
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import EVALUATION, read_recording
@@ -19,6 +18,7 @@ from vlatool.evaluate.recorded import alone, run_recorded
 from vlatool.gate.config import AccuracyClaim
 from vlatool.gate.episodes import Episodes
 from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
+from vlatool.measures import series
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
 from vlatool.stats.starts import distinct, independent
@@ -132,7 +132,7 @@ def _closed_loop(episodes: Episodes) -> _Drop:
     before, after = (row.raw["success"] for row in rows)
     lost = sum(one > two for one, two in zip(before, after, strict=True))
     won = sum(one < two for one, two in zip(before, after, strict=True))
-    starts = rows[0].raw[START]
+    starts = rows[0].raw[series.START]
     value, low, high = exact_drop(lost, won, len(before), CONFIDENCE, independent(starts))
     own = tuple(number for number in rows[1].measurements if number.name == "success")
     words, begun = "more failed episodes:", f", {distinct(starts)} distinct starts"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vlatool.accuracy.moved import RATIO, doubts, known_of, pairs_above_none, ratios
+from vlatool.accuracy.moved import doubts, known_of, pairs_above_none, ratios
 from vlatool.gate.claims._ratio import confidence_of, judged
 from vlatool.gate.config import MotionClaim
 from vlatool.gate.episodes import Episodes
@@ -29,7 +29,7 @@ def examine(episodes: Episodes, claim: MotionClaim) -> ClaimResult:
     confidence = confidence_of(len(names))
     found = ratios(*episodes.rows, names, confidence)
     titles = {name: metric.title for name, metric in metrics().items()}
-    told = {titles.get(name, name): ratio for name in names if (ratio := found.get(f"{name}{RATIO}"))}
+    told = {titles.get(name, name): ratio for name in names if (ratio := found.get(name))}
     none = pairs_above_none(*episodes.rows, names)
     doubt = doubts(*episodes.rows, names)
     results = [
@@ -37,7 +37,7 @@ def examine(episodes: Episodes, claim: MotionClaim) -> ClaimResult:
     ]
     if told or not results:
         results.insert(0, judged("motion", told, claim.margin, NOTHING))
-    if lacking := [name for name in names if f"{name}{RATIO}" not in found and name not in none]:
+    if lacking := [name for name in names if name not in found and name not in none]:
         words = "; ".join(f"no ratio of {name} ({doubt.get(name, 'not told')})" for name in lacking)
         results.insert(0, ClaimResult("motion", "inconclusive", words))
     verdict = worst(result.verdict for result in results)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vlatool.accuracy.moved import RATIO, doubts, ratios
+from vlatool.accuracy.moved import doubts, ratios
 from vlatool.gate.claims._ratio import judged
 from vlatool.gate.config import TaskTimeClaim
 from vlatool.gate.episodes import Episodes
@@ -18,6 +18,6 @@ def examine(episodes: Episodes, claim: TaskTimeClaim) -> ClaimResult:
     Raises:
         DataError: when no environment is named, or it fails.
     """
-    found = ratios(*episodes.rows, (METRIC,), CONFIDENCE).get(f"{METRIC}{RATIO}")
+    found = ratios(*episodes.rows, (METRIC,), CONFIDENCE).get(METRIC)
     nothing = doubts(*episodes.rows, (METRIC,)).get(METRIC, NOTHING)
     return judged(METRIC, {"task time": found} if found else {}, claim.margin, nothing)
