@@ -167,7 +167,7 @@ def measures_page() -> str:
         "([guide](../guides/add-a-method.md)). A part in braces is that of the policy or the command."
     )
     rows = ["| name | in words | unit | better | shown with | interval |", "|---|---|---|---|---|---|"]
-    rows += [f"| `{name}` | {' | '.join(map(str, each.values()))} |" for name, each in measures.described().items()]
+    rows += [f"| `{name}` | {' | '.join(map(str, each.values()))} |" for name, each in measures.descriptions().items()]
     return f"# Measures\n\n{about}\n\n" + "\n".join(rows) + "\n"
 
 
@@ -180,7 +180,7 @@ def schema_page() -> str:
         "$comment": "written by docs/generate.py from the code; do not edit",
         "title": "vlatool report",
     }
-    known = {"measures": measures.described()}
+    known = {"measures": measures.descriptions()}
     return json.dumps({**head, **root, "additionalProperties": True, "$defs": defs, **known}, indent=1) + "\n"
 
 

@@ -66,7 +66,7 @@ class Measurement:
         return not math.isnan(self.value)
 
 
-class Named(Protocol):
+class HasName(Protocol):
     """What has the name of a quantity: one of ``vlatool.measures``, or a measurement of it."""
 
     @property
@@ -102,12 +102,12 @@ class Row:
         if not isinstance(self.raw, Mapping) or not isinstance(self.details, Mapping):
             raise ValueError(f"raw and details of {self.name} must be mappings")
 
-    def get(self, quantity: Named, origin: str = "measured") -> Measurement | None:
+    def get(self, quantity: HasName, origin: str = "measured") -> Measurement | None:
         """Return the measurement of a quantity and origin, or None; a script may give the name of the quantity."""
         name = getattr(quantity, "name", quantity)
         return next((item for item in self.measurements if (item.name, item.origin) == (name, origin)), None)
 
-    def value(self, quantity: Named) -> float:
+    def value(self, quantity: HasName) -> float:
         """Return a measured value, NaN when it is not there."""
         measurement = self.get(quantity)
         return measurement.value if measurement else math.nan

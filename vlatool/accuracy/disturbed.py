@@ -43,7 +43,7 @@ def with_disturbed(
         if base is not None:
             disturbed = compare_success(success_row("baseline", "baseline", base), disturbed)
             raw[series.DISTURBED_BASELINE.name(name)] = [float(outcome.success) for outcome in base]
-        raw[series.DISTURBED.name(name)] = disturbed.raw[series.SUCCESS]
+        raw[series.DISTURBED_SUCCESS.name(name)] = disturbed.raw[series.SUCCESS]
         wins, count = wins + int(sum(disturbed.raw[series.SUCCESS])), count + len(own)
         records.append(_record(kind, strength, disturbed, base))
     first = sorted(records, key=_badness)
@@ -106,10 +106,12 @@ def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measur
         confidence: Of all intervals together (Bonferroni).
     """
     drops = {}
-    kinds = [kind for kind in series.DISTURBED.among(row.raw) if series.DISTURBED_BASELINE.name(kind) in row.raw]
+    kinds = [
+        kind for kind in series.DISTURBED_SUCCESS.among(row.raw) if series.DISTURBED_BASELINE.name(kind) in row.raw
+    ]
     confidence = 1 - (1 - confidence) / max(1, len(kinds))
     for kind in kinds:
-        names = series.DISTURBED_BASELINE.name(kind), series.DISTURBED.name(kind)
+        names = series.DISTURBED_BASELINE.name(kind), series.DISTURBED_SUCCESS.name(kind)
         pairs = list(zip(*(row.raw[name] for name in names), strict=True))
         lost, won = sum(before > after for before, after in pairs), sum(before < after for before, after in pairs)
         size = independent(row.raw.get(series.START) or range(len(pairs)))

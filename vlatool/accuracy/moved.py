@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.measures import Quantity, series, tables
-from vlatool.measures.motion import ADDED, RATIO, STEPS_RATIO
+from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
 from vlatool.measures.success import WORST_TASK_DROP
 from vlatool.motion.measure import FEWEST, metrics, ratio_of
 from vlatool.report import NO_INTERVAL, Measurement, Row
@@ -168,7 +168,7 @@ class _Pairs:
                 own, _, known = self._values(name)
                 some, count = int((own[known] > 0).sum()), int(known.sum())
                 note = f"mean of {self._told(known)}: above 0 in {some} of them, and in none of the "
-                quantity = ADDED.quantity(name, metrics()[name].unit)
+                quantity = ADDED_MEAN.quantity(name, metrics()[name].unit)
                 yield quantity.measurement(float(own[known].mean()), samples=count, note=f"{note}baseline's")
 
     def steps(self) -> Iterator[Measurement]:

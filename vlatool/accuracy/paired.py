@@ -83,7 +83,7 @@ def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:
         asked = [outcome.instruction for outcome in outcomes]
         raw[series.INSTRUCTION] = _places(details[tables.BY_INSTRUCTION], "instruction", asked)
     if refused := list(_refused(outcomes)):
-        details[tables.UNMEASURED] = refused
+        details[tables.MISSING_VALUES] = refused
     return Row(name, role, measurements=(rate, *_moved(outcomes)), raw=raw, details=details)
 
 
@@ -169,7 +169,7 @@ def with_chance(reference: Row, controls: Sequence[Row]) -> Row:
     rates = [(row.name, rate) for row in controls if (rate := row.get(SUCCESS)) is not None]
     name, best = max(rates, key=lambda pair: pair[1].value)
     note = f"{name} actions, the better of {' and '.join(name for name, _ in rates)}"
-    return replace(reference, measurements=(*reference.measurements, SUCCESS_CHANCE.renamed(best, note)))
+    return replace(reference, measurements=(*reference.measurements, SUCCESS_CHANCE.relabel(best, note)))
 
 
 def compare_success(baseline: Row, row: Row) -> Row:
@@ -194,6 +194,6 @@ def compare_success(baseline: Row, row: Row) -> Row:
     note = f"paired: {lost} lost, {won} won of {len(pairs)} episodes; {_starts(starts)}"
     difference = SUCCESS_DROP.measurement(drop, samples=len(pairs), low=low, high=high, note=note)
     table = [{"episodes": len(pairs), "lost": lost, "won": won, "drop": round(drop, 4), "McNemar exact p": round(p, 4)}]
-    details = {**row.details, tables.PAIRED: table}
+    details = {**row.details, tables.PAIRED_SUCCESS: table}
     row = replace(row, measurements=(*row.measurements, difference, test), details=details)
     return compare_motion(baseline, row)

@@ -110,7 +110,7 @@ def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) ->
     outcome = choice.outcome
     way: dict[str, Any] = {"state": choice.state}
     board = choice.profile.name
-    measurements = [resources.PRICE.predicted(choice.profile.price_usd.value, board)]
+    measurements = [resources.PRICE.prediction(choice.profile.price_usd.value, board)]
     if outcome is not None:
         candidate = outcome.candidate
         way |= {"power mode": candidate.mode, "engine": candidate.engine, "precision": candidate.precision}
@@ -122,7 +122,7 @@ def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) ->
             (resources.BATTERY_LIFE, spent.battery_hours),
         ):  # fmt: skip
             if not math.isnan(value):
-                measurements.append(quantity.predicted(value, board))
+                measurements.append(quantity.prediction(value, board))
     role = "chosen" if chosen else ROLES[choice.state]
     return Row(board, role, choice.reason, tuple(measurements), details={tables.WAY: [way]})
 

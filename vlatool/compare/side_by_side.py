@@ -13,8 +13,8 @@ from vlatool.compare.inputs import short_names
 from vlatool.measures.latency import LATENCY_P50, SPEEDUP
 from vlatool.report import VALIDITIES, Finding, Measurement, Report, Row
 
-APART = "against {name}; the two runs were not interleaved"
-HERE = "this host"
+SPEEDUP_NOTE = "against {name}; the two runs were not interleaved"
+THIS_HOST = "this host"
 
 
 def side_by_side(paths: Sequence[Path], reports: Sequence[Report]) -> Report:
@@ -72,7 +72,7 @@ def _rows(labels: Sequence[str], reports: Sequence[Report], same: bool) -> list[
                 items += _speedup(row, reference, names[reports[0].rows.index(reference)]) if same and reference else ()
             if not same:
                 where = f"{labels[index]}: {report.environment.get('cpu') or 'an unknown machine'}"
-                items = tuple(replace(item, where=where) if item.where == HERE else item for item in items)
+                items = tuple(replace(item, where=where) if item.where == THIS_HOST else item for item in items)
             role = "baseline" if row is reference else "failed" if row.role == "failed" else "subject"
             reason = row.reason if role == "failed" else ""
             rows.append(replace(row, name=name, role=role, reason=reason, measurements=items))
@@ -89,7 +89,7 @@ def _speedup(row: Row, reference: Row, name: str) -> tuple[Measurement, ...]:
     value, base = row.value(LATENCY_P50), reference.value(LATENCY_P50)
     if not math.isfinite(value) or value <= 0:
         return ()
-    return (SPEEDUP.measurement(base / value, note=APART.format(name=name)),)
+    return (SPEEDUP.measurement(base / value, note=SPEEDUP_NOTE.format(name=name)),)
 
 
 def _row_names(labels: Sequence[str], reports: Sequence[Report]) -> list[str]:

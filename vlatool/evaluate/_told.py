@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from vlatool.accuracy.disturbed import worst_record
 from vlatool.accuracy.moved import pairs_above_none
 from vlatool.measures.latency import LATENCY_IN_THE_LOOP
-from vlatool.measures.motion import ADDED, RATIO, STEPS_RATIO
+from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
 from vlatool.measures.success import WORST_TASK_DROP
 from vlatool.report import Measurement, Row
 
@@ -48,7 +48,7 @@ def _added(rows: Sequence[Row]) -> Iterator[str]:
     """Yield what the baseline has nothing of, and the variant in so many pairs that chance is no explanation."""
     if len(rows) < 2:
         return
-    added = ADDED.members(rows[-1])
+    added = ADDED_MEAN.members(rows[-1])
     for name, (some, count) in pairs_above_none(rows[0], rows[-1], added).items():
         if some >= FEWEST_ADDED:
             yield f"{name.replace('_', ' ')} (in {some} of {count} episodes, {added[name].value:.3g} on average)"

@@ -46,16 +46,16 @@ def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
     usable = 1e3 * outcome.candidate.profile.usable_memory_gb.value
 
     measurements = [
-        LATENCY_P50.predicted(latency.ms, where, low, high, LEVEL, note),
-        MEMORY.predicted(memory[0], where, memory[1], memory[2], LEVEL, JUDGED),
-        USABLE_MEMORY.predicted(usable, where),
-        WATTS.predicted(power[0], where, power[1], power[2], LEVEL, JUDGED),
+        LATENCY_P50.prediction(latency.ms, where, low, high, LEVEL, note),
+        MEMORY.prediction(memory[0], where, memory[1], memory[2], LEVEL, JUDGED),
+        USABLE_MEMORY.prediction(usable, where),
+        WATTS.prediction(power[0], where, power[1], power[2], LEVEL, JUDGED),
     ]
     if latency.known:
         ends = (power[1] * latency.low / 1e3, power[2] * latency.high / 1e3)
-        measurements.append(ENERGY.predicted(outcome.joules, where, *ends, LEVEL, JUDGED))
+        measurements.append(ENERGY.prediction(outcome.joules, where, *ends, LEVEL, JUDGED))
         for quantity, value in ((LATENCY_PER_ACTION, latency.ms), (ENERGY_PER_ACTION, outcome.joules)):
-            measurements.append(quantity.predicted(value / execute, where))
+            measurements.append(quantity.prediction(value / execute, where))
     return measurements
 
 

@@ -126,7 +126,7 @@ def sustained(samples: Sequence[float]) -> list[Measurement]:
 
 def raw(measured: Measured, policy: PolicyRun, alone: bool) -> dict[str, list[float]]:
     """Return every sample: latencies, when each call began, and, of a run alone, what the board told meanwhile."""
-    taken = {series.LATENCY: policy.samples, series.STARTED: list(policy.at_s)}
+    taken = {series.LATENCY: policy.samples, series.START_TIMES: list(policy.at_s)}
     if not alone or measured.telemetry is None:
         return taken
     moments: list[float] = []
@@ -135,7 +135,7 @@ def raw(measured: Measured, policy: PolicyRun, alone: bool) -> dict[str, list[fl
         taken |= {series.READING.name(name): list(gauge.values), series.READING_TIMES.name(name): times}
         if gauge.unit == THROTTLE:
             moments += [when for when, value in zip(times, gauge.values, strict=True) if value]
-    return {**taken, **({series.THROTTLED: sorted(moments)} if moments else {})}
+    return {**taken, **({series.THROTTLE_TIMES: sorted(moments)} if moments else {})}
 
 
 def tables(measured: Measured, policy: PolicyRun, alone: bool) -> dict[str, list[dict[str, Any]]]:
@@ -189,7 +189,7 @@ def _telemetry(telemetry: Recorded) -> dict[str, list[dict[str, Any]]]:
         if name not in OWN
     ]
     unmeasured = _unmeasured(telemetry.unmeasured)
-    return {titles.TELEMETRY: [*gauges, *counters], **({titles.UNMEASURED: unmeasured} if unmeasured else {})}
+    return {titles.TELEMETRY: [*gauges, *counters], **({titles.MISSING_VALUES: unmeasured} if unmeasured else {})}
 
 
 def _unmeasured(absent: Sequence[Absent]) -> list[dict[str, str]]:

@@ -16,8 +16,8 @@ from typing import Any
 from vlatool import registry
 from vlatool.report import Measurement, Row
 
-LESS, MORE = "less", "more"
-HEADLINE, RECORDED, PERCENTILES, MOTION, ELEMENTS, FURTHER, BOARDS = SECTIONS = (
+BETTER = ("", "less", "more")
+HEADLINE, RECORDED_ACCURACY, PERCENTILES, MOTION, ELEMENTS, FURTHER, BOARDS = SECTIONS = (
     "headline", "recorded", "percentiles", "motion", "elements", "further", "boards",
 )  # fmt: skip
 """Where a report shows a quantity: a column of the variants; the same unless episodes were played; the percentiles of
@@ -25,7 +25,7 @@ the latency; how the variants move; errors by action element; the further measur
 AUTOMATIC, PERCENT, POINTS, PLAIN = FORMS = ("", "percent", "points", "plain")
 """How a number is printed: with its unit, a share up to 1 in per cent; always in per cent; a difference of shares in
 percentage points; never in per cent, and metres in millimetres."""
-LAST = 1000
+LAST_POSITION = 1000
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class Quantity:
     name: str
     unit: str
     title: str = ""
-    better: str = LESS
+    better: str = "less"
     section: str = FURTHER
-    order: int = LAST
+    order: int = LAST_POSITION
     column: str = ""
     host_column: str = ""
     form: str = AUTOMATIC
@@ -64,7 +64,7 @@ class Quantity:
     part: str = ""
 
     def __post_init__(self) -> None:
-        known = (("better", self.better, ("", LESS, MORE)), ("section", self.section, SECTIONS))
+        known = (("better", self.better, BETTER), ("section", self.section, SECTIONS))
         for field, got, allowed in (*known, ("form", self.form, FORMS)):
             if got not in allowed:
                 raise ValueError(f"{field} of {self.name} is {got!r}; allowed: {', '.join(map(repr, allowed))}")
@@ -88,7 +88,7 @@ class Quantity:
         """Return a measured value; the arguments are those of ``Measurement``."""
         return Measurement(self.name, value, self.unit, "measured", where, samples, low, high, confidence, note)
 
-    def predicted(
+    def prediction(
         self,
         value: float,
         where: str,
@@ -100,7 +100,7 @@ class Quantity:
         """Return a value that is predicted for a board; the arguments are those of ``Measurement``."""
         return Measurement(self.name, value, self.unit, "predicted", where, 0, low, high, confidence, note)
 
-    def renamed(self, other: Measurement, note: str | None = None) -> Measurement:
+    def relabel(self, other: Measurement, note: str | None = None) -> Measurement:
         """Return the measurement of another quantity as one of this."""
         return replace(other, name=self.name, note=other.note if note is None else note)
 
@@ -186,7 +186,7 @@ def families() -> tuple[Family, ...]:
 
 
 @cache
-def named(name: str) -> Quantity:
+def quantity_of(name: str) -> Quantity:
     """Return the quantity of a name that a report or a user gives; one that only has this name where it is unknown."""
     if name in quantities():
         return quantities()[name]
@@ -201,7 +201,7 @@ def with_derived(row: Row) -> Row:
     return replace(row, measurements=(*row.measurements, *(item for item in found if item is not None)))
 
 
-def described() -> dict[str, dict[str, Any]]:
+def descriptions() -> dict[str, dict[str, Any]]:
     """Return name -> what the JSON schema says of a quantity; the names of families have a part in braces."""
     every = (*quantities().values(), *(family.each for family in families()))
     return {

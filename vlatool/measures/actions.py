@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vlatool.measures import ELEMENTS, MORE, PLAIN, POINTS, RECORDED, Family, Quantity
+from vlatool.measures import ELEMENTS, PLAIN, POINTS, RECORDED_ACCURACY, Family, Quantity
 
 
 def _by_element(name: str, title: str) -> Family:
@@ -13,10 +13,14 @@ def _by_element(name: str, title: str) -> Family:
     )
 
 
-AGREEMENT_EXPERT = Quantity("agreement_expert", "1", "agreement vs expert", MORE, RECORDED, 61, interval="Wilson")
-AGREEMENT_BASELINE = Quantity("agreement_baseline", "1", "agreement vs baseline", MORE, RECORDED, 62, interval="Wilson")
-ERROR_EXPERT = Quantity("error_expert", "1", "error vs expert", section=RECORDED, order=63, form=PLAIN)
-ERROR_BASELINE = Quantity("error_baseline", "1", "error vs baseline", section=RECORDED, order=64, form=PLAIN)
+AGREEMENT_EXPERT = Quantity(
+    "agreement_expert", "1", "agreement vs expert", "more", RECORDED_ACCURACY, 61, interval="Wilson"
+)
+AGREEMENT_BASELINE = Quantity(
+    "agreement_baseline", "1", "agreement vs baseline", "more", RECORDED_ACCURACY, 62, interval="Wilson"
+)
+ERROR_EXPERT = Quantity("error_expert", "1", "error vs expert", section=RECORDED_ACCURACY, order=63, form=PLAIN)
+ERROR_BASELINE = Quantity("error_baseline", "1", "error vs baseline", section=RECORDED_ACCURACY, order=64, form=PLAIN)
 ERROR_EXPERT_OF = _by_element("error_expert", "error vs expert")
 ERROR_BASELINE_OF = _by_element("error_baseline", "error vs baseline")
 ERROR_MAX_OF, ERROR_OF = _by_element("error_max", "error max"), _by_element("error", "error")
@@ -27,10 +31,10 @@ RELATIVE_ERROR_MAX = Quantity("relative_error_max", "1")
 RAW_RELATIVE_ERROR = Quantity("raw_relative_error", "1", "relative error (L2) of the raw action")
 GOLDEN_ERROR = Quantity("golden_error", "1")
 SKILL_EXPERT = Quantity(
-    "skill_expert", "1", "skill against a constant action", MORE, form=PLAIN, interval="Student's, over episodes"
+    "skill_expert", "1", "skill against a constant action", "more", form=PLAIN, interval="Student's, over episodes"
 )
 VARIATION = Quantity("variation", "1", "variation of the actions", "", form=PLAIN)
-FOLLOWS = Quantity("follows", "1", better=MORE)
+FOLLOWS = Quantity("follows", "1", better="more")
 
 AGREEMENT_DROP = Quantity("agreement_drop", "1", form=POINTS)
 ERROR_INCREASE = Quantity("error_increase", "1", form=PLAIN)

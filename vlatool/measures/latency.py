@@ -4,48 +4,50 @@ from __future__ import annotations
 
 import re
 
-from vlatool.measures import HEADLINE, MORE, PERCENT, PERCENTILES, Family, Quantity
+from vlatool.measures import HEADLINE, PERCENT, PERCENTILES, Family, Quantity
 
-BOUND = "upper bound, order statistic"
-PAIRED = "order statistic of the ratios within rounds"
+UPPER_BOUND = "upper bound, order statistic"
+RATIO_QUANTILE = "order statistic of the ratios within rounds"
 HODGES = "Hodges-Lehmann, over fresh processes"
 
-LATENCY_P50 = Quantity("latency_p50", "ms", section=HEADLINE, order=10, host_column="p50, this host", interval=BOUND)
-LATENCY_P90 = Quantity("latency_p90", "ms", section=PERCENTILES, order=20, interval=BOUND)
-LATENCY_P95 = Quantity("latency_p95", "ms", section=PERCENTILES, order=30, interval=BOUND)
-LATENCY_P99 = Quantity("latency_p99", "ms", section=PERCENTILES, order=40, interval=BOUND)
-LATENCY_P999 = Quantity("latency_p99.9", "ms", "latency p99.9", section=PERCENTILES, order=50, interval=BOUND)
+LATENCY_P50 = Quantity(
+    "latency_p50", "ms", section=HEADLINE, order=10, host_column="p50, this host", interval=UPPER_BOUND
+)
+LATENCY_P90 = Quantity("latency_p90", "ms", section=PERCENTILES, order=20, interval=UPPER_BOUND)
+LATENCY_P95 = Quantity("latency_p95", "ms", section=PERCENTILES, order=30, interval=UPPER_BOUND)
+LATENCY_P99 = Quantity("latency_p99", "ms", section=PERCENTILES, order=40, interval=UPPER_BOUND)
+LATENCY_P999 = Quantity("latency_p99.9", "ms", "latency p99.9", section=PERCENTILES, order=50, interval=UPPER_BOUND)
 LATENCY_MAX = Quantity("latency_max", "ms", section=PERCENTILES, order=60)
-LATENCY = Family(Quantity("latency_{percentile}", "ms", interval=BOUND))
+LATENCY = Family(Quantity("latency_{percentile}", "ms", interval=UPPER_BOUND))
 OF_LATENCY = (LATENCY_P50, LATENCY_P90, LATENCY_P95, LATENCY_P99, LATENCY_P999, LATENCY_MAX)
 """What a table of percentiles has."""
 
-SPEEDUP = Quantity("speedup", "x", "speed-up", MORE, HEADLINE, 30, interval=PAIRED)
+SPEEDUP = Quantity("speedup", "x", "speed-up", "more", HEADLINE, 30, interval=RATIO_QUANTILE)
 DEADLINE_MISSES = Quantity(
     "deadline_misses", "1", section=HEADLINE, order=20, host_column="deadline misses, this host", interval="Wilson"
 )
-THROUGHPUT = Quantity("throughput", "1/s", better=MORE, order=10)
-GMACS = Quantity("gmacs", "GMAC/s", better=MORE, order=20)
-REACH_SHARE = Quantity("reach_share", "1", better=MORE, order=30, form=PERCENT)
+THROUGHPUT = Quantity("throughput", "1/s", better="more", order=10)
+GMACS = Quantity("gmacs", "GMAC/s", better="more", order=20)
+REACH_SHARE = Quantity("reach_share", "1", better="more", order=30, form=PERCENT)
 JITTER = Quantity("jitter", "ms", order=40)
-AGE_P50 = Quantity("age_p50", "ms", "observation age p50", order=50, interval=BOUND)
-AGE_P99 = Quantity("age_p99", "ms", "observation age p99", order=51, interval=BOUND)
+AGE_P50 = Quantity("age_p50", "ms", "observation age p50", order=50, interval=UPPER_BOUND)
+AGE_P99 = Quantity("age_p99", "ms", "observation age p99", order=51, interval=UPPER_BOUND)
 AGE_MAX = Quantity("age_max", "ms", "observation age max", order=52)
-AGE = Family(Quantity("age_{percentile}", "ms", "observation age {percentile}", interval=BOUND))
-WAKEUP_P50 = Quantity("wakeup_p50", "ms", "wake-up delay p50", order=60, interval=BOUND)
-WAKEUP_P99 = Quantity("wakeup_p99", "ms", "wake-up delay p99", order=61, interval=BOUND)
-WAKEUP = Family(Quantity("wakeup_{percentile}", "ms", "wake-up delay {percentile}", interval=BOUND))
-LATENCY_START_P50 = Quantity("latency_start_p50", "ms", "latency p50 at the start", order=70, interval=BOUND)
-LATENCY_START = Family(Quantity("latency_start_{percentile}", "ms", interval=BOUND))
-LATENCY_SUSTAINED_P50 = Quantity("latency_sustained_p50", "ms", "latency p50 sustained", order=71, interval=BOUND)
-LATENCY_SUSTAINED = Family(Quantity("latency_sustained_{percentile}", "ms", interval=BOUND))
+AGE = Family(Quantity("age_{percentile}", "ms", "observation age {percentile}", interval=UPPER_BOUND))
+WAKEUP_P50 = Quantity("wakeup_p50", "ms", "wake-up delay p50", order=60, interval=UPPER_BOUND)
+WAKEUP_P99 = Quantity("wakeup_p99", "ms", "wake-up delay p99", order=61, interval=UPPER_BOUND)
+WAKEUP = Family(Quantity("wakeup_{percentile}", "ms", "wake-up delay {percentile}", interval=UPPER_BOUND))
+LATENCY_START_P50 = Quantity("latency_start_p50", "ms", "latency p50 at the start", order=70, interval=UPPER_BOUND)
+LATENCY_START = Family(Quantity("latency_start_{percentile}", "ms", interval=UPPER_BOUND))
+LATENCY_SUSTAINED_P50 = Quantity("latency_sustained_p50", "ms", "latency p50 sustained", order=71, interval=UPPER_BOUND)
+LATENCY_SUSTAINED = Family(Quantity("latency_sustained_{percentile}", "ms", interval=UPPER_BOUND))
 SUSTAINED_SLOWDOWN = Quantity("sustained_slowdown", "x", "sustained slow-down", order=72)
 COLD_START = Quantity("cold_start", "ms", order=80)
 
 LATENCY_IN_THE_LOOP = Quantity("latency_in_the_loop", "ms")
 LATENCY_PER_ACTION = Quantity("latency_per_action", "ms")
-TORCH_EAGER_P50 = Quantity("torch_eager_latency_p50", "ms", interval=BOUND)
-OPENVINO_FLOAT32_P50 = Quantity("openvino_float32_latency_p50", "ms", interval=BOUND)
+TORCH_EAGER_P50 = Quantity("torch_eager_latency_p50", "ms", interval=UPPER_BOUND)
+OPENVINO_FLOAT32_P50 = Quantity("openvino_float32_latency_p50", "ms", interval=UPPER_BOUND)
 LATENCY_RATIO = Quantity("latency_ratio", "x", interval=HODGES)
 LATENCY_MEAN_RATIO = Quantity("latency_mean_ratio", "x", interval=HODGES)
 LATENCY_RATIO_AT = Family(Quantity("latency_ratio_{threads}_threads", "x", interval=HODGES))
@@ -55,7 +57,7 @@ OVERHEAD_IN_TURN_P50 = Quantity("overhead_in_turn_p50", "us", interval="order st
 BARE_RUN_P50 = Quantity("bare_run_p50", "us")
 
 
-def limited_by(limit: str) -> Quantity | None:
+def latency_of_limit(limit: str) -> Quantity | None:
     """Return the latency that a limit is on, by the limit's name: ``max_latency_p99_ms``; None for another limit."""
     named = re.fullmatch(r"(?:max_)?(.*)_ms", limit)
     if named is None or not ("latency" in named[1] or "deadline" in named[1]):

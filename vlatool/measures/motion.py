@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vlatool.measures import MORE, MOTION, Family, Quantity
+from vlatool.measures import MOTION, Family, Quantity
 from vlatool.measures.latency import SPEEDUP
 from vlatool.report import Measurement, Row
 
@@ -24,11 +24,11 @@ def task_speedup(row: Row) -> Measurement | None:
 
 
 TASK_SPEEDUP = Quantity(
-    "task_speedup", "x", better=MORE, section=MOTION, order=10, interval="of speed-up and steps", of=task_speedup
+    "task_speedup", "x", better="more", section=MOTION, order=10, interval="of speed-up and steps", of=task_speedup
 )
 STEPS_RATIO = Quantity("steps_ratio", "x", section=MOTION, order=20, interval=BOOTSTRAP)
 RATIO = Family(Quantity("{metric}_ratio", "x", "{metric} ratio", section=MOTION, interval=BOOTSTRAP))
-ADDED = Family(Quantity("{metric}_added", "", "{metric} added", section=MOTION))
+ADDED_MEAN = Family(Quantity("{metric}_added", "", "{metric} added", section=MOTION))
 """The mean of a metric that is 0 in every episode of the baseline, so that there is no ratio."""
 
 

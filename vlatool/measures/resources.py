@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from vlatool.measures import BOARDS, HEADLINE, MORE, Quantity
+from vlatool.measures import BOARDS, HEADLINE, Quantity
 
-JUDGED = "a judgement, not a confidence interval"
+JUDGEMENT = "a judgement, not a confidence interval"
 
 SIZE = Quantity("size", "MB", section=HEADLINE, order=80)
 PEAK_RSS = Quantity(
@@ -18,13 +18,13 @@ ENERGY_PER_ACTION = Quantity("energy_per_action", "J", order=110)
 POWER_MEAN = Quantity("power_mean", "W", "mean power", order=120)
 TEMPERATURE_MAX = Quantity("temperature_max", "degC", "highest temperature", order=130)
 
-MEMORY = Quantity("memory", "MB", interval=JUDGED)
-USABLE_MEMORY = Quantity("usable_memory", "MB", better=MORE)
-WATTS = Quantity("watts", "W", interval=JUDGED)
-ENERGY = Quantity("energy", "J", interval=JUDGED)
+MEMORY = Quantity("memory", "MB", interval=JUDGEMENT)
+USABLE_MEMORY = Quantity("usable_memory", "MB", better="more")
+WATTS = Quantity("watts", "W", interval=JUDGEMENT)
+ENERGY = Quantity("energy", "J", interval=JUDGEMENT)
 PRICE = Quantity("price", "USD", section=BOARDS)
 AVERAGE_WATTS = Quantity("average_watts", "W", section=BOARDS)
-BATTERY_LIFE = Quantity("battery_life", "h", better=MORE, section=BOARDS)
+BATTERY_LIFE = Quantity("battery_life", "h", better="more", section=BOARDS)
 OWNED_COST = Quantity("owned_cost", "USD", section=BOARDS)
 CLOUD_COST = Quantity("cloud_cost", "USD", section=BOARDS)
 BREAK_EVEN = Quantity("break_even", "h", section=BOARDS)

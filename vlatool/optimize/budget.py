@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from vlatool.errors import RecipeError, nearest
-from vlatool.measures import named
+from vlatool.measures import quantity_of
 from vlatool.measures.actions import AGREEMENT_BASELINE, DISAGREEMENT, ERROR_BASELINE, ERROR_BASELINE_OF
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
@@ -39,7 +39,7 @@ class Budget:
             unit = self.name.partition(":")[2]
             alike = (m for m in ERROR_BASELINE_OF.members(row).values() if m.unit == unit)
             return max(alike, key=lambda m: m.value, default=None)
-        return row.get(named(self.name)) or row.get(ERROR_BASELINE_OF.quantity(self.name))
+        return row.get(quantity_of(self.name)) or row.get(ERROR_BASELINE_OF.quantity(self.name))
 
     def required(self, row: Row) -> Measurement:
         """Return the measurement of a row that the budget is about.

@@ -84,7 +84,7 @@ def _reference(base: Judged, engine: str) -> Judged:
     if engine != ENGINE or latency is None:
         return base
     rest = (other for other in base.row.measurements if other.name != LATENCY_P50.name or other.origin != "measured")
-    row = replace(base.row, name=IN_OPENVINO, measurements=(LATENCY_P50.renamed(latency), *rest))
+    row = replace(base.row, name=IN_OPENVINO, measurements=(LATENCY_P50.relabel(latency), *rest))
     return replace(base, row=row)
 
 

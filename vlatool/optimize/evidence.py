@@ -129,14 +129,14 @@ def told_wrong(bundle: Bundle, loop: ClosedLoop | None, cache: Path, context: Co
         rate = cached_measure(loop.told_wrong(), bundle, cache, context).rows[-1].get(SUCCESS)
     except (DataError, SourceError):  # it played the right one: what it cannot do is another
         return None
-    return rate and SUCCESS_WRONG_INSTRUCTION.renamed(rate)
+    return rate and SUCCESS_WRONG_INSTRUCTION.relabel(rate)
 
 
 def _joined(row: Row, played: Row) -> Row:
     measurements = (*row.measurements, *played.measurements)
     raw, details = {**row.raw, **played.raw}, {**row.details, **played.details}
-    if lacking := [*row.details.get(tables.UNMEASURED, ()), *played.details.get(tables.UNMEASURED, ())]:
-        details[tables.UNMEASURED] = lacking
+    if lacking := [*row.details.get(tables.MISSING_VALUES, ()), *played.details.get(tables.MISSING_VALUES, ())]:
+        details[tables.MISSING_VALUES] = lacking
     return replace(row, measurements=measurements, raw=raw, details=details)
 
 

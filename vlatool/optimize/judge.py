@@ -236,7 +236,7 @@ def _drop_words(drop: Measurement) -> str:
     if not name:
         return f"{drop.name} is {drop.value:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
     if drop.note == AGAINST_FLOAT32:
-        return _distance_words(drop if drop.name == actions.ERROR_INCREASE.name else actions.DISAGREEMENT.renamed(drop))
+        return _distance_words(drop if drop.name == actions.ERROR_INCREASE.name else actions.DISAGREEMENT.relabel(drop))
     if drop.name == actions.ERROR_INCREASE.name:
         return f"{name} {'rises' if drop.value >= 0 else 'falls'} by {_points(abs(drop.value))}"
     verb = "drops" if drop.value > 0 else ("is unchanged" if drop.value == 0 else "rises")

@@ -72,7 +72,7 @@ class Timing:
         named = {name: replace(row, name=name) for name, row in rows.items()}
         eager = report.rows[-1].get(LATENCY_P50) if torch else None
         if eager is not None:
-            own = TORCH_EAGER_P50.renamed(eager, "eager torch, same run")
+            own = TORCH_EAGER_P50.relabel(eager, "eager torch, same run")
             named[base] = replace(named[base], measurements=(*named[base].measurements, own))
         seen = [
             "; ".join(filter(None, (finding.reason, finding.remedy)))
@@ -96,7 +96,7 @@ def joined(ours: Mapping[str, Row], theirs: Mapping[str, Row], order: Sequence[s
     reference = theirs[base].get(LATENCY_P50) if theirs else None
     if reference is not None:
         note = f"{IN_OPENVINO}, in the run of its plans"
-        own = replace(OPENVINO_FLOAT32_P50.renamed(reference, note), where=where.where)
+        own = replace(OPENVINO_FLOAT32_P50.relabel(reference, note), where=where.where)
         rows[base] = replace(rows[base], measurements=(*rows[base].measurements, own))
     rows[base] = replace(rows[base], role="baseline")  # of a run alone it is none
     rows |= {name: replace(row, measurements=_noted(row, where.ratio)) for name, row in theirs.items() if name != base}
@@ -137,7 +137,7 @@ def foretold_by_engine(
     predicted = {name: predictions(profile, bundle) for name, bundle in bundles.items()}
     (base, baseline), *_ = bundles.items()
     own = predictions(profile, baseline, ENGINE) if where.confined else []
-    predicted[base] += [OPENVINO_FLOAT32_P50.renamed(number) for number in own if number.name == LATENCY_P50.name]
+    predicted[base] += [OPENVINO_FLOAT32_P50.relabel(number) for number in own if number.name == LATENCY_P50.name]
     return predicted
 
 

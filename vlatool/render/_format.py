@@ -7,7 +7,7 @@ import re
 import unicodedata
 from typing import Any
 
-from vlatool.measures import PERCENT, PLAIN, POINTS, named
+from vlatool.measures import PERCENT, PLAIN, POINTS, quantity_of
 from vlatool.report import COUNT, NO_INTERVAL, Measurement
 
 UNMEASURED = "unmeasured"
@@ -29,7 +29,7 @@ def plain(text: object) -> str:
 
 def label(name: str) -> str:
     """Return a measurement's name as words: ``latency_p50`` -> ``latency p50``."""
-    return plain(named(name).words)
+    return plain(quantity_of(name).words)
 
 
 def decimals_of(value: float, digits: int = 3) -> int:
@@ -91,7 +91,7 @@ def count(samples: int) -> str:
 
 def is_share(measurement: Measurement) -> bool:
     """Return whether a number without a unit is a share of something, to be shown in per cent."""
-    form = named(measurement.name).form
+    form = quantity_of(measurement.name).form
     if measurement.unit != "1" or form == PLAIN:
         return False
     return not measurement.known or abs(measurement.value) <= 1 or form == PERCENT
@@ -99,14 +99,14 @@ def is_share(measurement: Measurement) -> bool:
 
 def is_points(measurement: Measurement) -> bool:
     """Return whether a share is a difference of shares, to be shown in percentage points."""
-    return is_share(measurement) and named(measurement.name).form == POINTS
+    return is_share(measurement) and quantity_of(measurement.name).form == POINTS
 
 
 def _scale(measurement: Measurement) -> tuple[float, str]:
     """Return what the number is multiplied by, and the unit beside it; action errors in metres are in millimetres."""
     if is_share(measurement):
         return 100.0, "points" if is_points(measurement) else "%"
-    if measurement.unit == "m" and named(measurement.name).form == PLAIN:
+    if measurement.unit == "m" and quantity_of(measurement.name).form == PLAIN:
         return 1000.0, "mm"
     return 1.0, {"1": "", COUNT: "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
 

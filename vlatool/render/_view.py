@@ -6,16 +6,25 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
-from vlatool.measures import ELEMENTS, FURTHER, HEADLINE, LAST, MOTION, RECORDED, Quantity, named
-from vlatool.measures.latency import LATENCY_P50, OF_LATENCY, limited_by
+from vlatool.measures import (
+    ELEMENTS,
+    FURTHER,
+    HEADLINE,
+    LAST_POSITION,
+    MOTION,
+    RECORDED_ACCURACY,
+    Quantity,
+    quantity_of,
+)
+from vlatool.measures.latency import LATENCY_P50, OF_LATENCY, latency_of_limit
 from vlatool.measures.success import SUCCESS
-from vlatool.measures.tables import UNMEASURED
+from vlatool.measures.tables import MISSING_VALUES
 from vlatool.render._format import cell, interval, is_usual, label, plain
 from vlatool.report import ON_BOARD, Measurement, Report, Row
 
 ROLES = {"subject": "measured", "within": "within limits", "outside": "outside limits"}
 RANKING = "hwselect"
-"""The kind of a report that ranks boards: its rows are no variants."""
+"""The kind of a report that ranks boards: its rows are not variants."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +41,7 @@ def ranks_boards(report: Report) -> bool:
     return report.kind == RANKING
 
 
-def measured(report: Report, quantity: Quantity) -> list[Measurement | None]:
+def measurements(report: Report, quantity: Quantity) -> list[Measurement | None]:
     """Return the measured number of a quantity, one for each row."""
     return [row.get(quantity) for row in report.rows]
 
@@ -45,7 +54,7 @@ def of_origin(report: Report, origin: str, where: str | None = None) -> Iterator
 
 def quantities(report: Report, origin: str = "measured", where: str | None = None) -> list[Quantity]:
     """Return the quantities in the order of their first appearance."""
-    return [named(name) for name in dict.fromkeys(item.name for item in of_origin(report, origin, where))]
+    return [quantity_of(name) for name in dict.fromkeys(item.name for item in of_origin(report, origin, where))]
 
 
 def places(report: Report, origin: str) -> list[str]:
@@ -56,15 +65,15 @@ def places(report: Report, origin: str) -> list[str]:
 def headline(report: Report) -> list[Quantity]:
     """Return the few measured quantities that decide, each a column of the variants."""
     present = quantities(report)
-    sections = (HEADLINE,) if SUCCESS in present else (HEADLINE, RECORDED)
+    sections = (HEADLINE,) if SUCCESS in present else (HEADLINE, RECORDED_ACCURACY)
     return sorted((each for each in present if each.section in sections), key=lambda each: each.order)
 
 
-def others(report: Report) -> list[Quantity]:
+def further(report: Report) -> list[Quantity]:
     """Return the measured quantities that neither the headline nor another table shows."""
     shown = [*headline(report), *percentiles(report), *motions(report)]
     rest = (each for each in quantities(report) if each not in shown and each.section != ELEMENTS)
-    return sorted(rest, key=lambda each: each.order if each.section == FURTHER else LAST)
+    return sorted(rest, key=lambda each: each.order if each.section == FURTHER else LAST_POSITION)
 
 
 def motions(report: Report) -> list[Quantity]:
@@ -127,7 +136,7 @@ def notes(report: Report, origin: str, where: str | None = None) -> list[str]:
     by_note: dict[str, dict[str, None]] = {}
     for item in of_origin(report, origin, where):
         if item.note and (item.known or origin == "predicted"):
-            group = named(item.name).group
+            group = quantity_of(item.name).group
             words = f"{group} by dimension" if group else label(item.name)
             by_note.setdefault(plain(item.note), {})[words] = None
     return [f"{', '.join(labels)}: {note}" for note, labels in by_note.items()]
@@ -139,12 +148,12 @@ def unmeasured(report: Report, shown: Callable[[str], bool], *, further: bool = 
     Args:
         report: The report.
         shown: Says of the name of a measurement whether its reason is asked for.
-        further: Add what is no measurement of a row, from its details.
+        further: Add what is not a measurement of a row, from its details.
     """
     missing = [(row, _missing(item), plain(item.note)) for row in report.rows for item in row.measurements
                if not item.known and shown(item.name)]  # fmt: skip
     for row in report.rows if further else ():
-        records = row.details.get(UNMEASURED, ())
+        records = row.details.get(MISSING_VALUES, ())
         missing += [(row, plain(record.get("what", "")), plain(record.get("why", ""))) for record in records]
     rows_of: dict[tuple[str, str], dict[str, None]] = {}
     for row, what, why in missing:
@@ -169,14 +178,14 @@ def latency(report: Report) -> Latency:
     """Return which latency percentile the limit speaks of, and the limit.
 
     A benchmark at a rate (``hz``) without one has its period as the deadline, and so have several that are compared.
-    What ``optimize`` was asked for is no limit on this host when it is for another board.
+    What ``optimize`` was asked for is not a limit on this host when it is for another board.
     """
     present = quantities(report)
     for_board = quantities(report, "predicted") and report.kind == "optimize" and ON_BOARD not in report.environment
     for name, limit in () if for_board else report.limits.items():
-        limited = limited_by(name) if _is_number(limit) else None
-        if limited is not None and named(limited.name) in present:
-            return Latency(named(limited.name), float(limit), "deadline" if "deadline" in name else "limit")
+        limited = latency_of_limit(name) if _is_number(limit) else None
+        if limited is not None and quantity_of(limited.name) in present:
+            return Latency(quantity_of(limited.name), float(limit), "deadline" if "deadline" in name else "limit")
     rate = report.limits.get("hz")
     if report.kind in ("benchmark", "compare") and _is_number(rate) and rate > 0:
         return Latency(LATENCY_P50, 1e3 / rate, "deadline")
@@ -189,8 +198,10 @@ def _is_number(value: Any) -> TypeGuard[int | float]:
 
 def accuracy(report: Report) -> Quantity | None:
     """Return the quantity that says how well the variants do their task; None when there is none."""
-    recorded = sorted((each for each in quantities(report) if each.section == RECORDED), key=lambda each: each.order)
-    known = (each for each in (SUCCESS, *recorded) if any(item and item.known for item in measured(report, each)))
+    recorded = sorted(
+        (each for each in quantities(report) if each.section == RECORDED_ACCURACY), key=lambda each: each.order
+    )
+    known = (each for each in (SUCCESS, *recorded) if any(item and item.known for item in measurements(report, each)))
     return next(known, None)
 
 

@@ -147,7 +147,7 @@ def sampled(report: Report) -> list[Sampled]:
 
 def _timed(row: Row) -> tuple[list[float], list[float]]:
     """Return the samples, and when each call began; no times unless all are known and time went on."""
-    samples, times = row.raw.get(series.LATENCY) or [], row.raw.get(series.STARTED) or []
+    samples, times = row.raw.get(series.LATENCY) or [], row.raw.get(series.START_TIMES) or []
     if len(times) != len(samples):
         return finite(samples), []
     kept = [time for time, sample in zip(times, samples, strict=True) if finite([sample])]

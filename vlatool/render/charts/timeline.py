@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vlatool.measures.series import READING, READING_TIMES, THROTTLED
+from vlatool.measures.series import READING, READING_TIMES, THROTTLE_TIMES
 from vlatool.measures.tables import TELEMETRY
 from vlatool.render._format import fixed, plain, significant, tick
 from vlatool.render._view import Latency
@@ -59,7 +59,7 @@ def _kind(gauge: Gauge) -> int:
 
 def throttled(report: Report) -> list[float]:
     """Return the moments at which throttling was seen."""
-    return sorted({moment for row in report.rows for moment in finite(row.raw.get(THROTTLED) or [])})
+    return sorted({moment for row in report.rows for moment in finite(row.raw.get(THROTTLE_TIMES) or [])})
 
 
 def over_time(report: Report, variants: Sequence[Sampled], aim: Latency, width: int) -> Canvas:

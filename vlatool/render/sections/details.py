@@ -11,8 +11,8 @@ from vlatool.render.document import Section, Table
 from vlatool.render.sections.parts import PARTS
 from vlatool.report import Report
 
-ELSEWHERE = {
-    *PARTS, names.UNMEASURED, names.UNDER, names.EPISODE, names.AGAINST_BY_TASK, names.AGAINST_BY_INSTRUCTION,
+OTHER_SECTIONS = {
+    *PARTS, names.MISSING_VALUES, names.UNDER, names.EPISODE, names.AGAINST_BY_TASK, names.AGAINST_BY_INSTRUCTION,
 }  # fmt: skip
 """What other sections draw."""
 
@@ -29,5 +29,5 @@ class Details:
 def tables(report: Report) -> list[Table]:
     """Return the tables, that of the telemetry first."""
     titles = dict.fromkeys((names.TELEMETRY, *(title for row in report.rows for title in row.details)))
-    shown = (title for title in titles if title not in ELSEWHERE and names.ROUNDS.part(title) is None)
+    shown = (title for title in titles if title not in OTHER_SECTIONS and names.ROUNDS.part(title) is None)
     return [table for title in shown if (table := records_table(report, title))]

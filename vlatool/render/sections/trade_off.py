@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from vlatool.measures import LESS, Quantity, named
+from vlatool.measures import Quantity, quantity_of
 from vlatool.measures.resources import FOOTPRINT
 from vlatool.render._format import full, label, number, plain, tick, unit
 from vlatool.render._format import quantity as with_unit
-from vlatool.render._view import accuracy, floor, latency, measured
+from vlatool.render._view import accuracy, floor, latency, measurements
 from vlatool.render.charts.scatter import Bound, Point, Scatter
 from vlatool.render.charts.svg import tinted
 from vlatool.render.document import Chart, Section
@@ -28,7 +28,7 @@ class TradeOff:
     def build(self, report: Report) -> Iterator[Section]:
         """Return the drawing when there are two points or more."""
         if plot := scatter(report):
-            caption = f"{'Down' if named(plot.points[0].y.name) in FOOTPRINT else 'Up'} {HELP}"
+            caption = f"{'Down' if quantity_of(plot.points[0].y.name) in FOOTPRINT else 'Up'} {HELP}"
             title = plot.title[:1].upper() + plot.title[1:]
             yield Section(title, (Chart(plot.draw, caption),), 60, "measured")
 
@@ -37,9 +37,9 @@ def upright(report: Report) -> Quantity | None:
     """Return the quantity that is drawn against latency: the accuracy, else memory or size."""
     if (quantity := accuracy(report)) is not None:
         return quantity
-    across = measured(report, latency(report).quantity)
+    across = measurements(report, latency(report).quantity)
     for quantity in FOOTPRINT:
-        pairs = zip(across, measured(report, quantity), strict=True)
+        pairs = zip(across, measurements(report, quantity), strict=True)
         if sum(x is not None and y is not None and x.known and y.known for x, y in pairs) > 1:
             return quantity
     return None
@@ -65,8 +65,8 @@ def scatter(report: Report) -> Scatter | None:
     if len(shown) < 2:
         return None
     x, y = shown[0].x, shown[0].y
-    up = named(y.name)
-    least, smaller = floor(report, up), up.better == LESS
+    up = quantity_of(y.name)
+    least, smaller = floor(report, up), up.better == "less"
     error = smaller and up not in FOOTPRINT
     better = "better is up: smaller" if error else unit(y)
     return Scatter(
