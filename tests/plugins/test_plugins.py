@@ -29,6 +29,8 @@ absent = acme_robotics.no_such_file
 
 [vlatool.engines]
 acme = acme_robotics.engine
+openvino-provider = acme_robotics.openvino_provider
+ggml-provider = acme_robotics.ggml_provider
 absent = acme_robotics.no_such_engine
 
 [vlatool.sources]
@@ -49,6 +51,10 @@ acme = acme_robotics.tail
 
 [vlatool.videos]
 strip = acme_robotics.strip
+
+[vlatool.control]
+every-step = acme_robotics.every_step
+halved = acme_robotics.halved
 """
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -101,7 +107,7 @@ def test_doctor_says_what_it_adds(run: Run):
         assert added in finding
     for broken in ("'absent' (vlatool.quantize)", "'absent' (vlatool.engines)", "'a-first' (vlatool.sources)"):
         assert f"{broken}, cannot be imported" in finding
-    assert told["engine acme_robotics"]["finding"] == "acme-robotics 1.2: Acme"
+    assert told["engine acme_robotics"]["finding"] == "acme-robotics 1.2: Azure, CPU"
 
 
 def test_its_profile_is_found_by_name(run: Run):
@@ -114,8 +120,9 @@ def test_its_method_its_source_and_its_engine_run(run: Run, onnx_file: Path, tmp
     ok(run("quantize", "rounded", str(tmp_path / "tiny.acme"), "-o", str(tmp_path / "out"), "--bits", "8"))
     made = json.loads((tmp_path / "out/manifest.json").read_text())["made_by"]
     assert (made["stage"], made["options"]) == ("quantize.rounded", {"bits": 8})
-    told = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20"))
-    assert "latency_p50" in told or "p50" in told
+    done = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20", "--json"))
+    (row,) = json.loads(done)["rows"]
+    assert row["details"]["engine"][0]["providers"].startswith("AzureExecutionProvider {}; CPUExecutionProvider {}; ")
 
 
 def test_its_format_of_videos_is_found_by_the_suffix(run: Run, float_bundle: Bundle, policy_dir: Path, tmp_path: Path):
@@ -124,6 +131,31 @@ def test_its_format_of_videos_is_found_by_the_suffix(run: Run, float_bundle: Bun
     assert np.load(tmp_path / "worst.strip").shape[0] == 6, "of the reset, and after each of five steps"
     ok(run(*line, "--video", str(tmp_path / "worst.strip"), "--force"))
     assert "known: gif, mp4, strip" in run(*line, "--video", str(tmp_path / "worst.avi")).stderr
+
+
+def test_its_controller_and_its_wrapper_of_policies_play_episodes(run: Run, float_bundle: Bundle, policy_dir: Path):
+    line = ["evaluate", "closed-loop", str(float_bundle.path), "--policy", str(policy_dir), "--episodes", "2"]
+    told = ok(run(*line, "--controller", "every-step,halved")).replace("\n", " ")
+    assert "with the controller every-step,halved" in told
+    assert "did you mean 'every_step'" in run(*line, "--controller", "every-stop").stderr
+    late = run(*line, "--controller", "every-step", "--latency-in-the-loop")
+    assert (late.returncode, "every-step waits for each inference" in late.stderr) == (2, True)
+
+
+def test_its_controller_acts_as_it_says(run: Run, float_bundle: Bundle):
+    code = (
+        "from vlatool.episodes.play import EpisodesJob, Worker; from vlatool.data import observations_for; "
+        "from vlatool.bundle.bundle import Bundle; "
+        f"path = {str(float_bundle.path)!r}; worker = Worker(path, ''); "
+        "seen = observations_for(Bundle.open(path), 1)[0]; "
+        "made = [worker.controller(EpisodesJob('', '', '', (), controller=names)) for names in "
+        "[(), ('halved',), ('every-step',), ('every-step', 'halved')]]; "
+        "print([[each.act(seen).tolist() for _ in range(2)] for each in made])"
+    )
+    plain, halved, first, both = json.loads(ok(run(code=code)))
+    np.testing.assert_array_equal(halved, np.array(plain) / 2)
+    np.testing.assert_array_equal(first, [plain[0]] * 2)
+    np.testing.assert_array_equal(both, [halved[0]] * 2)
 
 
 def test_optimize_chooses_its_method(run: Run, policy_dir: Path, tmp_path: Path):
@@ -143,6 +175,24 @@ def test_a_search_begins_with_its_method_and_its_engines_plans(run: Run):
     found = ok(run(code=code))
     assert "'rounded'" in found
     assert "'acme_float16'" in found
+    assert "acme_int8" not in found
+
+
+def test_its_engine_knows_the_board_that_a_search_is_for(run: Run):
+    code = "from vlatool.hardware.profile import load_profile; from vlatool.optimize.search import variants_for; "
+    assert "acme_int8" in ok(run(code=f"{code}print(*variants_for(load_profile('acme-board'), True))"))
+
+
+def test_what_its_engine_is_built_against_is_in_keys_and_records(run: Run, float_bundle: Bundle):
+    code = (
+        "from vlatool.quantize.float16 import Float16; from vlatool.runtime import engine; "
+        "keys = Float16().key('a'); print(engine.identities()); "
+        "engine.engine_class('acme').providers = (('CPUExecutionProvider', {}),); print(keys == Float16().key('a'))"
+    )
+    identity, same = ok(run(code=code)).splitlines()
+    assert "'acme': 'AzureExecutionProvider {}; CPUExecutionProvider {}; onnxruntime " in identity
+    assert "acme-robotics 1.2" in identity
+    assert same == "False"
 
 
 def test_its_section_is_in_every_format_of_a_report(run: Run):
@@ -214,5 +264,5 @@ def test_it_replaces_nothing_of_vlatools_own(run: Run):
 
 def test_the_guide_shows_these_files():
     guide = (ROOT / "docs/guides/add-a-method.md").read_text()
-    for name in ("rounded", "engine", "source", "section", "tail"):
+    for name in ("rounded", "openvino_provider", "ggml_provider", "source", "section", "tail", "every_step", "halved"):
         assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide

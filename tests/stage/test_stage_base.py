@@ -15,6 +15,7 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.machine import instruction_sets
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, Measure, Stage, Transform, source_of
@@ -133,6 +134,16 @@ def test_the_key_follows_what_openvino_computes_in_and_that_of_an_export_does_no
         monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", told)
         keys.append([stage.key("a") for stage in stages])
     assert [len(set(each)) for each in zip(*keys, strict=True)] == [3, 3, 3, 1]
+
+
+def test_the_key_follows_what_an_engine_beside_the_processor_is_built_against(monkeypatch):
+    stages, drivers = (StaticInt8(), Latency(), ExportOnnx()), ("", "driver 1", "driver 1", "driver 2")
+    keys: list[list[str]] = []
+    for driver in drivers:
+        monkeypatch.setattr(OpenvinoSession, "identity", classmethod(lambda _, found=driver: found))
+        keys.append([stage.key("a") for stage in stages])
+    assert keys[1] == keys[2]
+    assert [len(set(each)) for each in zip(*keys, strict=True)] == [3, 3, 1]
 
 
 def test_the_key_follows_the_content_of_files_and_not_their_age(tmp_path: Path):

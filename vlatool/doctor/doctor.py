@@ -79,7 +79,8 @@ def diagnose(root: Path = host.ROOT) -> list[Check]:
         >>> [check.name for check in diagnose()][0]
         'python'
     """
-    installed = host.versions({*chain(*EXTRAS.values(), *_substitutes().values())})
+    engines_of = (library.distributions() for library in usable_engines().values())
+    installed = host.versions({*chain(*EXTRAS.values(), *engines_of)})
     return [
         python_version(),
         *engines(installed, host.board(root), lambda library: library.execution_providers()),
@@ -112,14 +113,16 @@ def engines(
 ) -> Iterator[Check]:
     """The inference libraries with their version and, where they say so, what they run on."""
     jetson = bool(board and "jetson" in board.lower())
-    for library in usable_engines().values():
-        title = f"engine {library.package}"
-        package = next((name for name in (library.package, *library.substitutes) if name in installed), None)
+    packages: set[str] = set()
+    for name, library in usable_engines().items():
+        title = f"engine {name if library.package in packages else library.package}"
+        packages.add(library.package)
+        package = next((name for name in library.distributions() if name in installed), None)
         if package is not None:
             yield _engine(title, f"{package} {installed[package]}", library, jetson, ask)
             continue
         advice = f" ({library.advice})" if library.advice else ""
-        fix = "" if jetson and advice else f"{install(library.extra)}{advice}"
+        fix = "" if jetson and advice else f"{library.installation()}{advice}"
         yield Check(title, "missing", "not installed", fix)
 
 
@@ -129,7 +132,7 @@ def _engine(
     try:
         providers = ask(library)
     except MissingExtra as error:
-        return Check(title, "warn", f"{words} is installed, but cannot be imported", error.fix)
+        return Check(title, "warn", f"{words} is installed, but cannot be used: {error.message}", error.fix)
     except Exception as error:  # the seam: a library, or another package's engine, may raise anything
         return Check(title, "warn", f"{words} fails: {type(error).__name__}: {message_of(error)}", "update it")
     if providers is None:
@@ -144,7 +147,9 @@ def _engine(
 
 def arithmetic() -> Iterator[Check]:
     """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
-    for name in usable_engines():
+    for name, library in usable_engines().items():
+        if not library.is_installed():
+            continue
         try:
             products = products_apart(name)
         except GraphError as error:  # the engine ended its process, or hangs
@@ -157,7 +162,7 @@ def arithmetic() -> Iterator[Check]:
             yield Check(f"int8 {name}", "ok", finding)
             continue
         fix = COMPARE_INT8
-        if name != DEFAULT_ENGINE:
+        if name != DEFAULT_ENGINE and library.layouts:
             fix = "vlatool quantize static-int8 SOURCE -o BUNDLE --layout ort: ONNX Runtime is set to be exact here; "
             fix += f"or --layout {name} --reduce-range"
         yield Check(f"int8 {name}", "warn", finding, fix)
@@ -194,7 +199,10 @@ def plugins() -> Iterator[Check]:
 
 def _substitutes() -> dict[str, tuple[str, ...]]:
     """Package of an engine -> the distributions of other names that bring it."""
-    return {library.package: library.substitutes for library in usable_engines().values()}
+    known: dict[str, tuple[str, ...]] = {}
+    for library in usable_engines().values():
+        known[library.package] = (*known.get(library.package, ()), *library.substitutes)
+    return known
 
 
 def instruction_set(features: Sequence[str] | None) -> Check:

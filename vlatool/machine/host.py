@@ -165,6 +165,19 @@ def board(root: Path = ROOT) -> str | None:
     return " ".join(part for part in parts if part) or None
 
 
+def gpus(root: Path = ROOT) -> tuple[str, ...]:
+    """Models of NVIDIA's graphics cards, as their driver names them."""
+    files = sorted(path.relative_to(root) for path in (root / "proc/driver/nvidia/gpus").glob("*/information"))
+    models = (re.search(r"^Model:\s*(.+)$", read_text(root, str(path)) or "", re.MULTILINE) for path in files)
+    return tuple(match[1] for match in models if match)
+
+
+def gpu_driver(root: Path = ROOT) -> str | None:
+    """Version of NVIDIA's driver in the kernel; None when it is not loaded."""
+    match = re.search(r"^NVRM version:.*?\s(\d+\.\d[\d.]*)\s", read_text(root, "proc/driver/nvidia/version") or "")
+    return f"NVIDIA driver {match[1]}" if match else None
+
+
 def online_cores(root: Path = ROOT) -> int | None:
     """Logical cores that are on."""
     return _count(read_text(root, "sys/devices/system/cpu/online"))

@@ -193,7 +193,9 @@ def _engines(policy: Policy) -> Iterator[GraphEngine]:
             graph=name,
             engine=policy.engine,
             version=session.version() if hasattr(session, "version") else "",
-            providers=", ".join(getattr(session, "providers", [])) or "CPU",
+            providers=getattr(session, "identity", str)()
+            or ", ".join(dict(getattr(session, "providers", ())))
+            or "CPU",
             computes_in=getattr(session, "precision", graph.compute or "float32"),
             macs_in=", ".join(f"{kind} {share:.1%}" for kind, share in shares),
         )

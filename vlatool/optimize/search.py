@@ -19,7 +19,6 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,14 +29,14 @@ from vlatool.data import recorded_observations
 from vlatool.errors import NOT_MADE, GraphError, PluginError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
-from vlatool.machine.host import isa
 from vlatool.machine.instruction_sets import board_set
+from vlatool.machine.target import target_of
 from vlatool.measures.latency import SPEEDUP
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Limits, StageList
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, installed
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, is_installed
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context
 from vlatool.stage.build import stage_class
@@ -322,9 +321,10 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
     known = engine_names()
     board = known if profile is None else [name for name in known if name in profile.engines]
     variants: dict[str, StageList] = {}
+    target = target_of(profile)
     for name in board:
-        if installed(name):
-            variants |= engine_class(name).variants(partial(processor_has, profile), calibrated)
+        if is_installed(name):
+            variants |= engine_class(name).variants(target, calibrated)
     for name in registry.names("quantize"):
         try:
             method = stage_class(f"quantize.{name}")
@@ -340,10 +340,3 @@ def graphs_of(bundle: Bundle) -> str:
     files = sorted(f"{path} {record.sha256}" for path, record in manifest.files.items() if path.startswith("graphs/"))
     computes = sorted(f"{name} {graph.compute}" for name, graph in manifest.graphs.items())
     return "\n".join([manifest.engine, *computes, *files])
-
-
-def processor_has(profile: Profile | None, *features: str) -> bool:
-    """Say whether the board's processor (this host's, for None) has one of these features."""
-    if profile is not None:
-        return any(name in features for unit in profile.units.values() for name in unit.isa)
-    return any(name in features for name in isa() or [])

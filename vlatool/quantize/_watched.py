@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Encoded, Moment
+from vlatool.data import Moment
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.graph.onnx_graph import OnnxGraph
@@ -15,7 +15,6 @@ from vlatool.machine.risky import risky
 from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context
@@ -56,17 +55,6 @@ class Watcher:
         return {name: values[name] for name in self._outputs}
 
 
-class _Passing(ObservationEncoder):
-    """An encoder that hands on what is encoded already."""
-
-    def __init__(self, encode: ObservationEncoder) -> None:
-        self.names, self._encode = encode.names, encode
-
-    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Encode an observation, as ``ObservationEncoder`` does, where that is to be done."""
-        return observation if isinstance(observation, Encoded) else self._encode(observation)
-
-
 def run_watched(
     bundle: Bundle,
     watchers: Mapping[str, Watcher],
@@ -92,7 +80,6 @@ def run_watched(
     graphs = bundle.manifest.graphs
     others = {name: open_graph(bundle, graphs[name], engine_class(), 1) for name in graphs if name not in watchers}
     policy = Policy(bundle, Program(bundle.manifest.program, {**others, **watchers}, seed=0), DEFAULT_ENGINE)
-    policy.encode = _Passing(policy.encode)
     for place, each in enumerate(observations):
         moment = each if isinstance(each, Moment) else Moment(each, numbers[place] if numbers else place)
         number = moment.number

@@ -19,6 +19,7 @@ from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
 from vlatool.rebuild.differences import Compared, compare_bundles
+from vlatool.runtime.engine import identities
 from vlatool.sources import source_stage
 from vlatool.stage.base import Context, Transform, installed_version, source_of
 from vlatool.stage.build import build_stage, stage_class
@@ -155,11 +156,12 @@ def version_changes(entries: Iterable[Entry]) -> dict[str, tuple[str, str]]:
     A package that stages recorded in several versions is named with the first that is not installed.
     """
     changed: dict[str, tuple[str, str]] = {}
+    built = identities()
     for entry in entries:
         installed = {name: installed_version(name) or "not installed" for name in entry.get("versions", {})}
         recorded = {"vlatool": entry.get("vlatool", VERSION), **entry.get("versions", {})}
         for name, version in recorded.items():
-            now = {"vlatool": VERSION, **installed}[name]
+            now = {"vlatool": VERSION, **installed, **built}[name]
             if version != now:
                 changed.setdefault(name, (str(version), now))
     return changed

@@ -23,9 +23,10 @@ class Session(Protocol):
     """One open graph on one engine."""
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run the graph: input name -> array, output name -> array.
+        """Run the graph: input name -> array, output name -> array, both of NumPy and in the memory of the host.
 
-        A session with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
+        In whose memory they are meanwhile is the session's affair; later runs do not change what it gave. A session
+        with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
         """
 
 

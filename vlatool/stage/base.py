@@ -23,6 +23,7 @@ from vlatool.files.work import Store
 from vlatool.machine.instruction_sets import computed_in
 from vlatool.machine.version import VERSION
 from vlatool.report import Report
+from vlatool.runtime.engine import identities
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str, float | None], None]
 BEFORE_ENGINES = ("sources", "export")
-"""Kinds of stages whose output is the same whatever OpenVINO computes in."""
+"""Kinds of stages whose output is the same whatever an engine computes in."""
 UNFINISHED = "define it; docs/guides/add-a-method.md shows a complete stage"
 RECORD = 2
 """Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
@@ -165,13 +166,13 @@ class Stage(Numeric):
     def key(self, source_hash: str) -> str:
         """Return the cache key of this stage's output: 16 hex digits.
 
-        What OpenVINO answers and how fast it is depends on the instruction set that it computes in, and a bundle
-        records how far its engine is from its graphs.
+        What OpenVINO answers and how fast it is depends on the instruction set that it computes in, what other engines
+        answer depends on what they say themselves, and a bundle records how far its engine is from its graphs.
         """
         versions = {package: installed_version(package) for package in self.used_packages()}
         files = [_content(path) for path in self.inputs()]
         content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, VERSION, RECORD]
-        content += [] if self.name().partition(".")[0] in BEFORE_ENGINES else [computed_in()]
+        content += [] if self.kind() in BEFORE_ENGINES else [computed_in(), *identities().items()]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 

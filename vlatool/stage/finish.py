@@ -19,11 +19,12 @@ from vlatool.files.kept import carry
 from vlatool.machine.risky import risky
 from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machine
 from vlatool.runtime.contract import OF_NOT_FINITE, OF_THE_GRAPHS, OF_THE_POLICY, off_the_robot
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, identities
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
+from vlatool.runtime.interface import Action
 from vlatool.runtime.observation import not_finite_text
-from vlatool.runtime.policy import Action, Policy, relative_error
+from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program, draw
 
 GOLDEN = "golden/golden.npz"
@@ -136,8 +137,8 @@ def finish(
     Raises:
         GraphError: when the engine refuses a graph or gives an action that is not finite.
     """
-    changed: dict[str, Any] = {"parent": source.hash, "made_by": dict(made_by), "graphs": dict(graphs), "accuracy": {}}
-    changed.update(changes or {})
+    changed: dict[str, Any] = {"parent": source.hash, "graphs": dict(graphs), "accuracy": {}, **(changes or {})}
+    changed["made_by"] = _with_engine(made_by, changed.get("engine", source.manifest.engine))
     origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
     unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
     draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
@@ -157,6 +158,12 @@ def finish(
         bundle.manifest, findings=(*kept, *new), golden_tolerance=_tolerance(golden.difference, bundle, redrawn),
         golden_chunk_tolerance=0.0 if discrete else _tolerance(golden.of_chunk, bundle, redrawn),
     ))  # fmt: skip
+
+
+def _with_engine(made_by: Mapping[str, Any], engine: str) -> dict[str, Any]:
+    """Return ``made_by`` with the identity of the bundle's engine among the versions, where it has one."""
+    built = identities().get(engine)
+    return {**made_by, "versions": {**made_by.get("versions", {}), engine: built}} if built else dict(made_by)
 
 
 def _tolerance(seen: float, bundle: Bundle, redrawn: bool) -> float:

@@ -21,6 +21,7 @@ from vlatool.machine.host import MAX_CPU_ISA, OLDER_MAX_CPU_ISA, architecture, v
 from vlatool.machine.instruction_sets import computed_in
 from vlatool.machine.processes import SINGLE
 from vlatool.machine.version import VERSION
+from vlatool.runtime.engine import identities
 from vlatool.user_code import trust
 from vlatool.user_code.children import Apart, Killed
 from vlatool.workers import Work
@@ -65,7 +66,7 @@ def this_machine() -> dict[str, str]:
     """Return what may differ between machines and change what is computed: name -> version."""
     installed = versions(MATTERS)
     about = {"vlatool": VERSION, "Python": platform.python_version(), "processor": str(architecture())}
-    return {**about, "instruction set": computed_in(), **installed}
+    return {**about, "instruction set": computed_in(), **installed, **identities()}
 
 
 class Seat:

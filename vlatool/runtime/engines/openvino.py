@@ -7,9 +7,9 @@ import ctypes
 import io
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Sta
 from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, precision
 from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
+
+if TYPE_CHECKING:
+    from vlatool.machine.target import Target
 
 FEEDS = "give every input of the graph, of the shape and type that the graph declares"
 DEVICE = "CPU"
@@ -213,19 +216,21 @@ class OpenvinoSession(Engine):
             return arithmetic.UNKNOWN
 
     @classmethod
-    def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
+    def variants(cls, target: Target, calibrated: bool) -> dict[str, Stages]:
         """Return bfloat16 where the processor has it, and int8 with what is not quantized in that.
 
         With matrix units (AMX) products are written as convolutions, too, as ``quantize._conv1x1`` says; where int8
         products saturate, weights are such that none does.
         """
         plans: dict[str, Stages] = {}
-        forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if has(*AMX) else {"": {}}
-        bfloat16 = has(*BF16)
+        forms: dict[str, dict[str, Any]] = (
+            {"": {}, "_convolutions": {"convolutions": True}} if target.has(*AMX) else {"": {}}
+        )
+        bfloat16 = target.has(*BF16)
         for form, how in forms.items() if bfloat16 else ():
             plans[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
         rest: dict[str, Any] = {"compute": "bfloat16"} if bfloat16 else {}
-        rest |= {"reduce_range": True} if has("avx2") and not has(*VNNI) else {}
+        rest |= {"reduce_range": True} if target.has("avx2") and not target.has(*VNNI) else {}
         for name, options in INT8_VARIANTS.items() if calibrated else ():
             for form, how in forms.items() if name == "int8" else list(forms.items())[-1:]:
                 stage = {"layout": "openvino", **rest, **how, **options}
