@@ -71,23 +71,11 @@ def stages_page() -> str:
 def gate_page() -> str:
     """Return a section for each claim of a gate file."""
     top = "What `vlatool gate` examines ([guide](../guides/gate.md)): `schema: 1`, `baseline: PATH`, and these claims;"
-    off = [
-        f"`{name}`" for name, field in config.Gate.model_fields.items() if field.default is None and name != "baseline"
-    ]
+    classes = config.claim_classes()
+    off = [f"`{name}`" for name, claim in classes.items() if not claim.by_default]
     parts = [f"# gate.yaml\n\n{top}\na claim that is null is not examined. Null by default: {', '.join(off)}.\n"]
-    for claim in (
-        config.LatencyClaim,
-        config.AccuracyClaim,
-        config.AnswersClaim,
-        config.GrowthClaim,
-        config.DeadlineClaim,
-        config.MotionClaim,
-        config.TaskTimeClaim,
-        config.WorstTaskClaim,
-        config.DisturbedClaim,
-    ):
-        names = [name for name, field in config.Gate.model_fields.items() if claim.__name__ in str(field.annotation)]
-        parts.append(f"## {', '.join(names)}\n\n{inspect.cleandoc(claim.__doc__ or '')}\n\n{_options(claim)}")
+    parts += [f"## {name}\n\n{inspect.cleandoc(claim.__doc__ or '')}\n\n{_options(claim)}"
+              for name, claim in classes.items()]  # fmt: skip
     meaning = config.Gate.model_fields["accept"].description
     parts.append(f"## accept\n\n`accept: [engine-difference]`: {meaning}; see `vlatool inspect`. None by default.\n")
     return "\n".join(parts)

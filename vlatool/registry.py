@@ -23,7 +23,8 @@ PACKAGES = {
     "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
     "sections": "vlatool.render.sections", "losses": "vlatool.training.losses",
     "hints": "vlatool.training.hints", "motion": "vlatool.motion.metrics",
-    "videos": "vlatool.render.videos", "control": "vlatool.runtime.control"}  # fmt: skip
+    "videos": "vlatool.render.videos", "control": "vlatool.runtime.control",
+    "claims": "vlatool.gate.claims"}  # fmt: skip
 """Kind -> the package that holds its files, where that has another name."""
 NOUNS = {
     "quantize": "quantization method", "prune": "pruning method", "distill": "distillation method",

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from vlatool.accuracy.credibility import SKILL, VARIATION, above, credibility
+from vlatool.accuracy.credibility import SKILL, VARIATION, credibility, lower_bound
 from vlatool.report import Measurement, Row
 
 
@@ -69,7 +69,7 @@ def test_the_sentence_says_both_shares_and_few_episodes_their_remedy():
 
 def test_the_bound_of_the_difference_is_that_of_newcombes_example():
     """56/70 against 48/80: 0.2 with 0.0524 to 0.3339 (Newcombe 1998, table II, method 10)."""
-    assert above(share("a", 56 / 70, 70), share("b", 48 / 80, 80)) == pytest.approx(0.0524, abs=5e-5)
+    assert lower_bound(share("a", 56 / 70, 70), share("b", 48 / 80, 80)) == pytest.approx(0.0524, abs=5e-5)
 
 
 @pytest.mark.parametrize(

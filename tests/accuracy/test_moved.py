@@ -104,7 +104,7 @@ def test_ratios_may_be_asked_for_with_another_confidence():
     base = [outcome("a", seed, True, 10, jerk=1.0 + seed % 3, path_length=1.0) for seed in range(60)]
     own = [outcome("a", seed, True, 10, jerk=1.2 + seed % 4, path_length=1.0) for seed in range(60)]
     baseline, row = rows(base, own)
-    narrow, wide = (ratios(baseline, row, ("jerk",), confidence)["jerk"] for confidence in (0.5, 0.999))
+    narrow, wide = (ratios(baseline, row, ("jerk",), confidence)["jerk"].measured for confidence in (0.5, 0.999))
     assert set(ratios(baseline, row, ("jerk",))) == {"jerk"}
     assert wide.low < narrow.low < narrow.high < wide.high
     assert wide.confidence == 0.999

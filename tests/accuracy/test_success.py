@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlatool.accuracy.success import Success, told
+from vlatool.accuracy.success import Success, reported_success
 from vlatool.errors import DataError
 
 
@@ -25,9 +25,9 @@ def episode(*infos: Any) -> bool:
     ids=repr,
 )
 def test_both_keys_and_all_that_means_true_are_known(key: str, value: Any) -> None:
-    assert told({key: value}) is True
+    assert reported_success({key: value}) is True
     opposite = type(value)([0]) if isinstance(value, list | tuple) else value * 0
-    assert told({key: opposite}) is False
+    assert reported_success({key: opposite}) is False
 
 
 def test_what_is_told_last_counts() -> None:
@@ -37,13 +37,13 @@ def test_what_is_told_last_counts() -> None:
 
 
 def test_success_goes_before_is_success() -> None:
-    assert told({"success": False, "is_success": True}) is False
-    assert told({"success": None, "is_success": True}) is True
+    assert reported_success({"success": False, "is_success": True}) is False
+    assert reported_success({"success": None, "is_success": True}) is True
 
 
 @pytest.mark.parametrize("final", [{"is_success": True}, [{"is_success": True}], np.array([{"is_success": True}])])
 def test_a_vector_environment_of_one_tells_it_in_final_info(final: Any) -> None:
-    assert told({"final_info": final}) is True
+    assert reported_success({"final_info": final}) is True
 
 
 @pytest.mark.parametrize("info", [None, {}, [], {"goal_reached": True}, {"final_info": None}, {"final_info": {}}])
@@ -56,4 +56,4 @@ def test_what_tells_nothing_is_an_error_that_names_the_keys(info: Any) -> None:
 @pytest.mark.parametrize("value", ["no", "True", 0.7, float("nan"), np.array([True, False]), {}, object(), 2])
 def test_what_is_neither_true_nor_false_is_refused(value: Any) -> None:
     with pytest.raises(DataError, match=r"info\['success'\] is .*; allowed: true or false"):
-        told({"success": value})
+        reported_success({"success": value})

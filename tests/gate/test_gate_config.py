@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import RecipeError
-from vlatool.gate.config import Gate, LatencyClaim, read_gate
+from vlatool.gate.claims.latency import Latency
+from vlatool.gate.config import Gate, read_gate
 
 
 def written(folder: Path, text: str) -> Path:
@@ -17,7 +18,7 @@ def written(folder: Path, text: str) -> Path:
 def test_the_defaults_claim_everything_but_a_deadline(tmp_path: Path) -> None:
     gate = read_gate(written(tmp_path, "{}"))
     assert gate == Gate()
-    assert gate.latency == LatencyClaim()
+    assert gate.latency == Latency()
     assert gate.latency.margin == 0.05
     assert gate.latency.interim_analyses == (10, 20, 40)
     assert gate.accuracy

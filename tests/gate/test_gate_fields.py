@@ -17,7 +17,8 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import VlatoolError
 from vlatool.gate import run as run_gate_module
-from vlatool.gate.config import AccuracyClaim, Gate
+from vlatool.gate.claims.accuracy import Accuracy
+from vlatool.gate.config import Gate
 from vlatool.gate.run import run_gate
 from vlatool.gate.same import check
 from vlatool.measurement.agreement import run_agreement
@@ -30,8 +31,8 @@ from gate_graphs import wrong_when
 
 CLASSES = (Manifest, Graph, FileRecord, PolicySpec, TensorSpec, ProgramStep)
 TRUST = Path(__file__).parents[2] / "docs/concepts/trust.md"
-GATE = Gate(latency=None, memory=None, answers=None, accuracy=AccuracyClaim(max_drop=0.5))
-PLAYED = Gate(accuracy=AccuracyClaim(episodes=4))
+GATE = Gate(latency=None, memory=None, answers=None, accuracy=Accuracy(max_drop=0.5))
+PLAYED = Gate(accuracy=Accuracy(episodes=4))
 
 Change = Callable[[Manifest], Manifest]
 

@@ -33,7 +33,9 @@ def test_recordings_are_the_baselines_and_the_gates(float_bundle: Bundle, policy
     assert [len(each) for each in Inputs(float_bundle, None, 0).recordings] == [16, 24]
     inputs = Inputs(float_bundle, policy_dir / "calibration.npz", 0)
     assert [len(each) for each in inputs.recordings] == [24, 16, 24]
-    assert inputs.told().startswith("observations are drawn from 64 recorded ones and the vocabulary with the seed 0; ")
+    assert inputs.description().startswith(
+        "observations are drawn from 64 recorded ones and the vocabulary with the seed 0; "
+    )
 
 
 def test_without_recordings_the_spec_alone_is_drawn_from(float_bundle: Bundle, tmp_path: Path, resealed) -> None:
@@ -41,7 +43,7 @@ def test_without_recordings_the_spec_alone_is_drawn_from(float_bundle: Bundle, t
     shutil.rmtree(bare.path / "data")
     inputs = Inputs(resealed(bare), None, 0)
     assert {each.kind for each in inputs.draw(20, TIMING)} == {"drawn"}
-    assert "from the spec alone: none is recorded" in inputs.told()
+    assert "from the spec alone: none is recorded" in inputs.description()
 
 
 def test_large_observations_are_fewer(float_bundle: Bundle, monkeypatch) -> None:

@@ -11,7 +11,11 @@ from vlatool.bundle.bundle import DIGEST, Bundle, digest_of
 from vlatool.errors import BundleError, DataError, GraphError
 from vlatool.gate import run as run_gate_module
 from vlatool.gate import timed
-from vlatool.gate.config import DeadlineClaim, Gate, GrowthClaim, LatencyClaim
+from vlatool.gate.claims.deadline import Deadline
+from vlatool.gate.claims.latency import Latency
+from vlatool.gate.claims.memory import Memory
+from vlatool.gate.claims.size import Size
+from vlatool.gate.config import Gate
 from vlatool.gate.run import run_gate
 from vlatool.measurement.agreement import run_agreement
 from vlatool.measurement.pairs import PairJob, Pairs
@@ -19,7 +23,7 @@ from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.telemetry._reading import THROTTLE, Reader, gauge
 
-QUICK = Gate(memory=None, latency=LatencyClaim(interim_analyses=(10,)))
+QUICK = Gate(memory=None, latency=Latency(interim_analyses=(10,)))
 
 
 @pytest.fixture
@@ -57,7 +61,7 @@ def test_the_worst_claim_decides(float_bundle: Bundle, as_fast, slowdown: float,
 
 def test_the_summary_begins_with_what_failed(float_bundle: Bundle, int8_bundle: Bundle, as_fast) -> None:
     as_fast(0.5)
-    gate = QUICK.model_copy(update={"size": GrowthClaim(margin=0), "accuracy": None, "memory": GrowthClaim(margin=9)})
+    gate = QUICK.model_copy(update={"size": Size(margin=0), "accuracy": None, "memory": Memory(margin=9)})
     report = run_gate(float_bundle, int8_bundle, gate, Context())
     assert report.summary[0] == "tiny does not keep to: size, latency."
     assert [line.split(":")[:2] for line in report.summary[1:-1]] == [
@@ -70,7 +74,7 @@ def test_the_summary_begins_with_what_failed(float_bundle: Bundle, int8_bundle: 
 
 def test_every_process_has_its_own_seed_and_both_bundles(float_bundle: Bundle, int8_bundle: Bundle, as_fast) -> None:
     jobs = as_fast(0.0)
-    claim = LatencyClaim(interim_analyses=(10,), pairs=33, threads=2, warmup=3, seconds=4)
+    claim = Latency(interim_analyses=(10,), pairs=33, threads=2, warmup=3, seconds=4)
     run_gate(int8_bundle, float_bundle, QUICK.model_copy(update={"latency": claim}), Context(), seed=7)
     assert [job.seed for job in jobs] == list(range(7, 17))
     job = jobs[0]
@@ -80,7 +84,7 @@ def test_every_process_has_its_own_seed_and_both_bundles(float_bundle: Bundle, i
 
 def test_a_deadline_needs_no_claim_about_the_median(float_bundle: Bundle, as_fast) -> None:
     as_fast(0.0)
-    gate = Gate(latency=None, accuracy=None, memory=None, size=None, deadline=DeadlineClaim(ms=3, percent=50))
+    gate = Gate(latency=None, accuracy=None, memory=None, size=None, deadline=Deadline(ms=3, percent=50))
     report = run_gate(float_bundle, float_bundle, gate, Context())
     assert report.verdict == "pass"
     assert len(report.rows[1].raw["latency_ms"]) >= 10 * 80, "ten processes at least"
@@ -88,7 +92,7 @@ def test_a_deadline_needs_no_claim_about_the_median(float_bundle: Bundle, as_fas
 
 def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
     """Ten processes, each with the same bundle twice; no verdict is asked for, for this machine may be busy."""
-    gate = Gate(latency=LatencyClaim(interim_analyses=(10,), pairs=30, margin=1.0), memory=GrowthClaim(margin=1.0))
+    gate = Gate(latency=Latency(interim_analyses=(10,), pairs=30, margin=1.0), memory=Memory(margin=1.0))
     report = run_gate(float_bundle, float_bundle, gate, Context())
     measured = {each.name: each for each in report.rows[1].measurements}
     assert {each.name for each in report.rows[0].measurements} == {
@@ -105,10 +109,10 @@ def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
 @pytest.mark.parametrize("claim", ["memory", "latency"])
 def test_a_process_that_hangs_ends_the_gate(float_bundle: Bundle, claim: str) -> None:
     gate = Gate(
-        memory=GrowthClaim() if claim == "memory" else None,
+        memory=Memory() if claim == "memory" else None,
         accuracy=None,
         size=None,
-        latency=LatencyClaim(timeout=0.05),
+        latency=Latency(timeout=0.05),
     )
     with pytest.raises(GraphError, match=r"no result after 0\.05 s, so the process was ended") as caught:
         run_gate(float_bundle, float_bundle, gate, Context())

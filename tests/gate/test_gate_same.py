@@ -11,10 +11,11 @@ import pytest
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import BundleError, DataError, GraphError
-from vlatool.gate.config import AccuracyClaim, Gate
+from vlatool.gate.claims.accuracy import Accuracy
+from vlatool.gate.config import Gate
 from vlatool.gate.same import check
 
-GATE = Gate(accuracy=AccuracyClaim(episodes=1))
+GATE = Gate(accuracy=Accuracy(episodes=1))
 
 
 def changed(bundle: Bundle, **fields) -> Bundle:

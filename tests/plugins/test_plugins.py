@@ -49,6 +49,10 @@ acme = acme_robotics.section
 [vlatool.measures]
 acme = acme_robotics.tail
 
+[vlatool.claims]
+bounded = acme_robotics.claim
+missing = acme_robotics.no_such_claim
+
 [vlatool.videos]
 strip = acme_robotics.strip
 
@@ -223,6 +227,52 @@ def test_its_measure_is_in_the_report_the_comparison_and_the_schema(run: Run, fl
     assert schema["measures"]["acme_tail"] == known
 
 
+@pytest.mark.parametrize(
+    ("options", "code", "found"),
+    [
+        ({"bound": 1000, "max_share": 0.6}, 0, "pass: 0.0% of 16 actions are larger than 1000 (0.0% to "),
+        ({"bound": 0, "max_share": 0.4}, 1, "fail: 100.0% of 16 actions are larger than 0 ("),
+        ({"bound": 1000, "max_share": 0.01}, 5, "inconclusive: 0.0% of 16 actions are larger than 1000 ("),
+    ],
+)
+def test_its_gate_claim_decides(
+    run: Run, float_bundle: Bundle, tmp_path: Path, options: dict[str, float], code: int, found: str
+):
+    done = run(*gated(float_bundle, tmp_path, bounded=options), "--json", "--junit", str(tmp_path / "gate.xml"))
+    assert done.returncode == code, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    (line,) = report["rows"][1]["details"]["claims"]
+    assert f"{line['verdict']}: {line['found']}".startswith(found)
+    assert (line["claim"], report["rows"][1]["measurements"][0]["name"]) == ("bounded", "large_actions")
+    assert "bounded" in (tmp_path / "gate.xml").read_text()
+
+
+def gated(bundle: Bundle, folder: Path, **claims: object) -> list[str]:
+    """Return the command line of a gate with these claims alone."""
+    off = dict.fromkeys(("latency", "accuracy", "answers", "memory", "size"))
+    (folder / "gate.yaml").write_text(json.dumps({**off, **claims}))
+    return ["gate", str(bundle.path), "--baseline", str(bundle.path), "--config", str(folder / "gate.yaml")]
+
+
+def test_its_gate_claim_is_in_a_new_gate_file_and_examined_where_it_is_named(
+    run: Run, float_bundle: Bundle, tmp_path: Path
+):
+    ok(run("gate", "init", str(tmp_path / "new")))
+    assert "\nbounded: null  # Few of the candidate's actions" in (tmp_path / "new/gate.yaml").read_text()
+    wrong = run(*gated(float_bundle, tmp_path, bounded={"bound": -1, "share": 1}))
+    assert wrong.returncode == 3
+    for problem in ("bounded.bound: Input should be greater than or equal to 0", "bounded.share: Extra inputs"):
+        assert problem in wrong.stderr
+    report = json.loads(ok(run(*gated(float_bundle, tmp_path, size={}), "--json")))
+    assert [line["claim"] for line in report["rows"][1]["details"]["claims"]] == ["size"]
+
+
+def test_a_gate_claim_that_cannot_be_imported_fails_where_it_is_named(run: Run, float_bundle: Bundle, tmp_path: Path):
+    done = run(*gated(float_bundle, tmp_path, missing={}))
+    assert done.returncode == 3
+    assert "acme-robotics 1.2, which adds 'missing' (vlatool.claims), cannot be imported" in done.stderr
+
+
 def test_its_bug_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
     done = run("quantize", "broken", str(onnx_file), "-o", str(tmp_path / "out"))
     assert done.returncode == 3
@@ -264,5 +314,15 @@ def test_it_replaces_nothing_of_vlatools_own(run: Run):
 
 def test_the_guide_shows_these_files():
     guide = (ROOT / "docs/guides/add-a-method.md").read_text()
-    for name in ("rounded", "openvino_provider", "ggml_provider", "source", "section", "tail", "every_step", "halved"):
+    for name in (
+        "rounded",
+        "openvino_provider",
+        "ggml_provider",
+        "source",
+        "section",
+        "tail",
+        "every_step",
+        "halved",
+        "claim",
+    ):
         assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide

@@ -16,7 +16,8 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.cli import main
 from vlatool.errors import DataError, RecipeError, SourceError
 from vlatool.export.onnx import ExportOnnx
-from vlatool.gate.config import AccuracyClaim, Gate
+from vlatool.gate.claims.accuracy import Accuracy
+from vlatool.gate.config import Gate
 from vlatool.gate.same import check
 from vlatool.module import stage, stored
 from vlatool.module.torch_policy import load_modules, torch_policy
@@ -70,7 +71,7 @@ def test_the_program_has_larger_steps_and_runs(one: Bundle, source: Bundle, fold
     whole = run_transform(ExportOnnx(), source, tmp_path / "whole", Context())
     with pytest.raises(DataError, match="runs fewer steps than the baseline, and no claim is made of its accuracy"):
         check(exported, whole, Gate(accuracy=None))
-    check(exported, whole, Gate(accuracy=AccuracyClaim(data=tmp_path / "any.npz")))
+    check(exported, whole, Gate(accuracy=Accuracy(data=tmp_path / "any.npz")))
 
 
 @pytest.fixture

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any
 
 from vlatool.measures import actions
@@ -13,8 +14,6 @@ from vlatool.stats.intervals import wilson
 
 DECIDE = (SUCCESS.name, SUCCESS_CHANCE.name, actions.SKILL_EXPERT.name, actions.VARIATION.name)
 """The measurements that the credibility rests on."""
-FAILS = "The reference fails"
-"""How the sentence about a reference begins that does not do its task."""
 SKILL = 0.1
 """Share of the best constant action's error that a credible policy does not make, at least."""
 FEW = 100
@@ -31,34 +30,103 @@ LOOK_AT_WORLD = (
 )
 
 
+class Trust(str, Enum):
+    """Whether the reference does its task; unknown where nothing says what is right."""
+
+    CREDIBLE = "credible"
+    FAILS = "fails"
+    UNKNOWN = "unknown"
+
+
+class Ground(Enum):
+    """What decides about the reference, or why nothing does; the value is the text about it."""
+
+    UNASKED = ""
+    NOTHING_RIGHT = (
+        "whether the reference does its task is unmeasured: there is no environment and no expert's action; at "
+        "most the distance from it was judged"
+    )
+    CHANCE_UNMEASURED = "what succeeds by chance in this environment was not measured"
+    NEVER_SUCCEEDS = "{name} succeeds in none of {own.samples} closed-loop episodes"
+    NOT_ABOVE_CHANCE = (
+        "{name} succeeds in {own.value:.1%} of {own.samples} closed-loop episodes, and actions that do not look at "
+        "the observation in {chance.value:.1%} of {chance.samples}, which cannot tell them apart"
+    )
+    ABOVE_CHANCE = (
+        "{name} succeeds in {own.value:.1%} of {own.samples} episodes; actions that do not look at the "
+        "observation in {chance.value:.1%} of {chance.samples}."
+    )
+    ONE_ACTION = "{name} gives the same action to all of {own.samples} recorded observations"
+    SKILL_UNKNOWN = "{own.note} ({own.samples} recorded observations)"
+    NO_SKILL = (
+        "{name} makes {error:.1%} of the error of the best constant action on {own.samples} recorded observations "
+        f"(at most {{most:.1%}}; a policy that looks makes less than {1 - SKILL:.0%})"
+    )
+    HARDLY_VARIES = (
+        "the actions of {name} hardly vary: {own.value:.1%} of the expert's standard deviation on {own.samples} "
+        "recorded observations"
+    )
+    BEATS_CONSTANT = (
+        "{name} makes {error:.1%} of the error of the best constant action on {own.samples} recorded observations."
+    )
+
+
+IN_EPISODES = (Ground.NEVER_SUCCEEDS, Ground.NOT_ABOVE_CHANCE)
+
+
 @dataclass(frozen=True)
 class Credibility:
     """What is known of the reference.
 
     Args:
-        verdict: ``credible``, ``fails``, or ``unknown`` where nothing says what is right.
-        sentences: When it fails: what was found and what to look at.
-        warnings: What a reader should know although it does not decide.
-        table: What was compared with which floor.
-        floor: The same in a sentence, when it is credible.
+        verdict: credible, fails, or unknown.
+        ground: what decides.
+        name: name of the reference in sentences.
+        own: number that decides; None where there is none.
+        chance: what it is compared with, for success rates.
+        table: what was compared with which floor.
+        reservations: what else was found, and does not decide.
     """
 
-    verdict: str
-    sentences: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    verdict: Trust = Trust.UNKNOWN
+    ground: Ground = Ground.UNASKED
+    name: str = ""
+    own: Measurement | None = None
+    chance: Measurement | None = None
     table: tuple[dict[str, Any], ...] = ()
-    floor: str = ""
+    reservations: tuple[Credibility, ...] = ()
 
     @property
     def fails(self) -> bool:
         """Whether nothing that is compared with the reference means anything."""
-        return self.verdict == "fails"
+        return self.verdict is Trust.FAILS
 
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was found and what to look at, when it fails."""
+        if not self.fails:
+            return ()
+        few = self.own and self.chance and max(self.own.samples, self.chance.samples) < FEW
+        look_at = LOOK_AT_WORLD if self.ground in IN_EPISODES else LOOK_AT
+        return (f"The reference fails, so that nothing can be held against it: {self._words}.",
+                f"{look_at} More --episodes would narrow that." if few else look_at)  # fmt: skip
 
-UNKNOWN = (
-    "whether the reference does its task is unmeasured: there is no environment and no expert's action; at "
-    "most the distance from it was judged"
-)
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader should know although it does not decide."""
+        own = (self._words,) if self.verdict is Trust.UNKNOWN and self.ground is not Ground.UNASKED else ()
+        return (*(text for other in self.reservations for text in (*other.warnings, *other.sentences[:1])), *own)
+
+    @property
+    def floor(self) -> str:
+        """What was compared with which floor, in a sentence, when it is credible."""
+        return self._words if self.verdict is Trust.CREDIBLE else ""
+
+    @property
+    def _words(self) -> str:
+        own = self.own or Measurement("", math.nan, "1")
+        error, most = 1 - own.value, 1 - (own.low or 0.0)
+        return self.ground.value.format(name=self.name, own=own, chance=self.chance, error=error, most=most)
 
 
 def credibility(row: Row, name: str = "the reference") -> Credibility:
@@ -69,49 +137,33 @@ def credibility(row: Row, name: str = "the reference") -> Credibility:
             and ``variation``, as the stages of ``vlatool.evaluate`` measure them.
         name: What the sentences call it.
     """
-    judged = _recorded(row, name), _played(row, name)
-    recorded, played = judged
-    table = tuple(line for part in judged for line in part.table)
-    if played.verdict != "unknown":
-        warnings = tuple(told for told in recorded.sentences[:1] if not played.fails)
-        return Credibility(played.verdict, played.sentences, (*played.warnings, *warnings), table, played.floor)
-    warnings = (UNKNOWN,) if recorded.verdict == "unknown" else recorded.warnings
-    return Credibility(recorded.verdict, recorded.sentences, (*played.warnings, *warnings), table, recorded.floor)
+    recorded, played = (replace(judged, name=name) for judged in (_recorded(row), _played(row)))
+    table = (*recorded.table, *played.table)
+    if played.verdict is Trust.UNKNOWN:
+        return replace(recorded, table=table, reservations=(played,))
+    reservations = (recorded,) if recorded.fails and not played.fails else ()
+    return replace(played, table=table, reservations=reservations)
 
 
-def _failing(reason: str, look_at: str, table: tuple[dict[str, Any], ...] = ()) -> Credibility:
-    first = f"{FAILS}, so that nothing can be held against it: {reason}."
-    return Credibility("fails", (first, look_at), table=table)
-
-
-def _played(row: Row, name: str) -> Credibility:
+def _played(row: Row) -> Credibility:
     own, chance = row.get(SUCCESS), row.get(SUCCESS_CHANCE)
     if own is None:
-        return Credibility("unknown")
+        return Credibility()
     if own.value == 0.0:
-        return _failing(f"{name} succeeds in none of {own.samples} closed-loop episodes", LOOK_AT_WORLD)
+        return Credibility(Trust.FAILS, Ground.NEVER_SUCCEEDS, own=own)
     if chance is None:
-        return Credibility("unknown", warnings=("what succeeds by chance in this environment was not measured",))
-    gain = above(own, chance)
+        return Credibility(ground=Ground.CHANCE_UNMEASURED)
+    gain = lower_bound(own, chance)
     line = {
         "measure": SUCCESS.name, "reference": round(own.value, 4), "by chance": round(chance.value, 4),
         "floor": "the difference is above 0 with 95 % confidence", "found": f"at least {gain:+.1%}",
     }  # fmt: skip
     if gain > 0:
-        floor = (
-            f"{name} succeeds in {own.value:.1%} of {own.samples} episodes; actions that do not look at the "
-            f"observation in {chance.value:.1%} of {chance.samples}."
-        )
-        return Credibility("credible", table=(line,), floor=floor)
-    reason = (
-        f"{name} succeeds in {own.value:.1%} of {own.samples} closed-loop episodes, and actions that do not look at "
-        f"the observation in {chance.value:.1%} of {chance.samples}, which cannot tell them apart"
-    )
-    few = "" if max(own.samples, chance.samples) >= FEW else " More --episodes would narrow that."
-    return _failing(reason, LOOK_AT_WORLD + few, (line,))
+        return Credibility(Trust.CREDIBLE, Ground.ABOVE_CHANCE, own=own, chance=chance, table=(line,))
+    return Credibility(Trust.FAILS, Ground.NOT_ABOVE_CHANCE, own=own, chance=chance, table=(line,))
 
 
-def above(own: Measurement, chance: Measurement) -> float:
+def lower_bound(own: Measurement, chance: Measurement) -> float:
     """Return the lower bound, at 95 %, of the difference of two success rates (Newcombe 1998, method 10).
 
     Args:
@@ -123,31 +175,25 @@ def above(own: Measurement, chance: Measurement) -> float:
     return own.value - chance.value - math.hypot(own.value - low, high - chance.value)
 
 
-def _recorded(row: Row, name: str) -> Credibility:
+def _recorded(row: Row) -> Credibility:
     skill, varied = row.get(actions.SKILL_EXPERT), row.get(actions.VARIATION)
     if varied is not None and varied.value == 0.0:
-        reason = f"{name} gives the same action to all of {varied.samples} recorded observations"
-        return _failing(reason, LOOK_AT, (_line(actions.VARIATION.name, varied, "above 0"),))
-    if skill is None:
-        return Credibility("unknown")
-    table: tuple[dict[str, Any], ...] = (
-        _line("skill against the best constant action", skill, f"{SKILL:g}, and above 0 with 95 % confidence"),
-    )
-    if not skill.known:
-        return _failing(f"{skill.note} ({skill.samples} recorded observations)", LOOK_AT, table)
-    if not (skill.value >= SKILL and (skill.low or 0.0) > 0):
-        reason = (
-            f"{name} makes {1 - skill.value:.1%} of the error of the best constant action on {skill.samples} recorded "
-            f"observations (at most {1 - (skill.low or 0.0):.1%}; a policy that looks makes less than {1 - SKILL:.0%})"
+        return Credibility(
+            Trust.FAILS, Ground.ONE_ACTION, own=varied, table=(_line(actions.VARIATION.name, varied, "above 0"),)
         )
-        return _failing(reason, LOOK_AT, table)
+    if skill is None:
+        return Credibility(ground=Ground.NOTHING_RIGHT)
+    floor = f"{SKILL:g}, and above 0 with 95 % confidence"
+    table: tuple[dict[str, Any], ...] = (_line("skill against the best constant action", skill, floor),)
+    if not skill.known:
+        return Credibility(Trust.FAILS, Ground.SKILL_UNKNOWN, own=skill, table=table)
+    if not (skill.value >= SKILL and (skill.low or 0.0) > 0):
+        return Credibility(Trust.FAILS, Ground.NO_SKILL, own=skill, table=table)
     if varied is not None and row.get(actions.ERROR_EXPERT) is not None:
         table = (*table, _line("variation by that of the expert", varied, f"{VARIATION:g}"))
         if varied.value < VARIATION:
-            reason = f"the actions of {name} hardly vary: {varied.value:.1%} of the expert's standard deviation"
-            return _failing(f"{reason} on {varied.samples} recorded observations", LOOK_AT, table)
-    floor = f"{name} makes {1 - skill.value:.1%} of the error of the best constant action on {skill.samples} recorded "
-    return Credibility("credible", table=table, floor=f"{floor}observations.")
+            return Credibility(Trust.FAILS, Ground.HARDLY_VARIES, own=varied, table=table)
+    return Credibility(Trust.CREDIBLE, Ground.BEATS_CONSTANT, own=skill, table=table)
 
 
 def _line(measure: str, measured: Measurement, floor: str) -> dict[str, Any]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.accuracy.doubt import KNOWN, Cause, Doubt
 from vlatool.measures import Quantity, series, tables
 from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
 from vlatool.measures.success import WORST_TASK_DROP
@@ -21,9 +22,9 @@ from vlatool.stats.success_sequential import exact_drop
 
 Array = NDArray[np.float64]
 AGAINST = {series.TASK: tables.AGAINST_BY_TASK, series.INSTRUCTION: tables.AGAINST_BY_INSTRUCTION}
+NAMED = ", the worst of "
+"""What follows the name of the task in the note of that measurement."""
 CONFIDENCE = 0.95
-KNOWN = 0.9
-"""Share of the episodes in which both succeed that must tell a metric of both, or nothing is claimed of it."""
 DOUBT = 0.25
 """Chance below which it is no accident that the variant's values are missing more often (an exact sign test): the doubt
 is not the baseline's, so that two episodes suffice."""
@@ -39,11 +40,18 @@ def compare_motion(baseline: Row, row: Row) -> Row:
     """
     pairs = _Pairs(baseline, row)
     tables = {title: table for key, title in AGAINST.items() if (table := pairs.table(key))}
-    found = (*pairs.ratios(), *pairs.added(), *pairs.steps(), *pairs.worst())
+    found = (*(ratio.measured for _, ratio in pairs.ratios()), *pairs.added_motion(), *pairs.steps(), *pairs.worst())
     return replace(row, measurements=(*row.measurements, *found), details={**row.details, **tables})
 
 
-def ratios(baseline: Row, row: Row, names: Collection[str], confidence: float = CONFIDENCE) -> dict[str, Measurement]:
+class Ratio(NamedTuple):
+    """A metric as a multiple of the baseline's, and what its note adds: what is unknown, where it is largest."""
+
+    measured: Measurement
+    remarks: tuple[str, ...] = ()
+
+
+def ratios(baseline: Row, row: Row, names: Collection[str], confidence: float = CONFIDENCE) -> dict[str, Ratio]:
     """Return metric -> how a variant moves as a multiple of the baseline, in episodes in which both succeed.
 
     Args:
@@ -51,11 +59,10 @@ def ratios(baseline: Row, row: Row, names: Collection[str], confidence: float = 
         names: Metrics; those that the episodes do not have are left out.
         confidence: Coverage of each interval.
     """
-    found = {item.name: item for item in _Pairs(baseline, row, confidence).ratios()}
-    return {metric: found[name] for metric, name in RATIO.pattern.among(found).items() if metric in names}
+    return {name: ratio for name, ratio in _Pairs(baseline, row, confidence).ratios() if name in names}
 
 
-def doubts(baseline: Row, row: Row, names: Collection[str]) -> dict[str, str]:
+def doubts(baseline: Row, row: Row, names: Collection[str]) -> dict[str, Doubt]:
     """Return metric -> why its missing values leave nothing to be claimed of it; those that are known are left out.
 
     Args:
@@ -88,17 +95,27 @@ def drops_by_task(baseline: Row, row: Row, confidence: float = CONFIDENCE) -> di
     return _Pairs(baseline, row, confidence).drops()
 
 
+def worst_task(drop: Measurement) -> str:
+    """Return the name of the task that a measurement of ``WORST_TASK_DROP`` is about."""
+    return drop.note.partition(NAMED)[0]
+
+
 def _ratio(
-    quantity: Quantity, ratio: tuple[float, float, float], count: int, note: str, confidence: float, doubt: str = ""
-) -> Measurement:
+    quantity: Quantity, ratio: tuple[float, float, float], count: int, note: Sequence[str], confidence: float,
+    doubt: Doubt | None = None,
+) -> Ratio:  # fmt: skip
+    """Return a ratio; without its interval where there is a doubt, or resamples in which the baseline's is always 0."""
+    low: float | None
+    high: float | None
     value, low, high = ratio
-    if np.isfinite(high) and not doubt:
-        return quantity.measurement(value, samples=count, low=low, high=high, confidence=confidence, note=note)
-    zeros = "too few pairs in which the baseline's is not 0"  # resamples have none of them, and no ratio
-    why = doubt or (f"{count} pairs, and it takes {FEWEST}" if count < FEWEST else zeros)
-    first, _, rest = note.partition("; ")
-    parts = (first, f"{NO_INTERVAL}{why}", *([rest] if rest else []))
-    return quantity.measurement(value, samples=count, confidence=confidence, note="; ".join(parts))
+    what, *remarks = note
+    if doubt or not np.isfinite(high):
+        doubt = doubt or Doubt(Cause.FEW_PAIRS if count < FEWEST else Cause.ZEROS, count)
+        low = high = None
+        remarks.insert(0, f"{NO_INTERVAL}{doubt}")
+    words = "; ".join((what, *remarks))
+    measured = quantity.measurement(value, samples=count, low=low, high=high, confidence=confidence, note=words)
+    return Ratio(measured, tuple(remarks))
 
 
 class _Pairs:
@@ -114,7 +131,7 @@ class _Pairs:
         self._names = {key: [str(record[key]) for record in row.details[titles[key]]] for key in self._places}
         self._metrics = sorted(series.METRIC.among(name for name in row.raw if name in baseline.raw))
 
-    def ratios(self) -> Iterator[Measurement]:
+    def ratios(self) -> Iterator[tuple[str, Ratio]]:
         """Yield the ratio of each metric in the episodes in which both succeed, the worst task named."""
         for name in self._metrics:
             own, base, known = self._values(name)
@@ -122,28 +139,31 @@ class _Pairs:
                 continue
             if (ratio := self._ratio_of(own, base, known, self._confidence)) is None:
                 continue
-            note = f"of the means of {self._told(known)}{self._worst_of(own, base, known)}"
+            counted, *unknown = self._counted(known)
+            note = (f"of the means of {counted}", *unknown, *self._worst_of(own, base, known))
             starts = distinct(self._starts[known].tolist())
-            why = f"{starts} distinct starts, and it takes {FEWEST}" if starts < min(FEWEST, known.sum()) else ""
-            doubt = self.doubt(name) or why
-            yield _ratio(RATIO.quantity(name), ratio, int(known.sum()), note, self._confidence, doubt)
+            few = Doubt(Cause.FEW_STARTS, starts) if starts < min(FEWEST, known.sum()) else None
+            doubt = self.doubt(name) or few
+            yield name, _ratio(RATIO.quantity(name), ratio, int(known.sum()), note, self._confidence, doubt)
 
-    def doubt(self, name: str) -> str:
-        """Return why the values of a metric that are missing leave nothing to be claimed of it; empty where they do."""
+    def doubt(self, name: str) -> Doubt | None:
+        """Return why the values of a metric that are missing leave nothing to be claimed of it; None where they do."""
         own, base, _ = (np.isfinite(values) for values in self._values(name))
         total = int(self._both.sum())
         ours, theirs = (int((self._both & ~one & other).sum()) for one, other in ((own, base), (base, own)))
         known = int((self._both & own & base).sum())
         if total and known < KNOWN * total:
-            return f"known of both in {known} of {total} common successes, and it takes {KNOWN:.0%}"
+            return Doubt(Cause.RARELY_KNOWN, known, total)
         if ours > theirs and sign_test(ours, ours + theirs) <= DOUBT:
-            return f"missing in {ours} common successes where the baseline has it, the other way round in {theirs}"
-        return ""
+            return Doubt(Cause.MISSING_MORE_OFTEN, ours, theirs)
+        return None
 
-    def _told(self, known: NDArray[np.bool_]) -> str:
+    def _counted(self, known: NDArray[np.bool_]) -> tuple[str, ...]:
+        """Return the episodes of a ratio in words, and in how many a metric is unknown."""
         some, total = int(known.sum()), int(self._both.sum())
-        return f"{some} episodes in which both succeed" if some == total else (
-            f"{some} of {total} episodes in which both succeed; unknown in {total - some} of them")  # fmt: skip
+        if some == total:
+            return (f"{some} episodes in which both succeed",)
+        return f"{some} of {total} episodes in which both succeed", f"unknown in {total - some} of them"
 
     def _ratio_of(
         self, own: Array, base: Array, known: NDArray[np.bool_], confidence: float = CONFIDENCE
@@ -161,13 +181,13 @@ class _Pairs:
                 starts = self._starts[known]
                 yield name, (distinct(starts[own[known] > 0].tolist()), distinct(starts.tolist()))
 
-    def added(self) -> Iterator[Measurement]:
+    def added_motion(self) -> Iterator[Measurement]:
         """Yield the mean of each of these metrics that the variant has something of."""
         for name, (some, _) in self.above_none():
             if some:
                 own, _, known = self._values(name)
                 some, count = int((own[known] > 0).sum()), int(known.sum())
-                note = f"mean of {self._told(known)}: above 0 in {some} of them, and in none of the "
+                note = f"mean of {'; '.join(self._counted(known))}: above 0 in {some} of them, and in none of the "
                 quantity = ADDED_MEAN.quantity(name, metrics()[name].unit)
                 yield quantity.measurement(float(own[known].mean()), samples=count, note=f"{note}baseline's")
 
@@ -182,14 +202,15 @@ class _Pairs:
             longest[own] = max(one[own].max() for one in steps)
         base, own = (np.where(won, one, longest) for won, one in zip(self._wins, steps, strict=True))
         if ratio := self._ratio_of(own, base, np.ones(len(own), bool)):
-            yield _ratio(STEPS_RATIO, ratio, len(own), "steps of all episodes, failures at full length", CONFIDENCE)
+            what = "steps of all episodes, failures at full length"
+            yield _ratio(STEPS_RATIO, ratio, len(own), (what,), CONFIDENCE).measured
 
     def worst(self) -> Iterator[Measurement]:
         """Yield the drop of the task that loses most, with an interval that allows for the choice."""
         drops = self.drops()
         if len(drops) > 1:
             name = max(drops, key=lambda task: drops[task].value)
-            yield replace(drops[name], note=f"{name}, the worst of {len(drops)} tasks")
+            yield replace(drops[name], note=f"{name}{NAMED}{len(drops)} tasks")
 
     def drops(self) -> dict[str, Measurement]:
         """Return task -> its drop; all intervals together have the coverage of the pairs (Bonferroni)."""
@@ -231,14 +252,15 @@ class _Pairs:
                 ratios[f"{name.replace('_', ' ')}, x"] = round(ratio[0], 3)
         return ratios
 
-    def _worst_of(self, own: Array, base: Array, known: NDArray[np.bool_]) -> str:
-        """Return the task whose ratio is the largest, as a part of a note; empty where there is one task alone."""
+    def _worst_of(self, own: Array, base: Array, known: NDArray[np.bool_]) -> Iterator[str]:
+        """Yield the task whose ratio is the largest, as a part of a note, where there are several tasks."""
         ratios = []
         for place, name in enumerate(self._names.get(series.TASK, ())):
             chosen = known & (self._places[series.TASK] == place)
             if chosen.sum() >= FEWEST and base[chosen].mean() > 0:
                 ratios.append((float(own[chosen].mean() / base[chosen].mean()), name))
-        return f"; most in {max(ratios)[1]}: {max(ratios)[0]:.3g}x" if len(ratios) > 1 else ""
+        if len(ratios) > 1:
+            yield f"most in {max(ratios)[1]}: {max(ratios)[0]:.3g}x"
 
     def _drop(self, chosen: NDArray[np.bool_], confidence: float) -> tuple[tuple[float, float, float], int]:
         before, after = (won[chosen] for won in self._wins)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from vlatool.accuracy.doubt import Cause, Doubt
 from vlatool.accuracy.moved import compare_motion
 from vlatool.errors import DataError
 from vlatool.measures import series, tables
@@ -16,7 +17,7 @@ from vlatool.measures.success import MCNEMAR_P, SUCCESS, SUCCESS_CHANCE, SUCCESS
 from vlatool.motion.measure import metrics
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import mcnemar_exact
-from vlatool.stats.starts import FEWEST, distinct, independent, too_few, wilson_of
+from vlatool.stats.starts import distinct, independent, too_few, wilson_of
 from vlatool.stats.success_sequential import exact_drop
 
 CLOCK = "time"
@@ -98,16 +99,14 @@ def _starts(starts: Sequence[Hashable]) -> str:
     return f"{count} distinct starts" + (f", worth {worth} episodes" if worth < len(starts) else "")
 
 
-def few_starts(row: Row) -> str:
-    """Return why episodes decide nothing: they repeat their first observations, and have too few; empty otherwise.
+def few_starts(row: Row) -> Doubt | None:
+    """Return why episodes decide nothing: they repeat their first observations, and have too few; None otherwise.
 
     Args:
         row: Of ``success_row``.
     """
     starts = row.raw.get(series.START, [])
-    if not too_few(starts):
-        return ""
-    return f"{len(starts)} episodes of {distinct(starts)} distinct starts decide nothing (from {FEWEST})"
+    return Doubt(Cause.REPEATED_STARTS, distinct(starts), len(starts)) if too_few(starts) else None
 
 
 def repeated_starts(row: Row) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ class Success:
         Raises:
             DataError: when one of the keys is there with something else than true or false.
         """
-        said = told(info)
+        said = reported_success(info)
         self._said = self._said if said is None else said
 
     def at_the_end(self, task: str, seed: int) -> bool:
@@ -48,7 +48,7 @@ class Success:
         return self._said
 
 
-def told(info: Any) -> bool | None:
+def reported_success(info: Any) -> bool | None:
     """Return what the info of a step says of success, None when it says nothing.
 
     A vector environment of one keeps what belongs to the end in ``final_info``.
@@ -61,7 +61,7 @@ def told(info: Any) -> bool | None:
     for key in KEYS:
         if (value := _only(info.get(key))) is not None:
             return _truth(key, value)
-    return told(_only(info.get("final_info")))
+    return reported_success(_only(info.get("final_info")))
 
 
 def _only(value: Any) -> Any:

@@ -146,17 +146,14 @@ def _folders(files: Iterable[Path]) -> Iterator[None]:
 
 def _read_by(gate: Gate, base: Path) -> tuple[Path | None, ...]:
     """Return what a gate reads beside the candidate."""
-    accuracy = gate.accuracy
-    return (base, *((accuracy.data, accuracy.policy) if accuracy else ()))
+    return (base, *gate.paths)
 
 
 def _gate(config: Path | None, margin: float | None) -> Gate:
-    from vlatool.gate.config import Gate, LatencyClaim, read_gate
+    from vlatool.gate.config import Gate, read_gate
 
     gate = read_gate(config or CONFIG) if config or CONFIG.is_file() else Gate()
-    if margin is None:
-        return gate
-    return gate.model_copy(update={"latency": (gate.latency or LatencyClaim()).model_copy(update={"margin": margin})})
+    return gate if margin is None else gate.with_options("latency", margin=margin)
 
 
 def _place(junit: Path, *inputs: str | Path | None) -> None:

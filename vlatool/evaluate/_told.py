@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from vlatool.accuracy.disturbed import worst_record
-from vlatool.accuracy.moved import pairs_above_none
+from vlatool.accuracy.moved import pairs_above_none, worst_task
 from vlatool.measures.latency import LATENCY_IN_THE_LOOP
 from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
 from vlatool.measures.success import WORST_TASK_DROP
@@ -27,7 +27,7 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
     row = rows[-1]
     worst, steps = row.get(WORST_TASK_DROP), row.get(STEPS_RATIO)
     if worst and worst.value > 0:
-        yield f"The task that loses most is {worst.note.partition(',')[0]}: {100 * worst.value:.3g} points."
+        yield f"The task that loses most is {worst_task(worst)}: {100 * worst.value:.3g} points."
     changed = {metric: item for metric, item in RATIO.members(row).items() if item is not steps}
     if rougher := {metric: item for metric, item in changed.items() if _is_more(item)}:
         words = (f"{metric.replace('_', ' ')} {_times(item.value)}" for metric, item in rougher.items())

@@ -207,7 +207,7 @@ class ClosedLoop(Measure):
             most = sum(len(job.seeds) for job in jobs)
             plays.append(Player(one, latency, self.engine, teller, most, plays[0] if plays else None))
         rows: list[Row] = []
-        believed, decision = Credibility("unknown"), None
+        believed, decision = Credibility(), None
         if self.baseline and self.limit is not None:
             first, outcomes, decision = played_until(jobs, self.limit, plays[0], plays[1], context)
             reference = [first]

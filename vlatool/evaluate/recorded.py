@@ -91,7 +91,7 @@ class Recorded(Measure):
         rows.append(with_derived(Row(names[-1], measurements=tuple(measurements))))
         kind = "calibration" if reservation else "recorded"
         title = f"{source.manifest.name} on {len(indices)} {kind} observations"
-        trust = credibility(rows[0]) if self.baseline else Credibility("unknown")
+        trust = credibility(rows[0]) if self.baseline else Credibility()
         text = f"{title}: {_summary(rows[-1])}."
         verdict = "inconclusive" if trust.fails else "info"
         sentences = (*trust.sentences, text)

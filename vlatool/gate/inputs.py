@@ -67,7 +67,7 @@ class Inputs:
             save_drawn(path, self.draw(count, purpose, number))
             yield path
 
-    def told(self) -> str:
+    def description(self) -> str:
         """Return in words what the observations are drawn from, and how to draw them again."""
         count = sum(map(len, self.recordings))
         source = f"from {count} recorded ones and the vocabulary" if count else "from the spec alone: none is recorded"

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
 from statistics import median
 from typing import Any
 
-from vlatool.accuracy.credibility import FAILS
 from vlatool.bundle.bundle import Bundle, hash_file
-from vlatool.gate.claims import accuracy, answers, deadline, disturbed, growth, latency, motion, task_time, worst_task
-from vlatool.gate.config import Gate, LatencyClaim
-from vlatool.gate.episodes import Episodes
+from vlatool.gate.config import Gate
+from vlatool.gate.evidence import Evidence
 from vlatool.gate.inputs import AGREEMENT, Inputs
-from vlatool.gate.result import ClaimResult, worst
+from vlatool.gate.plan import Need, Plan
 from vlatool.gate.same import check
 from vlatool.gate.timed import Timed
+from vlatool.gate.verdict import Outcome, Reason, Verdict, worst
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
 from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.validity import busy, throttled, validity
-from vlatool.report import Measurement, Report, Row
+from vlatool.measures import series, tables
+from vlatool.measures.latency import LATENCY_P50
+from vlatool.report import Finding, Report, Row
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context
 from vlatool.telemetry import Recorder, open_all
@@ -49,106 +51,102 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     check(candidate, baseline, gate)
     for bundle in (candidate, baseline):
         refuse_findings(bundle, gate.accept)
-    host = before_run()
-    how = gate.latency or LatencyClaim()
+    host, plan = before_run(), gate.plan
     seed = secrets.randbits(32) if seed is None else seed
-    inputs = Inputs(baseline, gate.accuracy.data if gate.accuracy else None, seed)
+    inputs = Inputs(baseline, plan.data, seed)
     paths = str(baseline.path), str(candidate.path)
-    job = PairJob(*paths, how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed)
-    timed = Timed(job, context, how.timeout, inputs)
-    agreement = _agreement(timed, gate, inputs)
-    results: list[ClaimResult] = []
-    if gate.size:
-        results.append(growth.examine_size(candidate, baseline, gate.size))
-    if gate.memory:
-        results.append(growth.examine_memory(candidate, baseline, gate.memory, how, context, inputs))
-    if gate.accuracy:
-        episodes = Episodes(candidate, baseline, gate.accuracy, context, how.engine, gate.disturbed)
-        results.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine, episodes))
-        results += _of_episodes(episodes, gate)
-    with Recorder(open_all(), PERIOD_S) as board:
-        if gate.latency:
-            results += latency.examine_all(timed, gate.latency)
-        if gate.deadline:
-            results.append(deadline.examine(timed, gate.deadline))
-    if gate.answers:
-        results.append(answers.examine(agreement, timed, gate.answers))
-    seen = (*throttled(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
-    seen = seen if gate.latency or gate.deadline else ()  # findings about times
+    job = PairJob(*paths, plan.engine, plan.threads, plan.warmup, plan.pairs, plan.seconds, seed)
+    timed = Timed(job, context, plan.timeout, inputs)
+    evidence = Evidence(candidate, baseline, plan, context, inputs, timed, _agreement(timed, plan, inputs))
+    results, findings = _examined(gate, evidence)
+    if Need.TIMES in plan.needs:
+        findings += tuple(replace(finding, effect="note") for finding in busy(host))
     name = candidate.manifest.name
     row = _row("candidate", candidate, timed, results)
-    row = replace(row, details={**row.details, "measured with": _measured_with(gate, inputs, agreement)})
+    row = replace(row, details={**row.details, tables.SETTINGS: _measured_with(evidence)})
     rows = (_row("baseline", baseline, timed, results), row)
-    return Report(KIND, f"Gate of {name}", worst(result.verdict for result in results),
-                  (*_summary(name, results), f"{inputs.told()}."), rows,
+    return Report(KIND, f"Gate of {name}", worst(result.verdict.outcome for result in results).value,
+                  (*_summary(name, results), f"{inputs.description()}."), rows,
                   command=context.command, environment=host, warnings=tuple(dict.fromkeys(context.notes)),
-                  validity=validity(seen), findings=seen)  # fmt: skip
+                  validity=validity(findings), findings=findings)  # fmt: skip
 
 
-def _of_episodes(episodes: Episodes, gate: Gate) -> Iterator[ClaimResult]:
-    """Yield what the claims say that are about the closed-loop episodes."""
-    if gate.motion:
-        yield motion.examine(episodes, gate.motion)
-    if gate.task_time:
-        yield task_time.examine(episodes, gate.task_time)
-    if gate.worst_task:
-        yield worst_task.examine(episodes, gate.worst_task)
-    if gate.disturbed:
-        yield disturbed.examine(episodes, gate.disturbed)
+@dataclass(frozen=True)
+class _Result:
+    """A verdict, its title and its words."""
+
+    title: str
+    verdict: Verdict
+    sentence: str
 
 
-def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:
-    """Load both bundles as a robot does, golden action and all, and ask both where answers are claimed."""
-    claim = gate.answers
+def _examined(gate: Gate, evidence: Evidence) -> tuple[list[_Result], tuple[Finding, ...]]:
+    """Examine every claim, and watch the board while something is timed."""
+    results: list[_Result] = []
+    findings: tuple[Finding, ...] = ()
+    for times, claims in groupby(gate.in_order, lambda claim: Need.TIMES in claim.needs):
+        with Recorder(open_all() if times else (), PERIOD_S) as board:
+            for claim in claims:
+                found = claim.verdicts(evidence).items()
+                results += (_Result(title, verdict, claim.sentence(verdict)) for title, verdict in found)
+        findings += tuple(throttled(board.recorded.throttling))
+    return results, findings
+
+
+def _agreement(timed: Timed, plan: Plan, inputs: Inputs) -> Agreement:
+    """Load both bundles as a robot does, golden action and all, and ask both where a claim looks at their answers."""
     timed.context.tell("both bundles, on observations that are not recorded", None)
-    job = replace(timed.job, pairs=claim.observations if claim else 0, seconds=claim.seconds if claim else 0.0)
-    if claim is None:
-        return measure_agreement(job, timed.timeout)
-    with inputs.file(claim.observations, AGREEMENT) as path:
+    if Need.AGREEMENT not in plan.needs:
+        return measure_agreement(replace(timed.job, pairs=0, seconds=0.0), timed.timeout)
+    job = replace(timed.job, pairs=plan.observations, seconds=plan.answer_seconds)
+    with inputs.file(plan.observations, AGREEMENT) as path:
         return measure_agreement(replace(job, observations=str(path)), timed.timeout)
 
 
-def _measured_with(gate: Gate, inputs: Inputs, agreement: Agreement) -> list[dict[str, Any]]:
+def _measured_with(evidence: Evidence) -> list[dict[str, Any]]:
     """Return what a reader needs to judge, or repeat, the gate: a row for each thing."""
-    how = gate.latency or LatencyClaim()
-    table: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (how.threads, *how.also_threads)))}
-    table |= dict(zip(("engine of the baseline", "engine of the candidate"), agreement.engines, strict=True))
+    plan, inputs = evidence.plan, evidence.inputs
+    table: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (plan.threads, *plan.also_threads)))}
+    engines = ("engine of the baseline", "engine of the candidate")
+    table |= dict(zip(engines, evidence.answers.engines, strict=True))
     table |= {
         f"recording {recording.path.name}": f"sha256:{hash_file(recording.path)}"
         for recording in inputs.recordings
         if recording.path.is_file()
     }
-    if gate.accuracy and (data := accuracy.data_of(inputs.baseline, gate.accuracy)) is not None and data.is_file():
+    if Need.RECORDINGS in plan.needs and (data := evidence.recording_path) is not None and data.is_file():
         table["evaluation data"] = f"sha256:{hash_file(data)}"
     return [{"what": what, "value": value} for what, value in table.items()]
 
 
-def _row(name: str, bundle: Bundle, timed: Timed, results: Sequence[ClaimResult]) -> Row:
+def _row(name: str, bundle: Bundle, timed: Timed, results: Sequence[_Result]) -> Row:
     calls = timed.calls(name)
-    measured = [Measurement("latency_p50", median(calls), "ms", samples=len(calls))] if calls else []
-    raw = {"latency_ms": calls} if calls else {}
+    measured = [LATENCY_P50.measurement(median(calls), samples=len(calls))] if calls else []
+    raw = {series.LATENCY: calls} if calls else {}
     reason = f"{bundle.manifest.name}, {bundle.hash[:19]}"
     if name == "baseline":
-        measured += [number for result in results for number in result.baseline]
+        measured += [number for result in results for number in result.verdict.baseline]
         return Row(name, "baseline", reason, tuple(measured), raw)
-    measured += [number for result in results for number in result.measurements]
+    measured += [number for result in results for number in result.verdict.measurements]
     if calls:
-        raw["log_ratio"] = [pairs.log_ratio for pairs in timed.pairs]
-        raw["log_mean_ratio"] = [pairs.mean_log_ratio for pairs in timed.pairs]
-    claims = [{"claim": result.claim, "verdict": result.verdict, "found": result.sentence} for result in results]
-    return Row(name, "subject", reason, tuple(measured), raw, {"claims": claims})
+        raw[series.LOG_RATIO] = [pairs.log_ratio for pairs in timed.pairs]
+        raw[series.LOG_MEAN_RATIO] = [pairs.mean_log_ratio for pairs in timed.pairs]
+    claims = [{"claim": result.title, "verdict": result.verdict.outcome.value, "found": result.sentence}
+              for result in results]  # fmt: skip
+    return Row(name, "subject", reason, tuple(measured), raw, {tables.CLAIMS: claims})
 
 
-def _summary(name: str, results: Sequence[ClaimResult]) -> tuple[str, ...]:
+def _summary(name: str, results: Sequence[_Result]) -> tuple[str, ...]:
     """Return the result, then every claim in a sentence, those that failed first."""
-    order = ("fail", "inconclusive", "pass")
-    named = {verdict: ", ".join(result.claim for result in results if result.verdict == verdict) for verdict in order}
+    named = {outcome: ", ".join(result.title for result in results if result.verdict.outcome is outcome)
+             for outcome in Outcome}  # fmt: skip
     first = {
-        "pass": f"{name} keeps to every claim: {named['pass']}.",
-        "fail": f"{name} does not keep to: {named['fail']}.",
-        "inconclusive": f"The samples cannot decide about {named['inconclusive']} of {name}.",
-    }[worst(result.verdict for result in results)]
-    if any(result.sentence.startswith(FAILS) for result in results) and not named["fail"]:
+        Outcome.PASS: f"{name} keeps to every claim: {named[Outcome.PASS]}.",
+        Outcome.FAIL: f"{name} does not keep to: {named[Outcome.FAIL]}.",
+        Outcome.INCONCLUSIVE: f"The samples cannot decide about {named[Outcome.INCONCLUSIVE]} of {name}.",
+    }[worst(result.verdict.outcome for result in results)]
+    no_reference = any(result.verdict.reason is Reason.REFERENCE_FAILS for result in results)
+    if no_reference and not named[Outcome.FAIL]:
         first = f"Nothing is said about {name}, for the baseline is no reference: it does not do its task."
-    ordered = sorted(results, key=lambda result: order.index(result.verdict))
-    return (first, *(f"{result.claim}: {result.verdict}: {result.sentence}." for result in ordered))
+    ordered = sorted(results, key=lambda result: list(Outcome).index(result.verdict.outcome))
+    return (first, *(f"{each.title}: {each.verdict.outcome.value}: {each.sentence}." for each in ordered))

@@ -10,7 +10,6 @@ from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
 from vlatool.bundle.unexported import no_graph
 from vlatool.errors import BundleError, DataError, GraphError, instead, nearest, require
-from vlatool.gate.claims import accuracy
 from vlatool.gate.config import Gate
 from vlatool.graph.draws import drawing
 from vlatool.graph.files import read
@@ -19,6 +18,8 @@ MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "fi
 """What a robot relies on; files of statistics and tokenizers may differ."""
 RATE = ("control_hz", "chunk", "executed")
 FEWER_STEPS = "prune.steps"
+ACCURACY = "accuracy"
+"""The claim that alone says what steps are worth."""
 LARGEST_TOLERANCE = 1.0
 """Of a golden action: with more, ``load`` would accept any."""
 
@@ -49,20 +50,20 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
             "name a candidate and a baseline that were made from the same policy",
         )
     _check_golden(candidate, baseline)
-    if _has_fewer_steps(mine, theirs) and gate.accuracy is None:
+    if _has_fewer_steps(mine, theirs) and ACCURACY not in gate.claims:
         raise DataError(
             f"{candidate.path} runs fewer steps than the baseline, and no claim is made of its accuracy.",
             "claim it in the gate (accuracy: {data: FILE} or {episodes: N}): it alone says what the steps are worth",
         )
     for bundle in (candidate, baseline):
         _refuse_draws(bundle)
-    if gate.accuracy:
-        accuracy.data_of(baseline, gate.accuracy)
+    for claim in gate.claims.values():
+        claim.check(baseline, gate.plan)
 
 
 def _plays_what_bundles_name(gate: Gate) -> bool:
     """Return whether episodes are played in an environment that no file of the gate's names."""
-    return bool(gate.accuracy and gate.accuracy.episodes and gate.accuracy.policy is None)
+    return gate.plan.episodes > 0 and gate.plan.policy is None
 
 
 def _scene(mine: Manifest, theirs: Manifest) -> str:
@@ -74,7 +75,7 @@ def _scene(mine: Manifest, theirs: Manifest) -> str:
         return ""
     keys = [key for key in dict.fromkeys((*theirs.environment, *mine.environment)) if key != "timeout"]
     pairs = [(key, mine.environment.get(key), theirs.environment.get(key)) for key in keys]
-    return "; ".join(text for key, one, two in pairs if (text := _told(f"environment: {key}", one, two)))
+    return "; ".join(text for key, one, two in pairs if (text := _difference(f"environment: {key}", one, two)))
 
 
 def _check_golden(candidate: Bundle, baseline: Bundle) -> None:
@@ -116,7 +117,7 @@ def _tensors(mine: Manifest, theirs: Manifest) -> str:
         for name in {**two, **one}:
             if differs := _differs(one.get(name), two.get(name)):
                 return f"{kind[:-1]} {name}: {differs}"
-    return _told("the action", mine.spec.action.name, theirs.spec.action.name)
+    return _difference("the action", mine.spec.action.name, theirs.spec.action.name)
 
 
 def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
@@ -124,12 +125,12 @@ def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
     if mine is None or theirs is None:
         return f"it is in the {'baseline' if mine is None else 'candidate'} alone"
     pairs = [(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING]
-    return "; ".join(text for name, one, two in pairs if (text := _told(name, one, two)))
+    return "; ".join(text for name, one, two in pairs if (text := _difference(name, one, two)))
 
 
 def _rates(mine: Manifest, theirs: Manifest) -> str:
     pairs = [(name, getattr(mine.spec, name), getattr(theirs.spec, name)) for name in RATE]
-    return "; ".join(text for name, one, two in pairs if (text := _told(name, one, two)))
+    return "; ".join(text for name, one, two in pairs if (text := _difference(name, one, two)))
 
 
 def _program(mine: Manifest, theirs: Manifest) -> str:
@@ -142,7 +143,7 @@ def _program(mine: Manifest, theirs: Manifest) -> str:
     parts: list[tuple[str, Any, Any]] = [(word, _of_all(mine, word), _of_all(theirs, word)) for word in words]
     if not _has_fewer_steps(mine, theirs):
         parts.append(("repeat", _repeat(mine), _repeat(theirs)))
-    return "; ".join(text for word, one, two in parts if (text := _told(f"the program's {word}", one, two)))
+    return "; ".join(text for word, one, two in parts if (text := _difference(f"the program's {word}", one, two)))
 
 
 def _has_fewer_steps(mine: Manifest, theirs: Manifest) -> bool:
@@ -161,7 +162,7 @@ def _of_all(manifest: Manifest, word: str) -> dict[str, Any]:
     return {name: value for step in manifest.program for name, value in getattr(step, word).items()}
 
 
-def _told(name: str, mine: Any, theirs: Any) -> str:
+def _difference(name: str, mine: Any, theirs: Any) -> str:
     if mine == theirs:
         return ""
     one, two = (list(value) if isinstance(value, tuple) else value for value in (mine, theirs))

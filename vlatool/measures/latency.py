@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from vlatool.measures import HEADLINE, PERCENT, PERCENTILES, Family, Quantity
+from vlatool.report import Measurement
 
 UPPER_BOUND = "upper bound, order statistic"
 RATIO_QUANTILE = "order statistic of the ratios within rounds"
@@ -55,6 +56,12 @@ LATENCY_MEAN_RATIO_AT = Family(Quantity("latency_mean_ratio_{threads}_threads", 
 OVERHEAD_P50 = Quantity("overhead_p50", "us", interval="order statistic")
 OVERHEAD_IN_TURN_P50 = Quantity("overhead_in_turn_p50", "us", interval="order statistic")
 BARE_RUN_P50 = Quantity("bare_run_p50", "us")
+
+
+def ratio_at_threads(ratio: Measurement, threads: int) -> Measurement:
+    """Return a ratio of latencies as that at a number of threads."""
+    family = LATENCY_RATIO_AT if ratio.name == LATENCY_RATIO.name else LATENCY_MEAN_RATIO_AT
+    return family.quantity(str(threads)).relabel(ratio)
 
 
 def latency_of_limit(limit: str) -> Quantity | None:

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from vlatool.measures import actions
+from vlatool.measures import Quantity, actions, quantity_of
 from vlatool.measures.latency import LATENCY_P50, LATENCY_P90
 from vlatool.measures.resources import MEMORY, PEAK_RSS
 from vlatool.measures.success import SUCCESS, SUCCESS_DROP
 from vlatool.optimize.budget import Budget, distance_of
-from vlatool.optimize.moves import judge_moves
+from vlatool.optimize.moves import Held, judge_moves
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
@@ -20,19 +20,11 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-12
 AGAINST_FLOAT32 = "against float32"
-FROM_FLOAT32 = {
-    actions.RELATIVE_ERROR.name,
-    actions.DISAGREEMENT.name,
-    actions.ERROR_BASELINE.name,
-    actions.GRIPPER_FLIPS_BASELINE.name,
-}
-"""The measurements that are distances from float32 themselves, beside the errors by element."""
-DROPS = {
-    SUCCESS_DROP: "success",
-    actions.AGREEMENT_DROP: "agreement with the expert",
-    actions.ERROR_INCREASE: "action error",
-}
-"""Which accuracy decides, and in words of what: the closed loop where there is one, else recorded observations."""
+FROM_FLOAT32 = (actions.RELATIVE_ERROR, actions.DISAGREEMENT, actions.ERROR_BASELINE, actions.GRIPPER_FLIPS_BASELINE)
+"""What is a distance from float32 itself, beside the errors by element."""
+RECORDED_DROPS = {actions.AGREEMENT_DROP: "agreement with the expert", actions.ERROR_INCREASE: "action error"}
+DROPS = {SUCCESS_DROP: "success", **RECORDED_DROPS}
+"""Which accuracy decides, and what of it in words: the closed loop where there is one, else recorded observations."""
 
 
 @dataclass(frozen=True)
@@ -70,53 +62,66 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_b
         The row with its role (``within`` / ``outside``; the baseline keeps its own) and the reason in words.
     """
     is_baseline = row is baseline
-    row = _with_drop(row, baseline)
-    decisive = next((measured for drop in DROPS if (measured := row.get(drop)) is not None), None)
-    if limits.metric:
-        decisive = Budget(limits.metric, 0.0).of(row)
-    rate = _both(_judge_rate(row, limits, profile, on_board), _judge_memory(row, limits, profile, on_board))
+    drops, from_float32 = ([], False) if is_baseline else _recorded_drops(row, baseline)
+    row = replace(row, measurements=(*row.measurements, *drops))
+    decisive = _decisive(row, limits, from_float32)
+    judges = (_judge_rate, _judge_memory)
+    rate = Held.all(judge_one(row, limits, profile, on_board) for judge_one in judges)
     if is_baseline:
-        reason = "; ".join(rate.reasons) or "the reference"
-        return Judged(replace(row, reason=reason), not rate.reasons, 0.0, rate.miss, (), rate.warnings)
+        reason = "; ".join(miss.words for miss in rate.missed) or "the reference"
+        return Judged(replace(row, reason=reason), not rate.missed, 0.0, rate.miss, (), rate.warnings)
     if row.reason and baseline.get(SUCCESS) is not None and row.get(SUCCESS) is None:
         return Judged(row, False, math.nan, math.inf)  # its episodes were not played, and the reason says why
-    accuracy = _both(_judge_accuracy(row, decisive, limits), _judge_distance(row, decisive, limits))
-    moves = judge_moves(row, limits)
-    accuracy = _both(accuracy, _Verdict(moves.reasons, moves.miss, moves.warnings))
-    reasons = (*accuracy.reasons, *rate.reasons)
+    found = Held.all((_judge_accuracy(row, decisive, limits), _judge_distance(row, decisive, limits),
+                      judge_moves(row, limits)))  # fmt: skip
+    missed = (*found.missed, *rate.missed)
     kept = f"{_drop_words(decisive)}, within {_allowed(limits, decisive)}" if decisive else ""
-    row = replace(row, role="outside" if reasons else "within", reason="; ".join(reasons) or kept)
-    warnings = (*rate.warnings, *(() if reasons else accuracy.warnings))
-    drop = decisive.value if decisive else math.nan
-    return Judged(row, not reasons, drop, accuracy.miss + rate.miss, (), warnings)
+    reason = "; ".join(miss.words for miss in missed) or kept
+    row = replace(row, role="outside" if missed else "within", reason=reason)
+    warnings = (*rate.warnings, *(() if missed else found.warnings))
+    drop = decisive.measured.value if decisive else math.nan
+    return Judged(row, not missed, drop, found.miss + rate.miss, (), warnings)
 
 
 @dataclass(frozen=True)
-class _Verdict:
-    """What one limit says: reasons against the row, by how much it misses, and reservations."""
+class _Decisive:
+    """The number that decides about accuracy.
 
-    reasons: tuple[str, ...] = ()
-    miss: float = 0.0
-    warnings: tuple[str, ...] = ()
+    Args:
+        measured: drop, or the metric that was named.
+        from_float32: whether it is a distance from float32's own answers, since nobody says what is right.
+    """
+
+    measured: Measurement
+    from_float32: bool = False
 
 
-def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verdict:
-    if drop is None or not drop.known:
+def _decisive(row: Row, limits: Limits, from_float32: bool) -> _Decisive | None:
+    drop = next((measured for drop in DROPS if (measured := row.get(drop)) is not None), None)
+    measured = Budget(limits.metric, 0.0).of(row) if limits.metric else drop
+    return (
+        None if measured is None else _Decisive(measured, from_float32 and quantity_of(measured.name) in RECORDED_DROPS)
+    )
+
+
+def _judge_accuracy(row: Row, decisive: _Decisive | None, limits: Limits) -> Held:
+    if decisive is None or not (drop := decisive.measured).known:
         reason = "its accuracy is unmeasured: the policy brings neither an environment nor evaluation data"
-        return _Verdict((reason,), math.inf)
+        return Held.missing(math.inf, reason)
     if limits.metric:
         allowed = limits.max_metric or 0.0
         if drop.value <= allowed:
-            return _Verdict()
-        over_limit = f"{_drop_words(drop)}, allowed {_allowed(limits, drop)}"
-        return _Verdict((over_limit,), drop.value / max(allowed, 1e-9) - 1)
+            return Held()
+        over_limit = f"{_drop_words(decisive)}, allowed {_allowed(limits, decisive)}"
+        return Held.missing(drop.value / max(allowed, 1e-9) - 1, over_limit)
     over = drop.value - limits.max_drop
     if over > TOLERANCE:
-        return _Verdict((f"{_drop_words(drop)}, {_points(over)} over the budget",), over / max(limits.max_drop, 0.001))
+        words = f"{_drop_words(decisive)}, {_points(over)} over the budget"
+        return Held.missing(over / max(limits.max_drop, 0.001), words)
     high = drop.high or 0.0
     if high <= limits.max_drop:
-        return _Verdict()
-    return _Verdict(
+        return Held()
+    return Held(
         warnings=(
             f"{row.name}: the drop could be as large as {_points(high)} ({drop.samples} paired samples cannot exclude "
             "it); more episodes would narrow it: --episodes",
@@ -124,23 +129,24 @@ def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verd
     )
 
 
-def _judge_distance(row: Row, decisive: Measurement | None, limits: Limits) -> _Verdict:
+def _judge_distance(row: Row, decisive: _Decisive | None, limits: Limits) -> Held:
     """Judge the distance from float32's own actions, which a drop against the expert or of success does not show."""
     distance = distance_of(row)
     if distance is None or (decisive is not None and _is_distance(decisive)):
-        return _Verdict()
+        return Held()
     if not distance.known:
-        return _Verdict((f"its distance from float32 is unknown: {distance.note}",), math.inf)
+        return Held.missing(math.inf, f"its distance from float32 is unknown: {distance.note}")
     if distance.value <= limits.max_distance:
-        return _Verdict()
+        return Held()
     reason = f"{_distance_words(distance)}, allowed {_percent(limits.max_distance)} (--max-distance)"
-    return _Verdict((reason,), distance.value / max(limits.max_distance, 1e-9) - 1)
+    return Held.missing(distance.value / max(limits.max_distance, 1e-9) - 1, reason)
 
 
-def _is_distance(decisive: Measurement) -> bool:
-    """Say whether what decides is a distance from float32 itself, so that the limit on it is the user's."""
-    known = decisive.name in FROM_FLOAT32 or actions.ERROR_BASELINE_OF.pattern.part(decisive.name) is not None
-    return known or decisive.note == AGAINST_FLOAT32
+def _is_distance(decisive: _Decisive) -> bool:
+    """Return whether what decides is a distance from float32 itself, so that the limit on it is the user's."""
+    name = decisive.measured.name
+    distance = quantity_of(name) in FROM_FLOAT32 or actions.ERROR_BASELINE_OF.pattern.part(name) is not None
+    return decisive.from_float32 or distance
 
 
 def _distance_words(distance: Measurement) -> str:
@@ -153,71 +159,70 @@ def _percent(share: float) -> str:
     return f"{100 * share:,.0f} %" if share >= 10 else f"{100 * share:.3g} %"
 
 
-def _with_drop(row: Row, baseline: Row) -> Row:
-    """Add the drop on recorded observations, in the direction in which more is worse."""
-    if row is baseline:
-        return row
-    drops: list[Measurement] = []
+def _recorded_drops(row: Row, baseline: Row) -> tuple[list[Measurement], bool]:
+    """Return the drops on recorded observations, more is worse; and whether they are distances from float32 itself."""
+    drops = []
     for quantity, drop, sign in (
         (actions.AGREEMENT_EXPERT, actions.AGREEMENT_DROP, -1.0),
         (actions.ERROR_EXPERT, actions.ERROR_INCREASE, 1.0),
     ):
         own, base = row.get(quantity), baseline.get(quantity)
         if own is not None and base is not None and own.known:
-            value, note = sign * (own.value - base.value), "recorded observations"
-            drops.append(drop.measurement(value, where=own.where, samples=own.samples, note=note))
-    if not drops:
-        agreement = row.get(actions.AGREEMENT_BASELINE)
-        against = agreement or row.get(actions.ERROR_BASELINE)
-        if against is not None and against.known:
-            value, drop = (
-                (1.0 - against.value, actions.AGREEMENT_DROP) if agreement else (against.value, actions.ERROR_INCREASE)
-            )
-            drops.append(drop.measurement(value, where=against.where, samples=against.samples, note=AGAINST_FLOAT32))
-    return replace(row, measurements=(*row.measurements, *drops))
+            drops.append(_drop(drop, sign * (own.value - base.value), own, "recorded observations"))
+    if drops:
+        return drops, False
+    agreement, error = row.get(actions.AGREEMENT_BASELINE), row.get(actions.ERROR_BASELINE)
+    if agreement is not None:
+        drops = (
+            [_drop(actions.AGREEMENT_DROP, 1.0 - agreement.value, agreement, AGAINST_FLOAT32)]
+            if agreement.known
+            else []
+        )
+    elif error is not None and error.known:
+        drops = [_drop(actions.ERROR_INCREASE, error.value, error, AGAINST_FLOAT32)]
+    return drops, bool(drops)
 
 
-def _both(first: _Verdict, second: _Verdict) -> _Verdict:
-    reasons, warnings = (*first.reasons, *second.reasons), (*first.warnings, *second.warnings)
-    return _Verdict(reasons, first.miss + second.miss, warnings)
+def _drop(quantity: Quantity, value: float, own: Measurement, note: str) -> Measurement:
+    return quantity.measurement(value, where=own.where, samples=own.samples, note=note)
 
 
-def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> _Verdict:
+def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> Held:
     """Judge the memory: by what a fresh process took here, or by the prediction for another board."""
     if limits.max_memory_mb is None:
-        return _Verdict()
+        return Held()
     measured = profile is None or on_board
     memory = row.get(PEAK_RSS) if measured else row.get(MEMORY, "predicted")
     if memory is None or not memory.known:
-        return _Verdict(warnings=(f"{row.name}: its memory is not known, so {limits.max_memory_mb:g} MB is unjudged",))
+        return Held(warnings=(f"{row.name}: its memory is not known, so {limits.max_memory_mb:g} MB is unjudged",))
     if memory.value <= limits.max_memory_mb:
-        return _Verdict()
+        return Held()
     reason = f"needs {memory.value:.4g} MB{'' if measured else ' (predicted)'} > {limits.max_memory_mb:g} MB"
-    return _Verdict((reason,), memory.value / limits.max_memory_mb - 1)
+    return Held.missing(memory.value / limits.max_memory_mb - 1, reason)
 
 
-def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> _Verdict:
+def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> Held:
     """Judge the latency: on the board by what was measured, elsewhere by the prediction for the board."""
     budget_ms = limits.latency_ms
     if budget_ms is None:
-        return _Verdict()
+        return Held()
     if on_board or profile is None:
         latency = row.get(LATENCY_P90) or row.get(LATENCY_P50)
         p90 = latency.value if latency else math.inf
-        late = (f"p90 latency {p90:.3g} ms > {budget_ms:.3g} ms",)
-        return _Verdict(late, p90 / budget_ms - 1) if p90 > budget_ms else _Verdict()
+        late = f"p90 latency {p90:.3g} ms > {budget_ms:.3g} ms"
+        return Held.missing(p90 / budget_ms - 1, late) if p90 > budget_ms else Held()
     predicted = row.get(LATENCY_P50, "predicted")
     if predicted is None or not predicted.known:
         unjudged = f"{row.name}: no latency can be predicted for {profile.name}, so {_rate(limits)} is unjudged"
-        return _Verdict(warnings=(unjudged,))
+        return Held(warnings=(unjudged,))
     low, high = predicted.low or predicted.value, predicted.high or predicted.value
     reason = f"predicted {predicted.value:.3g} ms ({low:.3g}-{high:.3g}) on {profile.name}"
     reason += f", {_rate(limits)} needs {budget_ms:.3g} ms"
     if low > budget_ms:
-        return _Verdict((reason,), predicted.value / budget_ms - 1)
+        return Held.missing(predicted.value / budget_ms - 1, reason)
     if high > budget_ms:
-        return _Verdict(warnings=(f"{row.name}: {reason}: too close to call, measure on the board",))
-    return _Verdict()
+        return Held(warnings=(f"{row.name}: {reason}: too close to call, measure on the board",))
+    return Held()
 
 
 def _rate(limits: Limits) -> str:
@@ -225,17 +230,19 @@ def _rate(limits: Limits) -> str:
     return "--max-latency-ms" if slow else f"{limits.hz:g} Hz"
 
 
-def _allowed(limits: Limits, drop: Measurement) -> str:
+def _allowed(limits: Limits, decisive: _Decisive) -> str:
     if not limits.metric:
         return _points(limits.max_drop)
-    return f"{limits.max_metric:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
+    unit = decisive.measured.unit
+    return f"{limits.max_metric:.4g}{'' if unit == '1' else ' ' + unit}"
 
 
-def _drop_words(drop: Measurement) -> str:
-    name = next((words for quantity, words in DROPS.items() if quantity.name == drop.name), "")
-    if not name:
+def _drop_words(decisive: _Decisive) -> str:
+    drop = decisive.measured
+    name = DROPS.get(quantity_of(drop.name))
+    if name is None:
         return f"{drop.name} is {drop.value:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
-    if drop.note == AGAINST_FLOAT32:
+    if decisive.from_float32:
         return _distance_words(drop if drop.name == actions.ERROR_INCREASE.name else actions.DISAGREEMENT.relabel(drop))
     if drop.name == actions.ERROR_INCREASE.name:
         return f"{name} {'rises' if drop.value >= 0 else 'falls'} by {_points(abs(drop.value))}"

@@ -22,7 +22,7 @@ from vlatool.measures.success import SUCCESS_DROP
 from vlatool.measures.training import TRAINING_TIME
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.made import candidate
-from vlatool.optimize.moves import Moves, judge_moves
+from vlatool.optimize.moves import Held, judge_moves
 from vlatool.optimize.plan import Plan, transforms
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.search import QUICK
@@ -117,8 +117,8 @@ class PrunedSearch:
         try:
             made = self._made(space.stages(shape))
             drop, moves = self._judged(made[-1])
-            return Tried(shape, self._speedup(made[-1]), drop, _training_s(made), refused="; ".join(moves.reasons),
-                         miss=moves.miss)  # fmt: skip
+            return Tried(shape, self._speedup(made[-1]), drop, _training_s(made), miss=moves.miss,
+                         refused="; ".join(miss.words for miss in moves.missed))  # fmt: skip
         except VlatoolError as failure:
             if failure.exit_code not in NOT_MADE:
                 raise
@@ -133,14 +133,14 @@ class PrunedSearch:
         timing = Latency(against=(bundle.path,), iterations=TIMED, threads=threads, engine=engine, **QUICK)
         return cached_measure(timing, self.baseline, self.plan.cache, self.context).rows[-1].value(SPEEDUP)
 
-    def _judged(self, bundle: Bundle) -> tuple[float, Moves]:
+    def _judged(self, bundle: Bundle) -> tuple[float, Held]:
         """Return what a policy loses in paired episodes, and whether it moves worse than allowed.
 
         Without an environment, it is the error on recorded observations.
         """
         loop = self.plan.closed_loop
         if loop is None or self.plan.recipe.limits.metric:
-            return self._error(bundle), Moves()
+            return self._error(bundle), Held()
         loop = loop.model_copy(
             update={"episodes": self.plan.recipe.pruning.episodes, "first_seed": SELECTION_SEEDS, "baseline": None}
         )
@@ -213,7 +213,7 @@ def with_measured(table: list[dict[str, Any]], rows: Mapping[str, Row]) -> list[
     lines = []
     for line in table:
         speed = rows[line["policy"]].get(SPEEDUP) if line["policy"] in rows else None
-        if line["note"] == NOT_MEASURED and speed is not None and speed.known:
+        if not line["within"] and speed is not None and speed.known:
             line = {**line, "speed-up": f"{speed.value:.2f}x", "note": MEASURED_AGAIN}
         lines.append(line)
     return lines

@@ -4,20 +4,22 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from _examined import found as examined
+from _examined import of, of_bundles
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.gate.claims import growth
-from vlatool.gate.claims.growth import examine_memory, examine_size, judged
-from vlatool.gate.config import GrowthClaim, LatencyClaim
+from vlatool.gate.claims import memory
+from vlatool.gate.claims.memory import Memory
+from vlatool.gate.claims.size import Size
 from vlatool.report import Measurement
-from vlatool.stage.base import Context
 
 
 @pytest.mark.parametrize(
     ("mine", "margin", "verdict"), [(110, 0.1, "pass"), (111, 0.1, "fail"), (50, 0.0, "pass"), (100, 0.0, "pass")]
 )
 def test_growth_up_to_the_margin_passes(mine: float, margin: float, verdict: str) -> None:
-    found = judged("memory", 100.0, Measurement("peak_rss", mine, "MB"), GrowthClaim(margin=margin))
+    claim = Memory(margin=margin)
+    found = of("memory", claim.judge(Measurement("peak_rss", mine, "MB"), 100.0), claim)
     assert found.verdict == verdict
     assert found.sentence == f"{mine:.1f} MB, the baseline 100.0 MB ({mine - 100:+.1f}%; allowed: {margin:+.1%})"
 
@@ -25,10 +27,10 @@ def test_growth_up_to_the_margin_passes(mine: float, margin: float, verdict: str
 def test_the_size_is_that_of_graphs_and_assets(float_bundle: Bundle, int8_bundle: Bundle) -> None:
     names = ("graphs/main.onnx", "assets/statistics.json", "assets/vocabulary.json")
     sizes = [sum((bundle.path / name).stat().st_size for name in names) / 1e6 for bundle in (float_bundle, int8_bundle)]
-    found = examine_size(int8_bundle, float_bundle, GrowthClaim(margin=10))
+    found = examined(Size(margin=10), candidate=int8_bundle, baseline=float_bundle)
     assert found.measurements[0].value == pytest.approx(sizes[1])
     assert found.verdict == "pass"
-    assert examine_size(float_bundle, float_bundle, GrowthClaim(margin=0)).verdict == "pass"
+    assert examined(Size(margin=0), candidate=float_bundle, baseline=float_bundle).verdict == "pass"
 
 
 @pytest.mark.parametrize("place", ["graphs/more.bin", "assets/more.bin", "data/more.bin", "reports/more.json"])
@@ -36,7 +38,7 @@ def test_a_file_counts_wherever_it_lies_and_whoever_lists_it(float_bundle: Bundl
     larger = copied(float_bundle)
     (larger.path / place).parent.mkdir(exist_ok=True)
     (larger.path / place).write_bytes(bytes(1_000_000))
-    found = examine_size(larger, float_bundle, GrowthClaim(margin=0.1))
+    found = examined(Size(margin=0.1), candidate=larger, baseline=float_bundle)
     assert found.verdict == "fail"
     assert found.measurements[0].value - found.baseline[0].value == pytest.approx(1.0)
 
@@ -63,19 +65,17 @@ def test_the_memory_is_that_of_fresh_processes(
     asked = []
 
     def probed(path, engine, threads, timeout, observations):
-        assert observations is None
+        assert observations.is_file(), "beside the golden one"
         asked.append((path, threads, timeout))
         return SimpleNamespace(peak_rss_mb=90.0 if path == float_bundle.path else 120.0 + len(asked))
 
-    monkeypatch.setattr(growth, "cold_start", probed)
-    found = examine_memory(
-        int8_bundle, float_bundle, GrowthClaim(margin=0.1), LatencyClaim(threads=2, timeout=60), Context()
-    )
+    monkeypatch.setattr(memory, "cold_start", probed)
+    found = of_bundles(int8_bundle, float_bundle, Memory(margin=0.1), threads=2, timeout=60)
     assert (found.verdict, found.measurements[0].value) == ("fail", 123.0)
     assert asked == [(path, 2, 60) for _ in range(3) for path in (int8_bundle.path, float_bundle.path)]
 
 
 def test_a_bundle_takes_as_much_as_itself(float_bundle: Bundle) -> None:
-    found = examine_memory(float_bundle, float_bundle, GrowthClaim(margin=0.5), LatencyClaim(), Context())
+    found = of_bundles(float_bundle, float_bundle, Memory(margin=0.5))
     assert found.verdict == "pass"
     assert found.measurements[0].value > 10

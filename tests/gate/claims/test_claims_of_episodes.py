@@ -6,19 +6,22 @@ import re
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from _examined import found
 from _full import small_or_full
 from pydantic import ValidationError
 
 from tests._reach import EAGER, TREMBLES, bundle_of
 from vlatool.accuracy.disturbed import with_disturbed
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
-from vlatool.gate.claims import disturbed, motion, task_time, worst_task
-from vlatool.gate.config import DisturbedClaim, Gate, MotionClaim, TaskTimeClaim, WorstTaskClaim, read_gate
+from vlatool.gate.claims.disturbed import Disturbed
+from vlatool.gate.claims.motion import Motion
+from vlatool.gate.claims.task_time import TaskTime
+from vlatool.gate.claims.worst_task import WorstTask
+from vlatool.gate.config import Gate, read_gate
 from vlatool.gate.files import gate_files
 from vlatool.gate.run import run_gate
 from vlatool.report import Row
@@ -49,12 +52,12 @@ def episodes(one: list[Outcome], two: list[Outcome], **under: tuple[list[Outcome
     if under:
         own, reference = ({(kind, 1.0): pair[place] for kind, pair in under.items()} for place in (1, 0))
         row = with_disturbed(row, own, reference)
-    return SimpleNamespace(rows=(base, row))
+    return base, row
 
 
 @pytest.mark.parametrize(("jerk", "verdict"), [(1.0, "pass"), (1.05, "pass"), (1.3, "fail"), (1.1, "inconclusive")])
 def test_rougher_motion_fails(jerk: float, verdict: str):
-    result = motion.examine(episodes(played(1, 300), played(2, 300, jerk=jerk)), MotionClaim(margin=0.1))
+    result = found(Motion(margin=0.1), episodes=episodes(played(1, 300), played(2, 300, jerk=jerk)))
     assert result.verdict == verdict, result.sentence
     assert result.claim == "motion"
     assert "allowed: +10.0%" in result.sentence
@@ -66,21 +69,21 @@ def test_rougher_motion_fails(jerk: float, verdict: str):
 
 
 def test_what_is_undecided_says_how_many_episodes_would_decide():
-    claim = MotionClaim(margin=0.03)
-    result = motion.examine(episodes(played(1, 20), played(2, 20, jerk=1.01)), claim)
+    claim = Motion(margin=0.03)
+    result = found(claim, episodes=episodes(played(1, 20), played(2, 20, jerk=1.01)))
     assert result.verdict == "inconclusive", result.sentence
     (count,) = re.findall(r"common successes; allowed: \+3.0%; about ([\d,]+) would decide", result.sentence)
     wanted = int(count.replace(",", ""))
     assert wanted > 20
     more = 9 * wanted  # the estimate is as rough as the ratio that it rests on
-    assert motion.examine(episodes(played(1, more), played(2, more, jerk=1.01)), claim).verdict == "pass"
-    few = motion.examine(episodes(played(1, 5), played(2, 5)), MotionClaim())
+    assert found(claim, episodes=episodes(played(1, more), played(2, more, jerk=1.01))).verdict == "pass"
+    few = found(Motion(), episodes=episodes(played(1, 5), played(2, 5)))
     assert "would decide" not in few.sentence, "without an interval nobody knows"
 
 
 def test_honest_candidates_are_not_called_rougher():
     verdicts = [
-        motion.examine(episodes(played(10 + trial, 150), played(500 + trial, 150)), MotionClaim(margin=0.0)).verdict
+        found(Motion(margin=0.0), episodes=episodes(played(10 + trial, 150), played(500 + trial, 150))).verdict
         for trial in range(small_or_full(30, 200))
     ]
     assert verdicts.count("fail") <= small_or_full(2, 6), "1 % are expected"
@@ -88,11 +91,11 @@ def test_honest_candidates_are_not_called_rougher():
 
 def test_metrics_that_are_named_count_and_must_be_known():
     rough = episodes(played(1, 120), played(2, 120, jerk=1.5))
-    assert motion.examine(rough, MotionClaim(metrics=("path_length",), margin=0.1)).verdict == "pass"
-    result = motion.examine(rough, MotionClaim(metrics=("path_length", "gripper_flips"), margin=0.1))
+    assert found(Motion(metrics=("path_length",), margin=0.1), episodes=rough).verdict == "pass"
+    result = found(Motion(metrics=("path_length", "gripper_flips"), margin=0.1), episodes=rough)
     assert (result.verdict, "no ratio of gripper_flips (not told" in result.sentence) == ("inconclusive", True)
     with pytest.raises(ValidationError, match=r"no metric of motion jitter; allowed: .*jerk"):
-        MotionClaim(metrics=("jitter",))
+        Motion(metrics=("jitter",))
 
 
 @pytest.mark.parametrize(("runs_into", "verdict", "says"), [
@@ -106,50 +109,50 @@ def test_collisions_where_the_baseline_has_none_decide(runs_into: int, verdict: 
         Outcome("open", seed, True, 20, "", {"collisions": 4.0 if seed < runs_into else 0.0, "jerk": 1.0})
         for seed in range(60)
     ]
-    result = motion.examine(episodes(base, own), MotionClaim(metrics=("collisions",)))
+    result = found(Motion(metrics=("collisions",)), episodes=episodes(base, own))
     assert (result.verdict, result.sentence) == (verdict, says)
-    both = motion.examine(episodes(base, own), MotionClaim(metrics=("jerk", "collisions")))
+    both = found(Motion(metrics=("jerk", "collisions")), episodes=episodes(base, own))
     assert both.verdict == verdict
     assert says in both.sentence
     rough = [Outcome("open", one.seed, True, 20, "", one.motion | {"jerk": 2.0}) for one in own]
-    both = motion.examine(episodes(base, rough), MotionClaim(metrics=("jerk", "collisions")))
+    both = found(Motion(metrics=("jerk", "collisions")), episodes=episodes(base, rough))
     assert both.verdict == "fail"
     assert ("jerk +100.0%" in both.sentence, says in both.sentence) == (True, verdict == "fail"), "only what fails"
 
 
 def test_without_positions_or_common_successes_nothing_is_decided():
     bare = episodes(played(1, 60, own=False), played(2, 60, own=False))
-    assert motion.examine(bare, MotionClaim()).verdict == "inconclusive"
+    assert found(Motion(), episodes=bare).verdict == "inconclusive"
     lost = episodes(played(1, 30), played(2, 30, lost=dict.fromkeys(TASKS, 1.0)))
-    for result in (motion.examine(lost, MotionClaim()), task_time.examine(lost, TaskTimeClaim())):
+    for result in (found(Motion(), episodes=lost), found(TaskTime(), episodes=lost)):
         assert result.verdict == "inconclusive"
         assert "both succeed" in result.sentence
 
 
 @pytest.mark.parametrize(("time", "verdict"), [(1.0, "pass"), (1.2, "fail"), (1.05, "inconclusive")])
 def test_a_longer_task_fails(time: float, verdict: str):
-    result = task_time.examine(episodes(played(1, 300), played(2, 300, time=time)), TaskTimeClaim())
+    result = found(TaskTime(), episodes=episodes(played(1, 300), played(2, 300, time=time)))
     assert result.verdict == verdict, result.sentence
 
 
 def test_a_task_that_is_lost_fails_however_well_the_others_do():
     bad = episodes(played(1, 600), played(2, 600, lost={"close": 0.3}))
-    result = worst_task.examine(bad, WorstTaskClaim())
+    result = found(WorstTask(), episodes=bad)
     assert result.verdict == "fail"
     assert re.search(r"^more failed episodes: close \+2\d\.\d\d%", result.sentence)
     assert result.measurements[0].note == "close"
-    assert worst_task.examine(episodes(played(1, 30), played(2, 30)), WorstTaskClaim()).verdict == "inconclusive"
+    assert found(WorstTask(), episodes=episodes(played(1, 30), played(2, 30))).verdict == "inconclusive"
     good = played(1, 3000)
-    assert worst_task.examine(episodes(good, good), WorstTaskClaim()).verdict == "pass"
+    assert found(WorstTask(), episodes=episodes(good, good)).verdict == "pass"
 
 
 def test_a_disturbance_that_costs_more_than_the_baseline_fails():
     same = played(1, 600)
     frail = episodes(same, same, delay=(same, played(3, 600, lost=dict.fromkeys(TASKS, 0.4))), light=(same, same))
-    result = disturbed.examine(frail, DisturbedClaim())
+    result = found(Disturbed(), episodes=frail)
     assert (result.verdict, "delay" in result.sentence, "light" in result.sentence) == ("fail", True, False)
     firm = episodes(same, same, delay=(same, same), light=(same, same))
-    assert disturbed.examine(firm, DisturbedClaim()).verdict == "pass"
+    assert found(Disturbed(), episodes=firm).verdict == "pass"
 
 
 def test_a_gate_with_every_claim_runs_the_episodes_once(tmp_path: Path):
@@ -168,8 +171,8 @@ def test_a_gate_with_every_claim_runs_the_episodes_once(tmp_path: Path):
     passed = {"accuracy": "pass", "motion": "pass", "task_time": "pass", "worst_task": "pass", "disturbed": "pass"}
     assert verdicts(good) == passed
     assert verdicts(rough) == {**passed, "motion": "fail"}
-    found = verdicts(eager)
-    assert (found["accuracy"], found["worst_task"], found["disturbed"]) == ("pass", "pass", "fail")
+    verdict = verdicts(eager)
+    assert (verdict["accuracy"], verdict["worst_task"], verdict["disturbed"]) == ("pass", "pass", "fail")
 
 
 def test_claims_of_episodes_need_episodes(tmp_path: Path):
@@ -215,7 +218,7 @@ def told(count: int, missing: Collection[int] = (), names: Collection[str] = ("p
 )
 @pytest.mark.parametrize("metrics", [(), ("jerk",), ("path_length", "jerk")])
 def test_values_that_are_missing_let_nothing_pass(ours, theirs, says: str, metrics: tuple[str, ...]):
-    result = motion.examine(episodes(told(400, theirs), told(400, ours)), MotionClaim(metrics=metrics))
+    result = found(Motion(metrics=metrics), episodes=episodes(told(400, theirs), told(400, ours)))
     assert result.verdict == "inconclusive", result.sentence
     assert says in result.sentence
 
@@ -224,7 +227,7 @@ def test_values_that_are_missing_let_nothing_pass(ours, theirs, says: str, metri
     ("ours", "theirs"), [((), ()), (range(5), range(5)), (range(5), range(5, 10)), ([7], ()), ((), range(20))]
 )
 def test_values_that_are_missing_by_chance_are_reported(ours, theirs):
-    result = motion.examine(episodes(told(400, theirs), told(400, ours)), MotionClaim())
+    result = found(Motion(), episodes=episodes(told(400, theirs), told(400, ours)))
     assert result.verdict == "pass", result.sentence
     lost = len({*ours, *theirs})
     assert (f"unknown in {lost} of them" in result.sentence) == (lost > 0)
@@ -234,20 +237,20 @@ def test_missing_values_do_not_leave_another_metric_to_decide():
     """The baseline tells of a path, the candidate of no place at all: how its actions change is no answer."""
     base, own = told(60), told(60, range(60))
     base, own = ([replace(each, motion={**each.motion, "action_rate": 1.0}) for each in some] for some in (base, own))
-    result = motion.examine(episodes(base, own), MotionClaim())
+    result = found(Motion(), episodes=episodes(base, own))
     assert (result.verdict, "no ratio of path_length" in result.sentence) == ("inconclusive", True)
 
 
 def test_a_metric_that_the_baseline_has_nothing_of_needs_its_values_too():
     base = [Outcome("open", seed, True, 20, "", {"collisions": 0.0}) for seed in range(60)]
     own = [replace(each, motion={} if each.seed < 20 else each.motion) for each in base]
-    result = motion.examine(episodes(base, own), MotionClaim(metrics=("collisions",)))
+    result = found(Motion(metrics=("collisions",)), episodes=episodes(base, own))
     assert (result.verdict, "known of both in 40 of 60" in result.sentence) == ("inconclusive", True)
 
 
 def test_task_time_needs_its_values_too():
     base, own = told(60), told(60, range(30), ("task_time",))
-    result = task_time.examine(episodes(base, own), TaskTimeClaim())
+    result = found(TaskTime(), episodes=episodes(base, own))
     assert (result.verdict, "known of both in 30 of 60" in result.sentence) == ("inconclusive", True)
 
 
@@ -256,27 +259,21 @@ def test_a_clock_that_went_wrong_in_one_arm_gives_no_pair():
     base, own = told(60), told(60)
     own = [replace(each, refused={"time": "it is told at 5 of 7 moments"}, motion={"jerk": 1e-6}) for each in own]
     for metrics in ((), ("jerk",)):
-        assert motion.examine(episodes(base, own), MotionClaim(metrics=metrics)).verdict == "inconclusive"
+        assert found(Motion(metrics=metrics), episodes=episodes(base, own)).verdict == "inconclusive"
     both = [[replace(each, refused={"time": "it stands"}) for each in told(60)] for _ in range(2)]
-    assert motion.examine(episodes(*both), MotionClaim()).verdict == "pass"
+    assert found(Motion(), episodes=episodes(*both)).verdict == "pass"
 
 
 def begun(outcomes: list[Outcome], count: int) -> list[Outcome]:
     return [replace(each, start=str(number % count)) for number, each in enumerate(outcomes)]
 
 
-@pytest.mark.parametrize("claim", [motion, task_time, worst_task, disturbed])
+@pytest.mark.parametrize("claim", [Motion(), TaskTime(), WorstTask(max_drop=0.99), Disturbed(max_drop=0.99)])
 def test_episodes_that_begin_alike_decide_nothing(claim):
     """Three hundred episodes of three starts, each a hundred times."""
     one = begun([replace(each, success=True) for each in played(1, 3)] * 100, 3)
     one = [replace(each, seed=seed) for seed, each in enumerate(one)]
-    asked = {
-        motion: MotionClaim(),
-        task_time: TaskTimeClaim(),
-        worst_task: WorstTaskClaim(max_drop=0.99),
-        disturbed: DisturbedClaim(max_drop=0.99),
-    }
-    found = claim.examine(episodes(one, one, delay=(one, one)), asked[claim])
-    assert (found.verdict, "3 distinct starts" in found.sentence) == ("inconclusive", True), found.sentence
+    alike = found(claim, episodes=episodes(one, one, delay=(one, one)))
+    assert (alike.verdict, "3 distinct starts" in alike.sentence) == ("inconclusive", True), alike.sentence
     apart = [replace(each, start="") for each in one]
-    assert claim.examine(episodes(apart, apart, delay=(apart, apart)), asked[claim]).verdict == "pass"
+    assert found(claim, episodes=episodes(apart, apart, delay=(apart, apart))).verdict == "pass"

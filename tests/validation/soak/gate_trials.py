@@ -31,9 +31,10 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.bundle.bundle import Bundle, seal
-from vlatool.gate.config import Gate, LatencyClaim
-from vlatool.gate.result import worst
+from vlatool.gate.claims.latency import Latency
+from vlatool.gate.config import Gate
 from vlatool.gate.run import run_gate
+from vlatool.gate.verdict import Outcome, worst
 from vlatool.measurement.pairs import PairJob, measure_pairs
 from vlatool.stage.base import Context
 from vlatool.stats.sequential import jointly
@@ -77,7 +78,7 @@ def main() -> int:
 
 def one_gate(candidate: Bundle, base: Bundle, margin: float, number: int, output: Path) -> None:
     """Run a gate on latency alone and append its line."""
-    gate = Gate(latency=LatencyClaim(margin=margin), accuracy=None, answers=None, memory=None, size=None)
+    gate = Gate(latency=Latency(margin=margin), accuracy=None, answers=None, memory=None, size=None)
     begun = time.monotonic()
     report = run_gate(candidate, base, gate, Context(), seed=1000 * number)
     ratio = report.rows[1].get("latency_ratio")
@@ -106,9 +107,8 @@ def resampled(output: Path, gates: int, margin: float) -> None:
     lines = [json.loads(line) for line in output.read_text().splitlines()]
     pool = [both for line in lines for both in zip(line["log_ratios"], line["log_mean_ratios"], strict=True)]
     draw = random.Random(0)
-    found = Counter(
-        worst(decision.verdict for decision in jointly(lambda _: draw.choice(pool), 2, margin)[0]) for _ in range(gates)
-    )
+    gate = (jointly(lambda _: draw.choice(pool), 2, margin)[0] for _ in range(gates))
+    found = Counter(worst(Outcome(decision.verdict) for decision in decisions).value for decisions in gate)
     print(f"{gates} gates drawn from {len(pool)} processes (median and mean): {dict(found)}")
     slow = sum("found an observation that is slower" in line["said"] for line in lines)
     print(f"{slow} of {len(lines)} gates found an observation that is slower each time")

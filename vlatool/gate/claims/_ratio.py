@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
-from vlatool.report import Measurement
+from vlatool.accuracy.moved import Ratio
+from vlatool.gate.claim import Claim
+from vlatool.gate.plan import Need
+from vlatool.gate.verdict import CONFIDENCE, Judgement, Outcome, judge_interval, samples_wanted, worst
 
-MOST = 100_000
-"""Common successes beyond which it is no advice that they would decide."""
+MAX_PAIRS = 100_000
+"""Common successes beyond which it is not a useful advice that they would decide."""
 
 
-def judged(claim: str, ratios: Mapping[str, Measurement], margin: float, nothing: str) -> ClaimResult:
-    """Hold ratios to the baseline against 1 + margin: one that is above it fails, all must be shown to be below.
+class Ratios(Claim):
+    """Base of claims about ratios to the baseline: one above 1 + margin fails, all must be shown to be below."""
 
-    Args:
-        claim: Its name.
-        ratios: Title -> ratio with its interval.
-        margin: Largest growth, a share.
-        nothing: What to say where there is no ratio.
-    """
-    if not ratios:
-        return ClaimResult(claim, "inconclusive", nothing)
-    verdicts = {title: _verdict(ratio, 1 + margin) for title, ratio in ratios.items()}
-    verdict = worst(verdicts.values())
-    told = [_told(title, ratio) for title, ratio in ratios.items() if verdicts[title] == verdict or verdict == "pass"]
-    count = max(ratio.samples for ratio in ratios.values())
-    end = f"{count} common successes; allowed: {margin:+.1%}"
-    if verdict == "inconclusive" and (more := _wanted(list(ratios.values()), 1 + margin)):
-        end += f"; about {more:,} would decide"
-    return ClaimResult(claim, verdict, f"{', '.join(told)} ({end})", tuple(ratios.values()))
+    needs = frozenset({Need.EPISODES})
+
+    margin: float
+    """Largest growth, a share."""
+
+    def judge(self, title: str, ratio: Ratio) -> Judgement:
+        """Hold a ratio against the limit."""
+        return judge_interval(ratio.measured, 1 + self.margin, title, remarks=ratio.remarks)
+
+    def ratio_words(self, judged: Sequence[Judgement]) -> str:
+        """Return the ratios that decide, and how many episodes would where they do not."""
+        outcome = worst(each.outcome for each in judged)
+        shown = [each for each in judged if each.outcome is outcome]
+        count = max(each.measured.samples for each in judged if each.measured)
+        end = f"{count} common successes; allowed: {self.margin:+.1%}"
+        wanted = [samples_wanted(each) for each in shown]
+        if outcome is Outcome.INCONCLUSIVE and all(wanted) and max(wanted) <= MAX_PAIRS:
+            end += f"; about {max(wanted):,} would decide"
+        return f"{', '.join(map(_words, shown))} ({end})"
 
 
 def confidence_of(count: int) -> float:
@@ -38,31 +42,10 @@ def confidence_of(count: int) -> float:
     return 1 - (1 - CONFIDENCE) / max(1, count)
 
 
-def _verdict(ratio: Measurement, allowed: float) -> str:
-    if ratio.low is None or ratio.high is None:
-        return "inconclusive"
-    return "fail" if ratio.low > allowed else "pass" if ratio.high <= allowed else "inconclusive"
-
-
-def _wanted(ratios: Sequence[Measurement], allowed: float) -> int:
-    """Return how many common successes would decide what is undecided; 0 where no sensible number would.
-
-    An interval narrows with the root of the number.
-    """
-    numbers = []
-    for ratio in ratios:
-        if _verdict(ratio, allowed) != "inconclusive":
-            continue
-        gap = abs(allowed - ratio.value)
-        if ratio.low is None or ratio.high is None or not gap:
-            return 0
-        reach = ratio.high - ratio.value if ratio.value < allowed else ratio.value - ratio.low
-        numbers.append(max(ratio.samples + 1, math.ceil(ratio.samples * (reach / gap) ** 2)))
-    wanted = max(numbers, default=0)
-    return wanted if wanted <= MOST else 0
-
-
-def _told(title: str, ratio: Measurement) -> str:
+def _words(judged: Judgement) -> str:
+    ratio = judged.measured
+    if ratio is None:
+        return judged.title
     span = "" if ratio.low is None or ratio.high is None else f" ({ratio.low - 1:+.1%} to {ratio.high - 1:+.1%})"
-    where = ratio.note.partition("; ")[2]
-    return f"{title} {ratio.value - 1:+.1%}{span}{f', {where}' if where else ''}"
+    remarks = "; ".join(judged.facts["remarks"])
+    return f"{judged.title} {ratio.value - 1:+.1%}{span}{f', {remarks}' if remarks else ''}"

@@ -3,156 +3,159 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from pydantic import Field
 
-from vlatool.accuracy.credibility import DECIDE, credibility
+from vlatool.accuracy.credibility import DECIDE, Credibility, credibility
 from vlatool.accuracy.losses import drop, losses
 from vlatool.accuracy.paired import few_starts, repeated_starts
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import EVALUATION, read_recording
+from vlatool.data import read_recording
 from vlatool.errors import DataError
 from vlatool.evaluate.recorded import alone, run_recorded
-from vlatool.gate.config import AccuracyClaim
-from vlatool.gate.episodes import Episodes
-from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
-from vlatool.measures import series
+from vlatool.gate.claim import Claim
+from vlatool.gate.evidence import Evidence, recorded_data
+from vlatool.gate.plan import Need, Plan
+from vlatool.gate.verdict import CONFIDENCE, Judgement, Outcome, Reason, Verdict, judge_interval, samples_wanted
+from vlatool.measures import Quantity, series
+from vlatool.measures.actions import RECORDED_DROP
+from vlatool.measures.success import SUCCESS, SUCCESS_DROP
 from vlatool.report import Measurement, Row
-from vlatool.stage.base import Context
 from vlatool.stats.starts import distinct, independent
 from vlatool.stats.success_sequential import exact_drop
 
-MOST_SAMPLES = 100_000
+MAX_SAMPLES = 100_000
+EXAMPLE = """
+accuracy:
+  max_drop: 0.01       # one point, on the same samples (and episodes) as the baseline
+  # data: data/evaluation.npz   # recorded observations and actions; the baseline's own when not given
+  # episodes: 200               # also closed-loop episodes, on paired seeds
+  # policy: policy              # directory of the policy.yaml that names environment and tasks
+"""
 
 
-@dataclass(frozen=True)
-class _Drop:
-    name: str
-    words: str
-    value: float
-    low: float
-    high: float
-    samples: int
-    baseline: tuple[Measurement, ...] = ()
-    warnings: tuple[str, ...] = ()
-    candidate: tuple[Measurement, ...] = ()
-    starts: str = ""
-    few: str = ""
+class Accuracy(Claim):
+    """The candidate is not worse than the baseline by more than a drop, on the same data or the same episodes."""
 
-    def verdict(self, allowed: float) -> str:
-        if self.few:
-            return "inconclusive"
-        return "fail" if self.low > allowed else "pass" if self.high <= allowed else "inconclusive"
+    needs = frozenset({Need.RECORDINGS})
+    by_default = True
+    order = 20
+    example = EXAMPLE
 
-    def told(self, allowed: float) -> str:
-        ends = " to ".join(f"{end:+.2%}" if math.isfinite(end) else "unbounded" for end in (self.low, self.high))
-        words = f"{self.words} {self.value:+.2%} ({ends}, {self.samples} of them{self.starts}; allowed: {allowed:+.2%})"
-        gap = abs(allowed - self.value)
-        if self.verdict(allowed) != "inconclusive":
-            return words
-        if self.few:
-            return f"{words}; {self.few}"
-        if not (math.isfinite(self.low) and math.isfinite(self.high)):
-            return f"{words}, of one episode alone, which says nothing of others"
-        if gap:  # an interval narrows with the root of the number
-            reach = (self.high - self.value) if self.value < allowed else (self.value - self.low)
-            words += f", about {max(self.samples + 1, math.ceil(self.samples * (reach / gap) ** 2)):,} would decide"
-        return words
+    max_drop: float = Field(0.01, ge=0, le=1, description="largest drop, a share (0.01 = 1 point)")
+    data: Path | None = Field(None, description="recorded observations and actions; the baseline's own when not given")
+    episodes: int = Field(0, ge=0, description="closed-loop episodes over all tasks; 0 for recorded observations alone")
+    policy: Path | None = Field(None, description="directory of the policy.yaml that names environment and tasks")
 
+    def extend_plan(self, plan: Plan) -> Plan:
+        """Name the recordings, and the episodes that other claims look at, too."""
+        plan = replace(super().extend_plan(plan), data=self.data, episodes=self.episodes, policy=self.policy)
+        return replace(plan, needs=plan.needs | {Need.EPISODES}) if self.episodes else plan
 
-def examine(
-    candidate: Bundle,
-    baseline: Bundle,
-    claim: AccuracyClaim,
-    context: Context,
-    engine: str = "",
-    episodes: Episodes | None = None,
-) -> ClaimResult:
-    """Examine the drop on recorded observations, and in the closed loop where episodes are asked for.
+    def check(self, baseline: Bundle, plan: Plan) -> None:
+        """Refuse a claim that there is nothing to examine on."""
+        if recorded_data(baseline, plan) is None and not plan.episodes:
+            raise DataError(
+                f"Accuracy is claimed, but the baseline {baseline.path} carries no evaluation data (those of the "
+                "candidate do not count) and no episodes are asked for.",
+                "name recorded data (accuracy: data) or episodes in the gate, or set accuracy: null",
+            )
 
-    Args:
-        candidate, baseline: Each is run with its own statistics and vocabulary, and judged by its physical actions.
-        claim: What is claimed.
-        context: Progress and workers.
-        engine: Of the runtime, that of the other claims; the one that each bundle was made for when empty.
-        episodes: Those that other claims look at, too; its own when None.
+    def examine(self, evidence: Evidence) -> Verdict:
+        """Examine the drop on recorded observations, and in the closed loop where episodes are asked for.
 
-    Raises:
-        DataError: when there is neither.
-    """
-    drops: list[_Drop] = []
-    if (data := data_of(baseline, claim)) is not None:
-        drops.append(_recorded(candidate, baseline, data, context, engine))
-    if claim.episodes:
-        drops.append(_closed_loop(episodes or Episodes(candidate, baseline, claim, context, engine)))
-    words = [lost.told(claim.max_drop) for lost in drops]
-    measured = tuple(
-        Measurement(lost.name, lost.value, "1", samples=lost.samples, low=finite(lost.low), high=finite(lost.high),
-                    confidence=CONFIDENCE, note=lost.words.rstrip(":"))
-        for lost in drops
-    )  # fmt: skip
-    measured += tuple(number for lost in drops for number in lost.candidate)
-    baselines = tuple(number for lost in drops for number in lost.baseline if number.name in DECIDE)
-    trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
-    verdict = "inconclusive" if trust.fails else worst(lost.verdict(claim.max_drop) for lost in drops)
-    unjudged = [warning for lost in drops for warning in lost.warnings]
-    reservations = [sentence.rstrip(".") for sentence in trust.sentences]
-    return ClaimResult(
-        "accuracy", verdict, "; ".join([*reservations, *words, *trust.warnings, *unjudged]), measured, baselines
-    )
+        Each bundle is run with its own statistics and vocabulary, and judged by its physical actions.
+        """
+        parts: list[_Part] = []
+        if evidence.recording_path is not None:
+            parts.append(self._on_recordings(evidence, evidence.recording_path))
+        if self.episodes:
+            parts.append(self._in_episodes(*evidence.episodes))
+        baselines = tuple(number for part in parts for number in part.baseline if number.name in DECIDE)
+        trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
+        notes = [note for part in parts for note in part.notes]
+        found = Verdict.of([part.judged for part in parts], baselines, trust=trust, notes=notes)
+        measured = (*found.measurements, *(number for part in parts for number in part.candidate))
+        outcome, reason = found.outcome, found.reason
+        if trust.fails:
+            outcome, reason = Outcome.INCONCLUSIVE, Reason.REFERENCE_FAILS
+        return replace(found, outcome=outcome, reason=reason, measurements=measured)
 
+    def _in_episodes(self, baseline: Row, candidate: Row) -> _Part:
+        before, after = (row.raw[series.SUCCESS] for row in (baseline, candidate))
+        lost = sum(one > two for one, two in zip(before, after, strict=True))
+        won = sum(one < two for one, two in zip(before, after, strict=True))
+        starts = baseline.raw[series.START]
+        interval = exact_drop(lost, won, len(before), CONFIDENCE, independent(starts))
+        judged = self._held(SUCCESS_DROP, "more failed episodes:", interval, len(before), distinct(starts))
+        if few := few_starts(baseline):
+            judged = replace(judged, outcome=Outcome.INCONCLUSIVE, reason=Reason.FEW_STARTS,
+                             facts={**judged.facts, "few": few})  # fmt: skip
+        own = tuple(number for number in candidate.measurements if number.name == SUCCESS.name)
+        return _Part(judged, baseline.measurements, own, repeated_starts(baseline))
 
-def finite(bound: float) -> float | None:
-    """Return a bound of an interval; None where there is none."""
-    return bound if math.isfinite(bound) else None
-
-
-def data_of(baseline: Bundle, claim: AccuracyClaim) -> Path | None:
-    """Return the recorded observations that the claim is examined on, None for the closed loop alone.
-
-    They are the gate's or the baseline's, never the candidate's: it would choose what it is judged on.
-
-    Raises:
-        DataError: when there are none and no episodes are asked for.
-    """
-    own = baseline.path / EVALUATION if EVALUATION in baseline.manifest.files else None
-    if (data := claim.data or own) is None and not claim.episodes:
-        raise DataError(
-            f"Accuracy is claimed, but the baseline {baseline.path} carries no evaluation data (those of the candidate "
-            "do not count) and no episodes are asked for.",
-            "name recorded data (accuracy: data) or episodes in the gate, or set accuracy: null",
+    def _on_recordings(self, evidence: Evidence, data: Path) -> _Part:
+        action = evidence.baseline.manifest.spec.action
+        recording = read_recording(data, evidence.baseline.manifest.spec)
+        indices = recording.spread(MAX_SAMPLES)
+        mine, theirs = (
+            run_recorded(bundle, recording, indices, evidence.plan.engine, evidence.context)
+            for bundle in (evidence.candidate, evidence.baseline)
         )
-    return data
+        episodes = None if recording.episodes is None else recording.episodes[indices]
+        expert = None if recording.actions is None else recording.actions[indices]
+        if expert is None:  # nobody says what is right: the baseline's own actions are
+            off, before = losses(action, mine, theirs), np.zeros(len(indices))
+            title = "distance from the baseline's actions:"
+        else:
+            off, before = losses(action, mine, expert), losses(action, theirs, expert)
+            title = "more distance from the expert's actions than the baseline has:"
+        interval = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
+        judged = self._held(RECORDED_DROP, title, interval, len(indices))
+        return _Part(judged, tuple(alone(action, theirs, expert, episodes)), notes=recording.unjudged)
+
+    def _held(
+        self, quantity: Quantity, title: str, drop: tuple[float, float, float], samples: int, starts: int = 0
+    ) -> Judgement:
+        value, *ends = drop
+        low, high = (end if math.isfinite(end) else None for end in ends)
+        measured = quantity.measurement(
+            value, samples=samples, low=low, high=high, confidence=CONFIDENCE, note=title.rstrip(":")
+        )
+        return judge_interval(measured, self.max_drop, title, starts=starts)
+
+    def sentence(self, verdict: Verdict) -> str:
+        """Return whether the baseline is a reference at all, each drop, and what a reader should know."""
+        trust: Credibility = verdict.facts["trust"]
+        reservations = (sentence.rstrip(".") for sentence in trust.sentences)
+        drops = map(drop_words, verdict.judgements)
+        return "; ".join([*reservations, *drops, *trust.warnings, *verdict.facts["notes"]])
 
 
-def _closed_loop(episodes: Episodes) -> _Drop:
-    rows = episodes.rows
-    before, after = (row.raw["success"] for row in rows)
-    lost = sum(one > two for one, two in zip(before, after, strict=True))
-    won = sum(one < two for one, two in zip(before, after, strict=True))
-    starts = rows[0].raw[series.START]
-    value, low, high = exact_drop(lost, won, len(before), CONFIDENCE, independent(starts))
-    own = tuple(number for number in rows[1].measurements if number.name == "success")
-    words, begun = "more failed episodes:", f", {distinct(starts)} distinct starts"
-    return _Drop("success_drop", words, value, low, high, len(before), rows[0].measurements,
-                 repeated_starts(rows[0]), own, begun, few_starts(rows[0]))  # fmt: skip
+class _Part(NamedTuple):
+    """A drop, numbers for the rows of both, and what a reader should know."""
+
+    judged: Judgement
+    baseline: tuple[Measurement, ...]
+    candidate: tuple[Measurement, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
-def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context, engine: str) -> _Drop:
-    recording = read_recording(data, baseline.manifest.spec)
-    indices = recording.spread(MOST_SAMPLES)
-    action = baseline.manifest.spec.action
-    mine, theirs = (run_recorded(bundle, recording, indices, engine, context) for bundle in (candidate, baseline))
-    episodes = None if recording.episodes is None else recording.episodes[indices]
-    expert = None if recording.actions is None else recording.actions[indices]
-    baselines = tuple(alone(action, theirs, expert, episodes))
-    if expert is None:  # nobody says what is right: the baseline's own actions are
-        off, before = losses(action, mine, theirs), np.zeros(len(indices))
-        words = "distance from the baseline's actions:"
-    else:
-        off, before = losses(action, mine, expert), losses(action, theirs, expert)
-        words = "more distance from the expert's actions than the baseline has:"
-    lost = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
-    return _Drop("recorded_drop", words, *lost, len(indices), baselines, recording.unjudged)
+def drop_words(judged: Judgement) -> str:
+    """Return a drop in words, and what would decide where it is open."""
+    drop = judged.measured
+    if drop is None:
+        return judged.title
+    ends = " to ".join("unbounded" if end is None else f"{end:+.2%}" for end in (drop.low, drop.high))
+    starts = f", {judged.facts['starts']} distinct starts" if judged.facts["starts"] else ""
+    words = f"{judged.title} {drop.value:+.2%} ({ends}, {drop.samples} of them{starts}; allowed: {judged.limit:+.2%})"
+    if judged.reason is Reason.FEW_STARTS:
+        return f"{words}; {judged.facts['few']}"
+    if drop.low is None or drop.high is None:
+        return f"{words}, of one episode alone, which says nothing of others"
+    more = samples_wanted(judged)
+    return f"{words}, about {more:,} would decide" if more else words

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pydantic import Field, model_validator
+
+from vlatool import registry
+from vlatool.accuracy.doubt import Doubt
 from vlatool.accuracy.moved import doubts, known_of, pairs_above_none, ratios
-from vlatool.gate.claims._ratio import confidence_of, judged
-from vlatool.gate.config import MotionClaim
-from vlatool.gate.episodes import Episodes
-from vlatool.gate.result import ClaimResult, worst
+from vlatool.gate.claims._ratio import Ratios, confidence_of
+from vlatool.gate.evidence import Evidence
+from vlatool.gate.verdict import Judgement, Outcome, Reason, Verdict, worst
 from vlatool.motion.measure import FEWEST, metrics
 from vlatool.report import Row
 
@@ -14,49 +17,82 @@ OF_BODY = ("path_length", "joint_path", "jerk", "joint_jerk")
 OF_ACTIONS = ("action_rate",)
 """Metrics that count where the environment tells nothing of the robot's body."""
 NOTHING = "no episode in which both succeed tells how they move"
+EXAMPLE = """
+# These are about the episodes that accuracy names, where it names any:
+motion: null           # where both succeed, neither path nor jerk grows by more than the margin
+# motion:
+#   margin: 0.10
+"""
 
 
-def examine(episodes: Episodes, claim: MotionClaim) -> ClaimResult:
-    """Examine the metrics that the claim names, or those of the body that the environment tells.
+class Motion(Ratios):
+    """The candidate moves no more roughly, and no farther, where both succeed (needs ``accuracy: episodes``)."""
 
-    Where the baseline has nothing of a metric (no collision in any episode) there is no ratio: the candidate passes
-    with nothing either, and fails where it has some in so many episodes that chance is no explanation.
+    order = 60
+    example = EXAMPLE
 
-    Raises:
-        DataError: when no environment is named, or it fails.
-    """
-    names = claim.metrics or _told_of(episodes.rows[0])
-    confidence = confidence_of(len(names))
-    found = ratios(*episodes.rows, names, confidence)
-    titles = {name: metric.title for name, metric in metrics().items()}
-    told = {titles.get(name, name): ratio for name in names if (ratio := found.get(name))}
-    none = pairs_above_none(*episodes.rows, names)
-    doubt = doubts(*episodes.rows, names)
-    results = [
-        _from_none(titles.get(name, name), *counts, confidence, doubt.get(name, "")) for name, counts in none.items()
-    ]
-    if told or not results:
-        results.insert(0, judged("motion", told, claim.margin, NOTHING))
-    if lacking := [name for name in names if name not in found and name not in none]:
-        words = "; ".join(f"no ratio of {name} ({doubt.get(name, 'not told')})" for name in lacking)
-        results.insert(0, ClaimResult("motion", "inconclusive", words))
-    verdict = worst(result.verdict for result in results)
-    sentences = [result.sentence for result in results if result.verdict == verdict or verdict != "fail"]
-    measurements = tuple(item for result in results for item in result.measurements)
-    return ClaimResult("motion", verdict, "; ".join(sentences), measurements)
+    margin: float = Field(0.1, ge=0, le=10, description="largest growth of each metric, a share (0.1 = 10 %)")
+    metrics: tuple[str, ...] = Field(
+        (), description="metrics of motion; paths and jerk of what the environment tells when empty, or action rate"
+    )
+
+    @model_validator(mode="after")
+    def _metrics_are_known(self) -> Motion:
+        known = registry.names("motion")
+        if unknown := [name for name in self.metrics if name not in known]:
+            raise ValueError(f"there is no metric of motion {', '.join(unknown)}; allowed: {', '.join(known)}")
+        return self
+
+    def examine(self, evidence: Evidence) -> Verdict:
+        """Examine the metrics that the claim names, or those of the body that the environment tells.
+
+        Where the baseline has nothing of a metric (no collision in any episode) there is no ratio: the candidate passes
+        with nothing either, and fails where it has some in so many episodes that chance is no explanation.
+        """
+        rows = evidence.episodes
+        names = self.metrics or _metrics_of(rows[0])
+        confidence = confidence_of(len(names))
+        titles = {name: metric.title for name, metric in metrics().items()}
+        found, none = ratios(*rows, names, confidence), pairs_above_none(*rows, names)
+        doubt = doubts(*rows, names)
+        judged = [Judgement(Outcome.INCONCLUSIVE, name, reason=Reason.MISSING_VALUES, facts={"doubt": doubt.get(name)})
+                  for name in names if name not in found and name not in none]  # fmt: skip
+        judged += [self.judge(titles[name], found[name]) for name in names if name in found]
+        judged += [_from_none(titles[name], *counts, confidence, doubt.get(name)) for name, counts in none.items()]
+        return Verdict.of(judged)
+
+    def sentence(self, verdict: Verdict) -> str:
+        """Return what fails; else all that is known."""
+        lacking = [each for each in verdict.judgements if each.reason is Reason.MISSING_VALUES]
+        compared = [each for each in verdict.judgements if each.measured]
+        none = [each for each in verdict.judgements if not each.measured and each.reason is Reason.LIMIT]
+        parts = [(each.outcome, _none_words(each.title, **each.facts)) for each in none]
+        if compared:
+            parts.insert(0, (worst(each.outcome for each in compared), self.ratio_words(compared)))
+        elif not none:
+            parts.append((Outcome.INCONCLUSIVE, NOTHING))
+        if lacking:
+            words = "; ".join(f"no ratio of {each.title} ({each.facts['doubt'] or 'not told'})" for each in lacking)
+            parts.insert(0, (Outcome.INCONCLUSIVE, words))
+        fails = verdict.outcome is Outcome.FAIL
+        return "; ".join(words for outcome, words in parts if outcome is Outcome.FAIL or not fails)
 
 
-def _told_of(baseline: Row) -> tuple[str, ...]:
+def _metrics_of(baseline: Row) -> tuple[str, ...]:
     """Return the metrics of the body that the baseline has, or that of the actions; no candidate chooses."""
     known = known_of(baseline)
     return tuple(name for name in OF_BODY if name in known) or OF_ACTIONS
 
 
-def _from_none(title: str, some: int, count: int, confidence: float, doubt: str) -> ClaimResult:
+def _from_none(title: str, some: int, count: int, confidence: float, doubt: Doubt | None) -> Judgement:
     """Judge a metric that the baseline has nothing of; the test is the exact sign test of pairs, one-sided."""
-    if not some:
-        enough = count >= FEWEST and not doubt
-        words = f"{title} 0 in all {count} common successes of both"
-        return ClaimResult("motion", "pass" if enough else "inconclusive", f"{words}{doubt and f' ({doubt})'}")
-    verdict = "fail" if 0.5**some <= (1 - confidence) / 2 else "inconclusive"
-    return ClaimResult("motion", verdict, f"{title} in {some} of {count} common successes, in none of the baseline's")
+    unlikely = some and 0.5**some <= (1 - confidence) / 2
+    enough = not some and count >= FEWEST and not doubt
+    outcome = Outcome.FAIL if unlikely else Outcome.PASS if enough else Outcome.INCONCLUSIVE
+    return Judgement(outcome, title, facts={"some": some, "count": count, "doubt": doubt})
+
+
+def _none_words(title: str, some: int, count: int, doubt: Doubt | None) -> str:
+    if some:
+        return f"{title} in {some} of {count} common successes, in none of the baseline's"
+    return f"{title} 0 in all {count} common successes of both{f' ({doubt})' if doubt else ''}"

@@ -32,7 +32,8 @@ from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import main as vlatool
 from vlatool.cli._run import exported
 from vlatool.errors import VlatoolError
-from vlatool.gate.config import AccuracyClaim, Gate
+from vlatool.gate.claims.accuracy import Accuracy
+from vlatool.gate.config import Gate
 from vlatool.gate.run import run_gate
 from vlatool.optimize.evidence import with_accuracy
 from vlatool.optimize.pipeline import judged_rows
@@ -147,7 +148,7 @@ def by_optimize(case: Case, folder: Path, made: dict[str, Bundle], cache: Path) 
 def by_gate(case: Case, folder: Path, made: dict[str, Bundle]) -> tuple[str, str]:
     """Hold the candidate against float32 as a gate does, by accuracy alone."""
     world = case.evidence != "recordings"
-    claim = AccuracyClaim(max_drop=0.3, episodes=EPISODES if world else 0, policy=folder if world else None)
+    claim = Accuracy(max_drop=0.3, episodes=EPISODES if world else 0, policy=folder if world else None)
     gate = Gate(latency=None, memory=None, size=None, accuracy=claim)
     report = run_gate(made["int8"], made["float32"], gate, Context())
     return report.verdict, report.summary[-1]

@@ -1,0 +1,40 @@
+"""Why the episodes of two policies leave nothing to be claimed: a value, and its words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from vlatool.motion.measure import FEWEST
+
+KNOWN = 0.9
+"""Share of the episodes in which both succeed that must tell a metric of both, or nothing is claimed of it."""
+
+
+class Cause(Enum):
+    """What makes episodes decide nothing; the value is the text about it."""
+
+    RARELY_KNOWN = f"known of both in {{count}} of {{of}} common successes, and it takes {KNOWN:.0%}"
+    MISSING_MORE_OFTEN = "missing in {count} common successes where the baseline has it, the other way round in {of}"
+    FEW_STARTS = f"{{count}} distinct starts, and it takes {FEWEST}"
+    REPEATED_STARTS = f"{{of}} episodes of {{count}} distinct starts decide nothing (from {FEWEST})"
+    FEW_PAIRS = f"{{count}} pairs, and it takes {FEWEST}"
+    ZEROS = "too few pairs in which the baseline's is not 0"
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Why episodes decide nothing.
+
+    Args:
+        cause: kind of the doubt.
+        count: number of what there is too little of.
+        of: number that it is compared with.
+    """
+
+    cause: Cause
+    count: int = 0
+    of: int = 0
+
+    def __str__(self) -> str:
+        return self.cause.value.format(count=self.count, of=self.of)
