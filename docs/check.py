@@ -18,7 +18,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 PLACES = ("", "vlatool", "tests", "docs")
 """Folders that a path on a page may start from, beside the page's own."""
-GROUPS = {"control", "engines", "profiles", "commands", "sections", "videos", "claims"}
+GROUPS = {"control", "engines", "profiles", "commands", "sections", "videos", "claims", "measures"}
 """Entry point groups that are not packages of vlatool."""
 EVERYWHERE = ("--help", "--trust")
 """Options that every command takes, whether its help lists them or not."""

@@ -18,7 +18,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from vlatool import errors, registry, report
+from vlatool import errors, measures, registry, report
 from vlatool.bundle import manifest, spec
 from vlatool.cli._schemas import COMMANDS, definitions
 from vlatool.gate import config
@@ -38,6 +38,7 @@ def main() -> None:
         "manifest.md": fields_page("manifest.json", [manifest.Manifest, spec.PolicySpec, spec.TensorSpec,
                                                      manifest.ProgramStep, manifest.Graph]),
         "report.md": report_page(),
+        "measures.md": measures_page(),
         "errors.md": errors_page(),
         "profiles.md": profiles_page(),
         "gate.md": gate_page(),
@@ -139,11 +140,23 @@ def report_page() -> str:
     about = (
         "Every command that measures writes one (`-o DIRECTORY`, or `--json` on stdout). "
         "[report.schema.json](report.schema.json) is its JSON Schema (draft 2020-12), made from the same classes: "
-        "`check-jsonschema --schemafile docs/reference/report.schema.json report.json`.\n\n"
+        "`check-jsonschema --schemafile docs/reference/report.schema.json report.json`. Its `measures` lists the "
+        "[quantities](measures.md): a measurement of another name is allowed.\n\n"
         "A number that could not be measured is null, and the note beside it says why. Within schema 1 a later version "
         "may add keys at the top level, which readers ignore; rows, measurements and findings have these keys only."
     )
     return f"{head}\n\n{about}\n{rest}"
+
+
+def measures_page() -> str:
+    """Return a row for each quantity of the vocabulary."""
+    about = (
+        "The quantities that reports hold, each a row of a file in `vlatool/measures/`; other packages add some "
+        "([guide](../guides/add-a-method.md)). A part in braces is that of the policy or the command."
+    )
+    rows = ["| name | in words | unit | better | shown with | interval |", "|---|---|---|---|---|---|"]
+    rows += [f"| `{name}` | {' | '.join(map(str, each.values()))} |" for name, each in measures.descriptions().items()]
+    return f"# Measures\n\n{about}\n\n" + "\n".join(rows) + "\n"
 
 
 def schema_page() -> str:
@@ -155,7 +168,8 @@ def schema_page() -> str:
         "$comment": "written by docs/generate.py from the code; do not edit",
         "title": "vlatool report",
     }
-    return json.dumps({**head, **root, "additionalProperties": True, "$defs": defs}, indent=1) + "\n"
+    known = {"measures": measures.descriptions()}
+    return json.dumps({**head, **root, "additionalProperties": True, "$defs": defs, **known}, indent=1) + "\n"
 
 
 def output_schema_page() -> str:

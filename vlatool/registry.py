@@ -165,6 +165,21 @@ def _requirements(entries: Mapping[str, Any]) -> str:
     return "; ".join(f"{name} ({entry.needs})" for name, entry in entries.items())
 
 
+def values(kind: str, *classes: type) -> list[Any]:
+    """Return the values of some classes that the files of a kind hold, those of vlatool's own files first.
+
+    Raises:
+        PluginError: when the file of another package cannot be imported, or holds none.
+    """
+    found: list[Any] = []
+    for name in (*_builtin_names(kind), *plugins(kind)):
+        held = [value for value in vars(module(kind, name)).values() if isinstance(value, classes)]
+        if not held and name in plugins(kind):
+            raise _plugin_error(plugins(kind)[name], f"holds no {noun_of(kind)}")
+        found += held
+    return found
+
+
 def entry_of(entry_class: type) -> str:
     """Return ``kind.name`` of a class that ``load`` returned, or that is in a file of its kind."""
     return _PLUGIN_CLASSES.get(entry_class) or ".".join(entry_class.__module__.split(".")[-2:])

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from vlatool.errors import DataError
 
@@ -15,12 +15,6 @@ SCHEMA = 1
 REPORT = "report.json"
 ON_BOARD = "is_profile"
 """Key of the environment: the profile that the machine is the board of."""
-TRAINED = "training: "
-"""What the names of losses (``raw``) and rounds (``details``) of a training begin with; its stage follows."""
-TEACHER = ", and its teacher"
-"""What the name of the details ends with that say how much the teacher of a training counted."""
-TRAINING_TIME = "training_time."
-"""The same of measurements of how long it took, in seconds."""
 COUNT = "count"
 """Unit of a number of things, which may be a mean of such numbers; ``1`` is a share."""
 NO_INTERVAL = "no interval: "
@@ -37,7 +31,7 @@ class Measurement:
     """One number, and what it is.
 
     Args:
-        name: What was measured, for example ``latency_p50``.
+        name: The quantity (``vlatool.measures``), for example ``latency_p50``.
         value: The number; NaN when it could not be had (then ``note`` says why).
         unit: ``ms``, ``MB``, ``1`` (a share), ``count`` (a number of things), ``x`` (a ratio), the unit of an action
             element, or nothing where there is none.
@@ -72,6 +66,15 @@ class Measurement:
         return not math.isnan(self.value)
 
 
+class HasName(Protocol):
+    """What has the name of a quantity: one of ``vlatool.measures``, or a measurement of it."""
+
+    @property
+    def name(self) -> str:
+        """The name in reports."""
+        ...
+
+
 @dataclass(frozen=True)
 class Row:
     """One policy variant in a report.
@@ -81,14 +84,9 @@ class Row:
         role: ``baseline``, ``chosen``, ``within`` or ``outside`` the limits, ``failed``, or ``subject``.
         reason: Why it has this role, in words.
         measurements: By no particular order; names are unique within a row and origin.
-        raw: Series name -> raw samples in the order in which they were taken: ``latency_ms``, and ``at_s`` (the start
-            of each call, seconds since the start of the run); ``telemetry.NAME`` and ``telemetry.NAME.at_s`` (a reading
-            of the machine and its times); ``throttled_at_s`` (moments at which throttling was seen);
-            ``training: STAGE`` (the loss of each step); of episodes ``success``, ``seed``, ``steps``, ``task`` and
-            ``instruction`` (places in the tables of details), ``start`` (the same number for equal first
-            observations), ``no clock`` (1 where the environment's clock went wrong), ``motion.METRIC`` (NaN where it
-            is not known).
-        details: Tables that belong to the row: title -> list of {column: cell}.
+        raw: Series name (``vlatool.measures.series``) -> raw samples in the order in which they were taken; NaN where
+            one is not known.
+        details: Tables that belong to the row: title (``vlatool.measures.tables``) -> list of {column: cell}.
     """
 
     name: str
@@ -104,13 +102,14 @@ class Row:
         if not isinstance(self.raw, Mapping) or not isinstance(self.details, Mapping):
             raise ValueError(f"raw and details of {self.name} must be mappings")
 
-    def get(self, name: str, origin: str = "measured") -> Measurement | None:
-        """Return the measurement of that name and origin, or None."""
+    def get(self, quantity: HasName, origin: str = "measured") -> Measurement | None:
+        """Return the measurement of a quantity and origin, or None; a script may give the name of the quantity."""
+        name = getattr(quantity, "name", quantity)
         return next((item for item in self.measurements if (item.name, item.origin) == (name, origin)), None)
 
-    def value(self, name: str) -> float:
+    def value(self, quantity: HasName) -> float:
         """Return a measured value, NaN when it is not there."""
-        measurement = self.get(name)
+        measurement = self.get(quantity)
         return measurement.value if measurement else math.nan
 
 

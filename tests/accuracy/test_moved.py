@@ -6,9 +6,10 @@ import math
 
 import pytest
 
-from vlatool.accuracy.moved import drops_by_task, ratios, with_task_speedup
+from vlatool.accuracy.moved import drops_by_task, ratios
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.evaluate._told import told
+from vlatool.measures import with_derived
 from vlatool.render._format import full
 from vlatool.report import Measurement, Row
 
@@ -112,9 +113,9 @@ def test_ratios_may_be_asked_for_with_another_confidence():
 def test_a_task_gains_what_more_steps_leave():
     steps = Measurement("steps_ratio", 1.25, "x", samples=100, low=1.2, high=1.3)
     row = Row("int8", measurements=(Measurement("speedup", 2.0, "x", low=1.9, high=2.1), steps))
-    task = with_task_speedup(row).get("task_speedup")
+    task = with_derived(row).get("task_speedup")
     assert (task.value, task.low, task.high) == (1.6, pytest.approx(1.9 / 1.3), pytest.approx(2.1 / 1.2))
-    assert with_task_speedup(Row("a", measurements=(steps,))).get("task_speedup") is None
+    assert with_derived(Row("a", measurements=(steps,))).get("task_speedup") is None
 
 
 @pytest.mark.parametrize(("pairs", "moves", "why"), [

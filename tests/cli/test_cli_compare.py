@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from vlatool.cli._side_by_side import short_names
+from vlatool.compare.inputs import short_names
 from vlatool.report import Finding, Measurement, Report, Row
 
 HOST = {"cpu": "Cortex-A76", "cores": 4, "governor": "performance", "versions": {"onnxruntime": "1.23.2"}}

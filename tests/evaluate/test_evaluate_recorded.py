@@ -16,6 +16,7 @@ from vlatool.data import evaluation_recording, recorded_observations
 from vlatool.errors import DataError, GraphError
 from vlatool.evaluate import recorded
 from vlatool.evaluate.recorded import Recorded, compare, run_recorded
+from vlatool.measures.actions import BASELINE, EXPERT
 from vlatool.runtime import Policy, load
 from vlatool.stage.base import Context
 
@@ -159,7 +160,7 @@ def test_a_few_calibration_observations_are_not_split_and_that_is_said(float_bun
 def test_continuous_actions_by_hand():
     wanted = np.array([[[1.0, 1.0], [3.0, -1.0]], [[1.0, 1.0], [3.0, -1.0]]])
     got = wanted + np.array([0.5, 0.0])
-    found = by_name(compare(ARM, got, wanted, "expert"))
+    found = by_name(compare(ARM, got, wanted, EXPERT))
     assert found["error_expert.dx"].value == 0.5
     assert found["error_expert.gripper"].value == 0.0
     assert found["error_expert"].value == pytest.approx((0.5 / 1.0 + 0.0 / 1.0) / 2)
@@ -169,7 +170,7 @@ def test_continuous_actions_by_hand():
 def test_gripper_flips_are_the_share_of_steps_with_the_other_sign():
     wanted = np.array([[[0.0, 1.0], [0.0, -1.0]], [[0.0, 0.2], [0.0, -0.2]]])
     got = np.array([[[0.0, -1.0], [0.0, -0.1]], [[0.0, 9.0], [0.0, -9.0]]])
-    flips = by_name(compare(ARM, got, wanted, "baseline"))["gripper_flips_baseline"]
+    flips = by_name(compare(ARM, got, wanted, BASELINE))["gripper_flips_baseline"]
     assert (flips.value, flips.samples) == (0.25, 4)
     assert 0 < flips.low < 0.25 < flips.high
 
@@ -179,12 +180,12 @@ def test_a_gripper_flips_at_the_middle_of_what_it_does(low: float, high: float):
     closed, wide = low + 0.1 * (high - low), low + 0.9 * (high - low)
     wanted = np.array([[[0.0, low], [0.0, high]], [[0.0, low], [0.0, high]]])
     got = np.array([[[0.0, closed], [0.0, wide]], [[0.0, wide], [0.0, high]]])
-    assert by_name(compare(ARM, got, wanted, "baseline"))["gripper_flips_baseline"].value == 0.25
+    assert by_name(compare(ARM, got, wanted, BASELINE))["gripper_flips_baseline"].value == 0.25
 
 
 def test_an_element_that_never_moves_does_not_divide_by_zero():
     wanted = np.zeros((3, 1, 2))
-    found = by_name(compare(ARM, wanted + 1.0, wanted, "expert"))
+    found = by_name(compare(ARM, wanted + 1.0, wanted, EXPERT))
     assert math.isnan(found["error_expert"].value)
     assert found["error_expert"].note == "the expert's action never varies, so no error relative to its spread"
     assert found["error_expert.dx"].value == 1.0
@@ -222,15 +223,15 @@ def test_a_baseline_that_does_no_better_than_a_constant_action_is_said(float_bun
 
 def test_chunks_of_unequal_length_are_compared_as_far_as_both_go():
     wanted = np.ones((2, 5, 2)) * np.arange(5)[None, :, None]
-    found = by_name(compare(ARM, wanted[:, :3] + 0.25, wanted, "expert"))
+    found = by_name(compare(ARM, wanted[:, :3] + 0.25, wanted, EXPERT))
     assert found["error_expert.dx"].value == 0.25
 
 
 def test_discrete_chunks_of_unequal_length_agree_as_far_as_both_go():
     got = np.array([[0, 1, 2], [2, 1, 0]])
-    (found,) = compare(TURN, got, np.array([[0], [1]]), "expert")
+    (found,) = compare(TURN, got, np.array([[0], [1]]), EXPERT)
     assert (found.value, found.samples) == (0.5, 2)
-    (found,) = compare(TURN, got, np.array([[0, 1], [1, 1]]), "expert")
+    (found,) = compare(TURN, got, np.array([[0, 1], [1, 1]]), EXPERT)
     assert (found.value, found.samples) == (0.75, 4)
 
 
@@ -246,19 +247,19 @@ def test_a_report_says_how_much_of_a_chunk_is_judged(float_bundle, tmp_path, ste
 
 def test_without_labels_elements_are_numbered():
     plain = TensorSpec("action", (1, 1, 2), unit="rad")
-    found = by_name(compare(plain, np.zeros((2, 1, 2)), np.ones((2, 1, 2)), "expert"))
+    found = by_name(compare(plain, np.zeros((2, 1, 2)), np.ones((2, 1, 2)), EXPERT))
     assert found["error_expert.1"].unit == "rad"
 
 
 def test_discrete_actions_agree_or_not():
     wanted = np.array([[0], [1], [2], [2]])
-    (found,) = compare(TURN, np.array([[0], [1], [2], [0]]), wanted, "expert")
+    (found,) = compare(TURN, np.array([[0], [1], [2], [0]]), wanted, EXPERT)
     assert (found.name, found.value, found.samples) == ("agreement_expert", 0.75, 4)
     assert found.low < 0.75 < found.high
 
 
 def test_nothing_to_compare_with_gives_nothing():
-    assert compare(TURN, np.zeros((2, 1)), None, "expert") == []
+    assert compare(TURN, np.zeros((2, 1)), None, EXPERT) == []
 
 
 def test_what_a_stage_found_to_be_wrong_is_said(float_bundle, copied):

@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 
 from vlatool.machine.instruction_sets import compare_sets
+from vlatool.measures.latency import OPENVINO_FLOAT32_P50
 from vlatool.optimize.choice_apart import choose_apart, on_board
 from vlatool.optimize.judge import Judged
 from vlatool.optimize.summary import about_int8, in_int8
-from vlatool.optimize.timings import IN_OPENVINO, REFERENCE, joined, placed
+from vlatool.optimize.timings import IN_OPENVINO, joined, placed
 from vlatool.report import Measurement, Row
 
 SET = compare_sets("old", ("avx2",), ("avx2", "avx512f", "avx512_vnni"), "AVX2")
@@ -30,9 +31,13 @@ def judged(name: str, p50: float, of: float, predicted: float | None, within: bo
 
 
 def baseline(predicted: float | None = 20.0, reference: float | None = 25.0) -> Judged:
-    found = [Measurement("latency_p50", 10.0, "ms"), Measurement(REFERENCE, 40.0, "ms"), Measurement("size", 4.0, "MB")]
+    found = [
+        Measurement("latency_p50", 10.0, "ms"),
+        OPENVINO_FLOAT32_P50.measurement(40.0),
+        Measurement("size", 4.0, "MB"),
+    ]
     found += [Measurement("latency_p50", predicted, "ms", "predicted", "old")] if predicted else []
-    found += [Measurement(REFERENCE, reference, "ms", "predicted", "old")] if reference else []
+    found += [OPENVINO_FLOAT32_P50.prediction(reference, "old")] if reference else []
     return Judged(Row("float32", "baseline", "the reference", tuple(found)), True, 0.0)
 
 
@@ -103,7 +108,7 @@ def test_rows_of_two_runs_are_joined_and_say_what_their_ratios_are():
     found = joined(ours, theirs, ["float32", "fast", "ort"], SET)
     assert list(found) == ["float32", "fast", "ort"]
     assert found["float32"].role == "baseline"
-    reference = found["float32"].get(REFERENCE)
+    reference = found["float32"].get(OPENVINO_FLOAT32_P50)
     assert (reference.value, reference.where) == (40.0, "this host, OpenVINO confined to AVX2")
     assert found["float32"].get("latency_p50") is None, "OpenVINO's own is no latency of the reference"
     assert (

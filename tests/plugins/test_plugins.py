@@ -52,6 +52,9 @@ acme = acme_robotics.hello
 [vlatool.sections]
 acme = acme_robotics.section
 
+[vlatool.measures]
+acme = acme_robotics.tail
+
 [vlatool.claims]
 bounded = acme_robotics.claim
 missing = acme_robotics.no_such_claim
@@ -309,6 +312,22 @@ def test_its_section_is_in_every_format_of_a_report(run: Run):
         assert "72,000" in text
 
 
+def test_its_measure_is_in_the_report_the_comparison_and_the_schema(run: Run, float_bundle: Bundle, tmp_path: Path):
+    line = ["benchmark", str(float_bundle.path), "--iterations", "20", "--duration", "0", "--no-cold"]
+    ok(run(*line, "-o", str(tmp_path / "one")))
+    (tmp_path / "other.json").write_text((tmp_path / "one/report.json").read_text())
+    compared = json.loads(ok(run("compare", str(tmp_path / "one"), str(tmp_path / "other.json"), "--json")))
+    for row in (*json.loads((tmp_path / "one/report.json").read_text())["rows"], *compared["rows"]):
+        (found,) = (item for item in row["measurements"] if item["name"] == "acme_tail")
+        assert (found["unit"], found["samples"], found["value"] >= 1) == ("x", 20, True)
+    for format in ("html", "md"):
+        assert "slowest call over median" in (tmp_path / f"one/report.{format}").read_text()
+    generate = str(ROOT / "docs/generate.py")
+    schema = json.loads(ok(run(code=f"import runpy; print(runpy.run_path({generate!r})['schema_page']())")))
+    known = {"title": "slowest call over median", "unit": "x", "better": "less", "section": "further", "interval": ""}
+    assert schema["measures"]["acme_tail"] == known
+
+
 @pytest.mark.parametrize(
     ("options", "code", "found"),
     [
@@ -396,6 +415,6 @@ def test_it_replaces_nothing_of_vlatools_own(run: Run):
 
 def test_the_guide_shows_these_files():
     guide = (ROOT / "docs/guides/add-a-method.md").read_text()
-    files = ("rounded", "openvino_provider", "ggml_provider", "source", "checkpoint", "log", "section", "every_step")
-    for name in (*files, "halved", "claim"):
+    files = ("rounded", "openvino_provider", "ggml_provider", "source", "checkpoint", "log", "section", "tail")
+    for name in (*files, "every_step", "halved", "claim"):
         assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide

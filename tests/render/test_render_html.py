@@ -294,7 +294,7 @@ def test_the_deadline_is_marked() -> None:
 )  # fmt: skip
 def test_the_limit_speaks_of_a_percentile(name: str, chosen: str) -> None:
     found = _view.latency(replace(sustained(), limits={name: 33, "hz": 20}))
-    assert found.name == chosen
+    assert found.quantity.name == chosen
     assert found.limit == (50 if "p42" in name else 33)
 
 

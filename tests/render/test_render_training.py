@@ -7,10 +7,12 @@ from dataclasses import replace
 import pytest
 from _render_reports import optimize
 
+from vlatool.measures import series, tables
+from vlatool.measures.training import TRAINING_TIME
 from vlatool.render import render
 from vlatool.render.charts.losses import Curve, loss_curve
 from vlatool.render.document import Chart, build
-from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Report, Row
+from vlatool.report import Report, Row
 
 STAGE = "distill.policy"
 ROUNDS = [
@@ -20,12 +22,14 @@ ROUNDS = [
 
 
 def trained(name: str, losses: list[float]) -> Row:
-    took = Measurement(f"{TRAINING_TIME}{STAGE}", 754.0, "s", samples=len(losses))
-    return Row(name, measurements=(took,), raw={f"{TRAINED}{STAGE}": losses}, details={f"{TRAINED}{STAGE}": ROUNDS})
+    took = TRAINING_TIME.quantity(STAGE).measurement(754.0, samples=len(losses))
+    return Row(
+        name, measurements=(took,), raw={series.LOSSES.name(STAGE): losses}, details={tables.ROUNDS.name(STAGE): ROUNDS}
+    )
 
 
 def taught(row: Row, **about: str) -> Row:
-    return replace(row, details={**row.details, f"{TRAINED}{STAGE}{TEACHER}": [about]})
+    return replace(row, details={**row.details, tables.TEACHER.name(STAGE): [about]})
 
 
 def report(*rows: Row) -> Report:

@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
+from vlatool.measures import actions
+from vlatool.measures.success import SUCCESS, SUCCESS_CHANCE
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import wilson
 
-DECIDE = ("success", "success_chance", "skill_expert", "variation")
+DECIDE = (SUCCESS.name, SUCCESS_CHANCE.name, actions.SKILL_EXPERT.name, actions.VARIATION.name)
 """The measurements that the credibility rests on."""
 SKILL = 0.1
 """Share of the best constant action's error that a credible policy does not make, at least."""
@@ -144,7 +146,7 @@ def credibility(row: Row, name: str = "the reference") -> Credibility:
 
 
 def _played(row: Row) -> Credibility:
-    own, chance = row.get("success"), row.get("success_chance")
+    own, chance = row.get(SUCCESS), row.get(SUCCESS_CHANCE)
     if own is None:
         return Credibility()
     if own.value == 0.0:
@@ -153,7 +155,7 @@ def _played(row: Row) -> Credibility:
         return Credibility(ground=Ground.CHANCE_UNMEASURED)
     gain = lower_bound(own, chance)
     line = {
-        "measure": "success", "reference": round(own.value, 4), "by chance": round(chance.value, 4),
+        "measure": SUCCESS.name, "reference": round(own.value, 4), "by chance": round(chance.value, 4),
         "floor": "the difference is above 0 with 95 % confidence", "found": f"at least {gain:+.1%}",
     }  # fmt: skip
     if gain > 0:
@@ -174,9 +176,11 @@ def lower_bound(own: Measurement, chance: Measurement) -> float:
 
 
 def _recorded(row: Row) -> Credibility:
-    skill, varied = row.get("skill_expert"), row.get("variation")
+    skill, varied = row.get(actions.SKILL_EXPERT), row.get(actions.VARIATION)
     if varied is not None and varied.value == 0.0:
-        return Credibility(Trust.FAILS, Ground.ONE_ACTION, own=varied, table=(_line("variation", varied, "above 0"),))
+        return Credibility(
+            Trust.FAILS, Ground.ONE_ACTION, own=varied, table=(_line(actions.VARIATION.name, varied, "above 0"),)
+        )
     if skill is None:
         return Credibility(ground=Ground.NOTHING_RIGHT)
     floor = f"{SKILL:g}, and above 0 with 95 % confidence"
@@ -185,7 +189,7 @@ def _recorded(row: Row) -> Credibility:
         return Credibility(Trust.FAILS, Ground.SKILL_UNKNOWN, own=skill, table=table)
     if not (skill.value >= SKILL and (skill.low or 0.0) > 0):
         return Credibility(Trust.FAILS, Ground.NO_SKILL, own=skill, table=table)
-    if varied is not None and row.get("error_expert") is not None:
+    if varied is not None and row.get(actions.ERROR_EXPERT) is not None:
         table = (*table, _line("variation by that of the expert", varied, f"{VARIATION:g}"))
         if varied.value < VARIATION:
             return Credibility(Trust.FAILS, Ground.HARDLY_VARIES, own=varied, table=table)

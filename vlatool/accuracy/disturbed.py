@@ -6,8 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from vlatool.accuracy.moved import RATIO, START, STEPS
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.measures import series, tables
+from vlatool.measures.motion import RATIO, STEPS_RATIO
+from vlatool.measures.success import DISTURBED_DROP, SUCCESS, SUCCESS_DISTURBED, SUCCESS_DROP
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import wilson
 from vlatool.stats.starts import independent
@@ -16,11 +18,6 @@ from vlatool.stats.success_sequential import exact_drop
 Played = Sequence[Outcome]
 Disturbance = tuple[str, float]
 """Kind and strength."""
-DISTURBED = "disturbed."
-"""What the names of raw samples begin with that say which episodes succeeded under a disturbance."""
-OF_BASELINE = ", baseline"
-"""What they end with of the same episodes of what the variant is held against."""
-TABLE = "under disturbances"
 SHOWN = {"task_time": "task time", "path_length": "path", "jerk": "jerk", "action_rate": "action rate"}
 """Metrics of motion that the table has, where both succeed."""
 
@@ -40,14 +37,14 @@ def with_disturbed(
     kinds = dict.fromkeys(kind for kind, _ in played)
     strengths = dict.fromkeys(strength for _, strength in played)
     for (kind, strength), own in played.items():
-        name = f"{DISTURBED}{kind} at {strength:g}" if len(strengths) > 1 else f"{DISTURBED}{kind}"
+        name = f"{kind} at {strength:g}" if len(strengths) > 1 else kind
         base = reference[kind, strength] if reference else None
         disturbed = success_row(kind, "subject", own)
         if base is not None:
             disturbed = compare_success(success_row("baseline", "baseline", base), disturbed)
-            raw[f"{name}{OF_BASELINE}"] = [float(outcome.success) for outcome in base]
-        raw[name] = disturbed.raw["success"]
-        wins, count = wins + int(sum(disturbed.raw["success"])), count + len(own)
+            raw[series.DISTURBED_BASELINE.name(name)] = [float(outcome.success) for outcome in base]
+        raw[series.DISTURBED_SUCCESS.name(name)] = disturbed.raw[series.SUCCESS]
+        wins, count = wins + int(sum(disturbed.raw[series.SUCCESS])), count + len(own)
         records.append(_record(kind, strength, disturbed, base))
     first = sorted(records, key=_badness)
     order = list(dict.fromkeys(record["disturbance"] for record in first))
@@ -55,8 +52,8 @@ def with_disturbed(
     low, high = wilson(wins, count)
     listed = ", ".join(f"{strength:g}" for strength in strengths)
     note = f"under {', '.join(kinds)}; strength {listed}"
-    rate = Measurement("success_disturbed", wins / count, "1", samples=count, low=low, high=high, note=note)
-    measurements, details = (*row.measurements, rate), {**row.details, TABLE: records}
+    rate = SUCCESS_DISTURBED.measurement(wins / count, samples=count, low=low, high=high, note=note)
+    measurements, details = (*row.measurements, rate), {**row.details, tables.UNDER: records}
     return replace(row, measurements=measurements, raw={**row.raw, **raw}, details=details)
 
 
@@ -87,7 +84,7 @@ def worst_record(row: Row) -> tuple[Mapping[str, Any], str] | None:
     Args:
         row: Of ``with_disturbed``.
     """
-    table = row.details.get(TABLE)
+    table = row.details.get(tables.UNDER)
     if not table:
         return None
     worst = min(table, key=_badness)
@@ -109,25 +106,28 @@ def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measur
         confidence: Of all intervals together (Bonferroni).
     """
     drops = {}
-    names = [name for name in row.raw if name.startswith(DISTURBED) and f"{name}{OF_BASELINE}" in row.raw]
-    confidence = 1 - (1 - confidence) / max(1, len(names))
-    for name in names:
-        kind = name.removeprefix(DISTURBED)
-        pairs = list(zip(row.raw[f"{name}{OF_BASELINE}"], row.raw[name], strict=True))
+    kinds = [
+        kind for kind in series.DISTURBED_SUCCESS.among(row.raw) if series.DISTURBED_BASELINE.name(kind) in row.raw
+    ]
+    confidence = 1 - (1 - confidence) / max(1, len(kinds))
+    for kind in kinds:
+        names = series.DISTURBED_BASELINE.name(kind), series.DISTURBED_SUCCESS.name(kind)
+        pairs = list(zip(*(row.raw[name] for name in names), strict=True))
         lost, won = sum(before > after for before, after in pairs), sum(before < after for before, after in pairs)
-        size = independent(row.raw.get(START) or range(len(pairs)))
+        size = independent(row.raw.get(series.START) or range(len(pairs)))
         drop, low, high = exact_drop(lost, won, len(pairs), confidence, size)
-        drops[kind] = Measurement("disturbed_drop", drop, "1", samples=len(pairs), low=low, high=high,
-                                  confidence=confidence, note=kind)  # fmt: skip
+        drops[kind] = DISTURBED_DROP.measurement(
+            drop, samples=len(pairs), low=low, high=high, confidence=confidence, note=kind
+        )
     return drops
 
 
 def _record(kind: str, strength: float, row: Row, base: Sequence[Outcome] | None) -> dict[str, Any]:
-    record: dict[str, Any] = {"disturbance": kind, "strength": strength, "episodes": len(row.raw["success"])}
+    record: dict[str, Any] = {"disturbance": kind, "strength": strength, "episodes": len(row.raw[series.SUCCESS])}
     if base is not None:
         record["baseline"] = round(sum(outcome.success for outcome in base) / len(base), 4)
-    record["success"] = round(row.value("success"), 4)
-    if drop := row.get("success_drop"):
+    record["success"] = round(row.value(SUCCESS), 4)
+    if drop := row.get(SUCCESS_DROP):
         record |= {"drop": round(drop.value, 4), "low": round(drop.low or 0.0, 4), "high": round(drop.high or 0.0, 4)}
-    named = {STEPS: "steps", **{f"{name}{RATIO}": words for name, words in SHOWN.items()}}
-    return record | {f"{words}, x": round(ratio.value, 3) for name, words in named.items() if (ratio := row.get(name))}
+    ratios = {"steps": STEPS_RATIO, **{words: RATIO.quantity(name) for name, words in SHOWN.items()}}
+    return record | {f"{words}, x": round(ratio.value, 3) for words, one in ratios.items() if (ratio := row.get(one))}

@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.accuracy.doubt import KNOWN, Cause, Doubt
+from vlatool.measures import Quantity, series, tables
+from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
+from vlatool.measures.success import WORST_TASK_DROP
 from vlatool.motion.measure import FEWEST, metrics, ratio_of
 from vlatool.report import NO_INTERVAL, Measurement, Row
 from vlatool.stats.intervals import sign_test
@@ -18,23 +21,10 @@ from vlatool.stats.starts import distinct, independent
 from vlatool.stats.success_sequential import exact_drop
 
 Array = NDArray[np.float64]
-MOTION = "motion."
-"""What the names of raw samples begin with that a metric of motion gave."""
-RATIO = "_ratio"
-ADDED = "_added"
-"""What the name of a metric ends with where the baseline's is 0 in every pair, so that there is no ratio."""
-STEPS = "steps_ratio"
-WORST = "worst_task_drop"
+AGAINST = {series.TASK: tables.AGAINST_BY_TASK, series.INSTRUCTION: tables.AGAINST_BY_INSTRUCTION}
 NAMED = ", the worst of "
 """What follows the name of the task in the note of that measurement."""
-SPEEDUP = "task_speedup"
-BY_TASK, BY_INSTRUCTION = "success by task", "success by instruction"
-AGAINST = {"task": "against the baseline, by task", "instruction": "against the baseline, by instruction"}
 CONFIDENCE = 0.95
-NO_CLOCK = "no clock"
-"""The raw samples that say in which episodes the environment's clock could not be used."""
-START = "start"
-"""The raw samples that number the distinct first observations of episodes."""
 DOUBT = 0.25
 """Chance below which it is no accident that the variant's values are missing more often (an exact sign test): the doubt
 is not the baseline's, so that two episodes suffice."""
@@ -85,9 +75,9 @@ def doubts(baseline: Row, row: Row, names: Collection[str]) -> dict[str, Doubt]:
 
 def known_of(baseline: Row) -> list[str]:
     """Return the metrics that episodes of the baseline have in which it succeeds, whatever a variant has."""
-    won = np.asarray(baseline.raw["success"]) > 0
-    values = {name.removeprefix(MOTION): values for name, values in baseline.raw.items() if name.startswith(MOTION)}
-    return sorted(name for name, own in values.items() if np.isfinite(np.asarray(own, np.float64)[won]).any())
+    won = np.asarray(baseline.raw[series.SUCCESS]) > 0
+    metrics = series.METRIC.among(baseline.raw).items()
+    return sorted(one for one, name in metrics if np.isfinite(np.asarray(baseline.raw[name], np.float64)[won]).any())
 
 
 def pairs_above_none(baseline: Row, row: Row, names: Collection[str]) -> dict[str, tuple[int, int]]:
@@ -106,27 +96,12 @@ def drops_by_task(baseline: Row, row: Row, confidence: float = CONFIDENCE) -> di
 
 
 def worst_task(drop: Measurement) -> str:
-    """Return the name of the task that a measurement ``WORST`` is about."""
+    """Return the name of the task that a measurement of ``WORST_TASK_DROP`` is about."""
     return drop.note.partition(NAMED)[0]
 
 
-def with_task_speedup(row: Row) -> Row:
-    """Return the row with how many times as fast it does its task: its speed-up by the ratio of its steps.
-
-    A policy that answers in half of the time and needs twice as many steps is done no sooner, where the control loop
-    waits for its answers.
-    """
-    speed, steps = row.get("speedup"), row.get(STEPS)
-    if speed is None or steps is None or not steps.value or None in (speed.low, speed.high, steps.low, steps.high):
-        return row
-    low, high = (speed.low or 0.0) / max(steps.high or 0.0, 1e-9), (speed.high or 0.0) / max(steps.low or 0.0, 1e-9)
-    note = "speed-up of an inference / ratio of steps, failures at full length"
-    task = Measurement(SPEEDUP, speed.value / steps.value, "x", samples=steps.samples, low=low, high=high, note=note)
-    return replace(row, measurements=(*row.measurements, task))
-
-
 def _ratio(
-    name: str, ratio: tuple[float, float, float], count: int, note: Sequence[str], confidence: float,
+    quantity: Quantity, ratio: tuple[float, float, float], count: int, note: Sequence[str], confidence: float,
     doubt: Doubt | None = None,
 ) -> Ratio:  # fmt: skip
     """Return a ratio; without its interval where there is a doubt, or resamples in which the baseline's is always 0."""
@@ -138,8 +113,8 @@ def _ratio(
         doubt = doubt or Doubt(Cause.FEW_PAIRS if count < FEWEST else Cause.ZEROS, count)
         low = high = None
         remarks.insert(0, f"{NO_INTERVAL}{doubt}")
-    measured = Measurement(name, value, "x", samples=count, low=low, high=high, confidence=confidence,
-                           note="; ".join((what, *remarks)))  # fmt: skip
+    words = "; ".join((what, *remarks))
+    measured = quantity.measurement(value, samples=count, low=low, high=high, confidence=confidence, note=words)
     return Ratio(measured, tuple(remarks))
 
 
@@ -148,15 +123,13 @@ class _Pairs:
 
     def __init__(self, baseline: Row, row: Row, confidence: float = CONFIDENCE) -> None:
         self._rows, self._confidence = (baseline, row), confidence
-        self._wins = tuple(self._of(one, "success") > 0 for one in self._rows)
+        self._wins = tuple(self._of(one, series.SUCCESS) > 0 for one in self._rows)
         self._both = self._wins[0] & self._wins[1]
-        self._starts = np.asarray(baseline.raw.get(START) or range(len(self._both)), np.float64)
+        self._starts = np.asarray(baseline.raw.get(series.START) or range(len(self._both)), np.float64)
         self._places = {key: self._of(row, key).astype(int) for key in AGAINST if key in row.raw}
-        titles = {"task": BY_TASK, "instruction": BY_INSTRUCTION}
+        titles = {series.TASK: tables.BY_TASK, series.INSTRUCTION: tables.BY_INSTRUCTION}
         self._names = {key: [str(record[key]) for record in row.details[titles[key]]] for key in self._places}
-        self._metrics = sorted(
-            name.removeprefix(MOTION) for name in row.raw if name.startswith(MOTION) and name in baseline.raw
-        )
+        self._metrics = sorted(series.METRIC.among(name for name in row.raw if name in baseline.raw))
 
     def ratios(self) -> Iterator[tuple[str, Ratio]]:
         """Yield the ratio of each metric in the episodes in which both succeed, the worst task named."""
@@ -171,7 +144,7 @@ class _Pairs:
             starts = distinct(self._starts[known].tolist())
             few = Doubt(Cause.FEW_STARTS, starts) if starts < min(FEWEST, known.sum()) else None
             doubt = self.doubt(name) or few
-            yield name, _ratio(f"{name}{RATIO}", ratio, int(known.sum()), note, self._confidence, doubt)
+            yield name, _ratio(RATIO.quantity(name), ratio, int(known.sum()), note, self._confidence, doubt)
 
     def doubt(self, name: str) -> Doubt | None:
         """Return why the values of a metric that are missing leave nothing to be claimed of it; None where they do."""
@@ -215,22 +188,22 @@ class _Pairs:
                 own, _, known = self._values(name)
                 some, count = int((own[known] > 0).sum()), int(known.sum())
                 note = f"mean of {'; '.join(self._counted(known))}: above 0 in {some} of them, and in none of the "
-                yield Measurement(f"{name}{ADDED}", float(own[known].mean()), metrics()[name].unit, samples=count,
-                                  note=f"{note}baseline's")  # fmt: skip
+                quantity = ADDED_MEAN.quantity(name, metrics()[name].unit)
+                yield quantity.measurement(float(own[known].mean()), samples=count, note=f"{note}baseline's")
 
     def steps(self) -> Iterator[Measurement]:
         """Yield the ratio of the steps of all episodes; one that fails counts as long as the longest of its task."""
-        steps = [self._of(one, "steps") for one in self._rows]
-        if "task" not in self._places:
+        steps = [self._of(one, series.STEPS) for one in self._rows]
+        if series.TASK not in self._places:
             return
         longest = np.zeros(len(steps[0]))
-        for place in range(len(self._names["task"])):
-            own = self._places["task"] == place
+        for place in range(len(self._names[series.TASK])):
+            own = self._places[series.TASK] == place
             longest[own] = max(one[own].max() for one in steps)
         base, own = (np.where(won, one, longest) for won, one in zip(self._wins, steps, strict=True))
         if ratio := self._ratio_of(own, base, np.ones(len(own), bool)):
             what = "steps of all episodes, failures at full length"
-            yield _ratio(STEPS, ratio, len(own), (what,), CONFIDENCE).measured
+            yield _ratio(STEPS_RATIO, ratio, len(own), (what,), CONFIDENCE).measured
 
     def worst(self) -> Iterator[Measurement]:
         """Yield the drop of the task that loses most, with an interval that allows for the choice."""
@@ -241,13 +214,14 @@ class _Pairs:
 
     def drops(self) -> dict[str, Measurement]:
         """Return task -> its drop; all intervals together have the coverage of the pairs (Bonferroni)."""
-        names = self._names.get("task", [])
+        names = self._names.get(series.TASK, [])
         confidence = 1 - (1 - self._confidence) / max(1, len(names))
         drops = {}
         for place, name in enumerate(names):
-            (value, low, high), count = self._drop(self._places["task"] == place, confidence)
-            drops[name] = Measurement(WORST, value, "1", samples=count, low=low, high=high, confidence=confidence,
-                                      note=name)  # fmt: skip
+            (value, low, high), count = self._drop(self._places[series.TASK] == place, confidence)
+            drops[name] = WORST_TASK_DROP.measurement(
+                value, samples=count, low=low, high=high, confidence=confidence, note=name
+            )
         return drops
 
     def table(self, key: str) -> list[dict[str, Any]]:
@@ -281,8 +255,8 @@ class _Pairs:
     def _worst_of(self, own: Array, base: Array, known: NDArray[np.bool_]) -> Iterator[str]:
         """Yield the task whose ratio is the largest, as a part of a note, where there are several tasks."""
         ratios = []
-        for place, name in enumerate(self._names.get("task", ())):
-            chosen = known & (self._places["task"] == place)
+        for place, name in enumerate(self._names.get(series.TASK, ())):
+            chosen = known & (self._places[series.TASK] == place)
             if chosen.sum() >= FEWEST and base[chosen].mean() > 0:
                 ratios.append((float(own[chosen].mean() / base[chosen].mean()), name))
         if len(ratios) > 1:
@@ -301,8 +275,8 @@ class _Pairs:
         where the other one is by the clock.
         """
         missing = [math.nan] * len(self._both)
-        base, own = (np.array(one.raw.get(f"{MOTION}{name}", missing), np.float64) for one in self._rows)
-        clocks = [np.asarray(one.raw.get(NO_CLOCK) or np.zeros(len(self._both))) > 0 for one in self._rows]
+        base, own = (np.array(one.raw.get(series.METRIC.name(name), missing), np.float64) for one in self._rows)
+        clocks = [np.asarray(one.raw.get(series.NO_CLOCK) or np.zeros(len(self._both))) > 0 for one in self._rows]
         base[clocks[0] & ~clocks[1]] = own[clocks[1] & ~clocks[0]] = math.nan
         return own, base, self._both & np.isfinite(own) & np.isfinite(base)
 

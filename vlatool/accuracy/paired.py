@@ -9,16 +9,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from vlatool.accuracy.doubt import Cause, Doubt
-from vlatool.accuracy.moved import BY_INSTRUCTION, BY_TASK, MOTION, NO_CLOCK, START, compare_motion
+from vlatool.accuracy.moved import compare_motion
 from vlatool.errors import DataError
+from vlatool.measures import series, tables
+from vlatool.measures.motion import mean_of
+from vlatool.measures.success import MCNEMAR_P, SUCCESS, SUCCESS_CHANCE, SUCCESS_DROP
 from vlatool.motion.measure import metrics
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import mcnemar_exact
 from vlatool.stats.starts import distinct, independent, too_few, wilson_of
 from vlatool.stats.success_sequential import exact_drop
 
-ABSENT = "unmeasured"
-"""The table of a row that says what could not be had."""
 CLOCK = "time"
 """Where an environment tells its clock in the info of a step."""
 MOST_INSTRUCTIONS = 64
@@ -63,27 +64,27 @@ def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:
     starts = _numbered([outcome.begins for outcome in outcomes])
     low, high = wilson_of(wins, starts)
     note = f"closed loop, Wilson interval; {_starts(starts)}"
-    rate = Measurement("success", wins / len(outcomes), "1", samples=len(outcomes), low=low, high=high, note=note)
+    rate = SUCCESS.measurement(wins / len(outcomes), samples=len(outcomes), low=low, high=high, note=note)
     tasks = _table("task", outcomes, lambda outcome: outcome.task)
     told = sorted({outcome.instruction for outcome in outcomes})
     raw = {
-        "success": [float(outcome.success) for outcome in outcomes],
-        "seed": [float(outcome.seed) for outcome in outcomes],
-        "steps": [float(outcome.steps) for outcome in outcomes],
-        "task": _places(tasks, "task", [outcome.task for outcome in outcomes]),
-        START: starts,
+        series.SUCCESS: [float(outcome.success) for outcome in outcomes],
+        series.SEED: [float(outcome.seed) for outcome in outcomes],
+        series.STEPS: [float(outcome.steps) for outcome in outcomes],
+        series.TASK: _places(tasks, "task", [outcome.task for outcome in outcomes]),
+        series.START: starts,
     }
-    raw |= {f"{MOTION}{name}": [outcome.motion.get(name, math.nan) for outcome in outcomes]
+    raw |= {series.METRIC.name(name): [outcome.motion.get(name, math.nan) for outcome in outcomes]
             for name in metrics() if any(name in outcome.motion for outcome in outcomes)}  # fmt: skip
     if any(CLOCK in outcome.refused for outcome in outcomes):
-        raw[NO_CLOCK] = [float(CLOCK in outcome.refused) for outcome in outcomes]
-    details = {BY_TASK: tasks}
+        raw[series.NO_CLOCK] = [float(CLOCK in outcome.refused) for outcome in outcomes]
+    details = {tables.BY_TASK: tasks}
     if 1 < len(told) <= MOST_INSTRUCTIONS:
-        details[BY_INSTRUCTION] = _table("instruction", outcomes, lambda outcome: outcome.instruction)
+        details[tables.BY_INSTRUCTION] = _table("instruction", outcomes, lambda outcome: outcome.instruction)
         asked = [outcome.instruction for outcome in outcomes]
-        raw["instruction"] = _places(details[BY_INSTRUCTION], "instruction", asked)
+        raw[series.INSTRUCTION] = _places(details[tables.BY_INSTRUCTION], "instruction", asked)
     if refused := list(_refused(outcomes)):
-        details[ABSENT] = refused
+        details[tables.MISSING_VALUES] = refused
     return Row(name, role, measurements=(rate, *_moved(outcomes)), raw=raw, details=details)
 
 
@@ -104,7 +105,7 @@ def few_starts(row: Row) -> Doubt | None:
     Args:
         row: Of ``success_row``.
     """
-    starts = row.raw.get(START, [])
+    starts = row.raw.get(series.START, [])
     return Doubt(Cause.REPEATED_STARTS, distinct(starts), len(starts)) if too_few(starts) else None
 
 
@@ -114,7 +115,7 @@ def repeated_starts(row: Row) -> tuple[str, ...]:
     Args:
         row: Of ``success_row``.
     """
-    starts = row.raw.get(START, [])
+    starts = row.raw.get(series.START, [])
     if distinct(starts) == len(starts):
         return ()
     return (
@@ -129,7 +130,8 @@ def _moved(outcomes: Sequence[Outcome]) -> Iterator[Measurement]:
         values = [outcome.motion[name] for outcome in outcomes if outcome.success and name in outcome.motion]
         if values and any(values):
             mean = math.fsum(values) / len(values)
-            yield Measurement(name, mean, metric.unit, samples=len(values), note="mean of the episodes that succeed")
+            note = "mean of the episodes that succeed"
+            yield mean_of(name, metric.unit).measurement(mean, samples=len(values), note=note)
 
 
 def _refused(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
@@ -163,11 +165,10 @@ def _table(column: str, outcomes: Sequence[Outcome], key: Callable[[Outcome], st
 
 def with_chance(reference: Row, controls: Sequence[Row]) -> Row:
     """Return the row with ``success_chance``: how often the better control succeeds, with its Wilson interval."""
-    rates = [(row.name, rate) for row in controls if (rate := row.get("success")) is not None]
+    rates = [(row.name, rate) for row in controls if (rate := row.get(SUCCESS)) is not None]
     name, best = max(rates, key=lambda pair: pair[1].value)
     note = f"{name} actions, the better of {' and '.join(name for name, _ in rates)}"
-    chance = replace(best, name="success_chance", note=note)
-    return replace(reference, measurements=(*reference.measurements, chance))
+    return replace(reference, measurements=(*reference.measurements, SUCCESS_CHANCE.relabel(best, note)))
 
 
 def compare_success(baseline: Row, row: Row) -> Row:
@@ -176,22 +177,22 @@ def compare_success(baseline: Row, row: Row) -> Row:
     Raises:
         DataError: when the two rows did not play the same seeds.
     """
-    if baseline.raw["seed"] != row.raw["seed"]:
+    if baseline.raw[series.SEED] != row.raw[series.SEED]:
         raise DataError(
             "The two evaluations did not play the same episodes, so they cannot be paired.",
             "play both again with the same --episodes and tasks",
         )
-    pairs = list(zip(baseline.raw["success"], row.raw["success"], strict=True))
+    pairs = list(zip(baseline.raw[series.SUCCESS], row.raw[series.SUCCESS], strict=True))
     lost = sum(before > after for before, after in pairs)
     won = sum(before < after for before, after in pairs)
-    starts = baseline.raw[START]
+    starts = baseline.raw[series.START]
     size = independent(starts)
     drop, low, high = exact_drop(lost, won, len(pairs), size=size)
     p = mcnemar_exact(*(count * size // len(pairs) for count in (lost, won)))
-    test = Measurement("mcnemar_p", p, "1", samples=len(pairs), note="exact, two-sided")
+    test = MCNEMAR_P.measurement(p, samples=len(pairs), note="exact, two-sided")
     note = f"paired: {lost} lost, {won} won of {len(pairs)} episodes; {_starts(starts)}"
-    difference = Measurement("success_drop", drop, "1", samples=len(pairs), low=low, high=high, note=note)
+    difference = SUCCESS_DROP.measurement(drop, samples=len(pairs), low=low, high=high, note=note)
     table = [{"episodes": len(pairs), "lost": lost, "won": won, "drop": round(drop, 4), "McNemar exact p": round(p, 4)}]
-    details = {**row.details, "paired with the baseline": table}
+    details = {**row.details, tables.PAIRED_SUCCESS: table}
     row = replace(row, measurements=(*row.measurements, difference, test), details=details)
     return compare_motion(baseline, row)

@@ -6,11 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from vlatool.accuracy.paired import Outcome
+from vlatool.measures import series, tables
 from vlatool.report import Row
-
-EPISODE = "episode."
-"""What the names of raw samples begin with that show one episode."""
-TABLE = "the episode that differs most"
 
 
 def differs_most(base: Sequence[Outcome], own: Sequence[Outcome]) -> int:
@@ -37,8 +34,8 @@ def _length(outcome: Outcome) -> int:
 
 def with_episode(row: Row, outcome: Outcome) -> Row:
     """Return the row with the steps of an episode, and a line on how it ended."""
-    raw = {f"{EPISODE}{name}": list(values) for name, values in outcome.series.items()}
+    raw = {series.EPISODE.name(name): list(values) for name, values in outcome.series.items()}
     record = {"task": outcome.task, "seed": outcome.seed, "instruction": outcome.instruction,
               "success": "yes" if outcome.success else "no", "steps": outcome.steps}  # fmt: skip
     told = {name: value for name, value in record.items() if value != ""}
-    return replace(row, raw={**row.raw, **raw}, details={**row.details, TABLE: [told]})
+    return replace(row, raw={**row.raw, **raw}, details={**row.details, tables.EPISODE: [told]})

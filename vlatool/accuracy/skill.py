@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vlatool.accuracy.losses import losses, spread_of
 from vlatool.bundle.spec import TensorSpec
+from vlatool.measures.actions import SKILL_EXPERT, VARIATION
 from vlatool.report import Measurement
 from vlatool.stats.intervals import paired_drop, student
 
@@ -41,10 +42,10 @@ def skill(action: TensorSpec, got: Array, expert: Array, episodes: Array | None 
     floor = float(idle.mean())
     if floor == 0.0 or (action.kind != "discrete" and not spread_of(expert).any()):
         note = "the expert's action never varies, so a policy cannot be told from a constant one"
-        return Measurement("skill_expert", math.nan, "1", samples=len(got), note=note)
+        return SKILL_EXPERT.measurement(math.nan, samples=len(got), note=note)
     low, high = _interval(idle - own, episodes, action.kind == "discrete")
-    return Measurement(
-        "skill_expert", float((idle - own).mean()) / floor, "1", samples=len(got), low=low / floor, high=high / floor,
+    return SKILL_EXPERT.measurement(
+        float((idle - own).mean()) / floor, samples=len(got), low=low / floor, high=high / floor,
         confidence=CONFIDENCE, note=f"1 - error / error of the best constant action, which is {floor:.4g}",
     )  # fmt: skip
 
@@ -85,7 +86,7 @@ def variation(action: TensorSpec, got: Array, expert: Array | None) -> list[Meas
         return []
     if action.kind == "discrete":
         value = 1.0 - float(np.bincount(got.reshape(-1)).max()) / got.size
-        return [Measurement("variation", value, "1", samples=len(got), note="share without the most frequent answer")]
+        return [VARIATION.measurement(value, samples=len(got), note="share without the most frequent answer")]
     own, note = got.astype(np.float64).std(axis=0).mean(axis=0), "standard deviation / largest size"
     scale = np.abs(got).max(axis=(0, 1)).astype(np.float64)
     if expert is not None:
@@ -95,6 +96,6 @@ def variation(action: TensorSpec, got: Array, expert: Array | None) -> list[Meas
         scale = np.where(spread_of(expert) > 0, scale, 0.0)
     moved = scale > 0
     if not moved.any():
-        return [Measurement("variation", 0.0, "1", samples=len(got), note=note)] if expert is None else []
+        return [VARIATION.measurement(0.0, samples=len(got), note=note)] if expert is None else []
     value = float(np.mean(own[moved] / scale[moved]))
-    return [Measurement("variation", value if value > 1e-6 else 0.0, "1", samples=len(got), note=note)]
+    return [VARIATION.measurement(value if value > 1e-6 else 0.0, samples=len(got), note=note)]

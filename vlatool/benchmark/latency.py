@@ -27,6 +27,9 @@ from vlatool.measurement.reach import LIKELY_SHARE, POSSIBLE, REPEATS, SIZE, sha
 from vlatool.measurement.results import Benchmark, PolicyRun
 from vlatool.measurement.rows import measurements, raw, sustained_rows, tables
 from vlatool.measurement.validity import findings, validity
+from vlatool.measures import resources, with_derived
+from vlatool.measures import tables as titles
+from vlatool.measures.latency import DEADLINE_MISSES, GMACS, LATENCY_P50, REACH_SHARE, SPEEDUP
 from vlatool.report import Finding, Measurement, Report, Row
 from vlatool.runtime.engine import engine_class
 from vlatool.stage.base import Context, Measure
@@ -200,16 +203,16 @@ class Latency(Measure):
             numbers = measurements(run, policy, reference if others else None, self.rate)
             numbers += sustained_rows(policy.samples) if self.sustained else []
             if bundle.manifest.graphs:
-                numbers.append(Measurement("size", bundle.graph_bytes / 1e6, "MB", note="graphs on disk"))
+                numbers.append(resources.SIZE.measurement(bundle.graph_bytes / 1e6, note="graphs on disk"))
             work = _work(bundle)
             numbers += _arithmetic(work, policy)
             details = tables(run, policy, not others)
             details |= {WORK: [{**whole_work(work), "engine": policy.engine}]} if work else {}
             if policy is reference and (lines := run.log.strip().splitlines()):
-                details["log"] = [{"line": line} for line in lines[-LOG_LINES:]]
+                details[titles.LOG] = [{"line": line} for line in lines[-LOG_LINES:]]
             role = "baseline" if policy is reference and others else "subject"
             placed = tuple(replace(number, where=where) for number in numbers)
-            rows.append(Row(policy.name, role, "", placed, raw(run, policy, not others), details))
+            rows.append(with_derived(Row(policy.name, role, "", placed, raw(run, policy, not others), details)))
         seen = (
             *findings(run, job, bool(self.sustained)),
             *self._limited(run.host, where),
@@ -236,9 +239,9 @@ class Latency(Measure):
         row, others = rows[0], rows[1:]
         text = f"{row.name}: {_ms(row)} median latency on {where}"
         for other in others:
-            text += f"; {other.name}: {_ms(other)} ({other.value('speedup'):.3g}x as fast)"
+            text += f"; {other.name}: {_ms(other)} ({other.value(SPEEDUP):.3g}x as fast)"
         if self.rate:
-            misses = row.value("deadline_misses")
+            misses = row.value(DEADLINE_MISSES)
             late = f"{misses:.2%} of the ticks are late" if misses else "no tick is late"
             text = f"{row.name} at {self.rate:g} Hz: {late}, {_ms(row)} median from the tick to "
             text += f"its action, on {where}"
@@ -290,7 +293,7 @@ def processors(text: str) -> tuple[int, ...]:
 
 def _ms(row: Row) -> str:
     """Return the median latency with three digits, or with all before the point."""
-    value = row.value("latency_p50")
+    value = row.value(LATENCY_P50)
     return f"{value:.3g} ms" if value < 1000 else f"{value:,.0f} ms"
 
 
@@ -301,7 +304,9 @@ def _sparse(bundles: Sequence[Bundle], rows: Sequence[Row], run: Benchmark) -> I
         share = zero_share(bundle) if dense < 1 else 0.0
         if share < dense + SPARSE:
             continue
-        speedup = next(number for number in row.measurements if number.name == "speedup")
+        speedup = row.get(SPEEDUP)
+        if speedup is None:
+            continue
         gained = speedup.low is not None and speedup.low > GAINED
         titles = ", ".join(dict.fromkeys(str(engine_class(graph.engine).title) for graph in policy.engines))
         verdict = "gains by them" if gained else "multiplies them like other numbers: nothing is faster"
@@ -316,7 +321,7 @@ def _sparse(bundles: Sequence[Bundle], rows: Sequence[Row], run: Benchmark) -> I
 def _beyond(rows: Sequence[Row]) -> Iterator[Finding]:
     """Say where a policy seems to be faster than its work at the speed of the large product."""
     for row in rows:
-        found = row.get("reach_share")
+        found = row.get(REACH_SHARE)
         if found is None or found.value <= LIKELY_SHARE:
             continue
         what = f"{row.name} seems to do its work {found.value:,.3g} times as fast as the large product"
@@ -344,8 +349,8 @@ def _arithmetic(work: Workload | None, policy: PolicyRun) -> list[Measurement]:
     if work is None or not policy.reach or work.unknown or latency <= 0:
         return []
     total, product = sum(work.macs.values()), ", ".join(f"{dtype} {gmacs:.3g}" for dtype, gmacs in policy.reach.items())
-    numbers = [Measurement("gmacs", total / latency / 1e9, "GMAC/s", samples=len(policy.samples),
-                           note=f"{total / 1e9:.3g} GMAC in one inference")]  # fmt: skip
+    each = f"{total / 1e9:.3g} GMAC in one inference"
+    numbers = [GMACS.measurement(total / latency / 1e9, samples=len(policy.samples), note=each)]
     share = share_of_reach(work.macs, policy.reach, latency)
     note = f"time that the same work takes at the speed of a product of {SIZE}^3 in this run (GMAC/s: {product})"
-    return numbers if share is None else [*numbers, Measurement("reach_share", share, "1", samples=REPEATS, note=note)]
+    return numbers if share is None else [*numbers, REACH_SHARE.measurement(share, samples=REPEATS, note=note)]

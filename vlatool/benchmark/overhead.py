@@ -14,7 +14,9 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
 from vlatool.errors import UsageError
 from vlatool.machine.host import fingerprint
-from vlatool.report import Measurement, Report, Row
+from vlatool.measures import series, with_derived
+from vlatool.measures.latency import BARE_RUN_P50, OVERHEAD_IN_TURN_P50, OVERHEAD_P50
+from vlatool.report import Report, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import draw
@@ -91,13 +93,15 @@ class Overhead(Measure):
         beside = "infer() minus bare run(), single calls in turn"
         count = len(in_turn)
         measurements = (
-            Measurement("overhead_p50", value, "us", samples=len(differences), low=low, high=high, note=note),
-            Measurement("overhead_in_turn_p50", turn, "us", samples=count, low=turn_low, high=turn_high, note=beside),
-            Measurement("bare_run_p50", bare_us, "us", samples=len(differences), note="engine alone"),
+            OVERHEAD_P50.measurement(value, samples=len(differences), low=low, high=high, note=note),
+            OVERHEAD_IN_TURN_P50.measurement(turn, samples=count, low=turn_low, high=turn_high, note=beside),
+            BARE_RUN_P50.measurement(bare_us, samples=len(differences), note="engine alone"),
         )
         text = f"infer() adds {value:.1f} us (median) to a bare run() of {bare_us:.0f} us"
         text += f"; {turn:.1f} us when calls of both kinds take turns."
-        row = Row(source.manifest.name, measurements=measurements, raw={"overhead_us": differences.tolist()})
+        row = with_derived(
+            Row(source.manifest.name, measurements=measurements, raw={series.OVERHEAD: differences.tolist()})
+        )
         return Report("benchmark", f"Overhead of the runtime on {source.manifest.name}", summary=(text,), rows=(row,),
                       environment=fingerprint())  # fmt: skip
 

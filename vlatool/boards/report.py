@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,10 @@ from vlatool.boards.select import Choice, Wants, cost
 from vlatool.bundle.bundle import MANIFEST
 from vlatool.graph.workload import Workload
 from vlatool.latency_model.predict import numbers
-from vlatool.report import Measurement, Report, Row
+from vlatool.measures import resources, tables
+from vlatool.report import Report, Row
 
 ROLES = {"fits": "within", "may fit": "subject", "unknown": "subject", "no": "outside"}
-WAY = "way"
-"""Table of a row that says how the board is driven: state, power mode, engine, precision."""
 
 
 def boards_report(
@@ -110,22 +109,22 @@ def _warnings(first: Choice | None) -> tuple[str, ...]:
 def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) -> Row:
     outcome = choice.outcome
     way: dict[str, Any] = {"state": choice.state}
-    measurements = [Measurement("price", choice.profile.price_usd.value, "USD", "predicted", choice.profile.name)]
+    board = choice.profile.name
+    measurements = [resources.PRICE.prediction(choice.profile.price_usd.value, board)]
     if outcome is not None:
         candidate = outcome.candidate
         way |= {"power mode": candidate.mode, "engine": candidate.engine, "precision": candidate.precision}
         measurements += numbers(outcome, wants.execute)
         spent = cost(choice, wants, cloud)
-        for name, value, unit in (
-            ("average_watts", spent.average_watts, "W"), ("owned_cost", spent.owned, "USD"),
-            ("cloud_cost", spent.cloud, "USD"), ("break_even", spent.break_even_hours, "h"),
-            ("battery_life", spent.battery_hours, "h"),
+        for quantity, value in (
+            (resources.AVERAGE_WATTS, spent.average_watts), (resources.OWNED_COST, spent.owned),
+            (resources.CLOUD_COST, spent.cloud), (resources.BREAK_EVEN, spent.break_even_hours),
+            (resources.BATTERY_LIFE, spent.battery_hours),
         ):  # fmt: skip
             if not math.isnan(value):
-                measurements.append(Measurement(name, value, unit, "predicted", choice.profile.name))
-    tables: Mapping[str, list[dict[str, Any]]] = {WAY: [way]}
+                measurements.append(quantity.prediction(value, board))
     role = "chosen" if chosen else ROLES[choice.state]
-    return Row(choice.profile.name, role, choice.reason, tuple(measurements), details=tables)
+    return Row(board, role, choice.reason, tuple(measurements), details={tables.WAY: [way]})
 
 
 def _number(value: float) -> str:

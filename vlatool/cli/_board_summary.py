@@ -10,6 +10,9 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.hardware.profile import Profile
+from vlatool.measures.actions import AGREEMENT_BASELINE, RELATIVE_ERROR
+from vlatool.measures.latency import LATENCY_P50
+from vlatool.measures.resources import MEMORY
 from vlatool.report import Measurement
 from vlatool.stage.base import Context
 
@@ -17,7 +20,7 @@ SAMPLES = 64
 """Recorded observations that the actions are compared on."""
 SMALLER = 1.05
 """Smallest ratio at which a bundle is reported as smaller than its source."""
-SHOWN = {"latency_p50": "latency p50", "memory": "memory"}
+SHOWN = {quantity.name: quantity.words for quantity in (LATENCY_P50, MEMORY)}
 
 
 @dataclass(frozen=True)
@@ -105,13 +108,13 @@ def _error(bundle: Bundle, source: Bundle | None, context: Context) -> Measureme
     if source is None or not source.manifest.graphs or not carries_evaluation(bundle):
         return None
     row = Recorded(baseline=source.path, samples=SAMPLES).run(bundle, context).rows[-1]
-    error = row.get("agreement_baseline") or row.get("relative_error")
+    error = row.get(AGREEMENT_BASELINE) or row.get(RELATIVE_ERROR)
     return error if error is not None and error.known else None
 
 
 def _error_text(error: Measurement) -> str:
     of = f"{error.samples} recorded observations"
-    if error.name.startswith("agreement"):
+    if error.name == AGREEMENT_BASELINE.name:
         return f"the same actions as the source: {error.value:.1%} of {of}"
     return f"relative error of the actions: {error.value:.3g} against the source, on {of}"
 

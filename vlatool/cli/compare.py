@@ -12,7 +12,8 @@ from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing, show
 from vlatool.cli._options import AsJson, Force, Raw, ReportFolder
-from vlatool.cli._side_by_side import read_reports, side_by_side
+from vlatool.compare.inputs import read_reports
+from vlatool.compare.side_by_side import side_by_side
 from vlatool.errors import DataError, UsageError
 
 

@@ -13,10 +13,10 @@ from vlatool.hardware.profile import load_profile
 from vlatool.latency_model.predict import predictions
 from vlatool.measurement import agent
 from vlatool.measurement.jobs import LatencyJob
+from vlatool.measures.latency import LATENCY_IN_THE_LOOP
 from vlatool.report import Measurement
 from vlatool.stage.base import Context
 
-LOOP_LATENCY = "latency_in_the_loop"
 CALLS, SECONDS = 50, 2.0
 """Of each bundle, when its latency is measured."""
 
@@ -38,9 +38,9 @@ def loop_latency(bundle: Bundle, board: str, engine: str, context: Context) -> M
         latency = predictions(load_profile(board), bundle, engine)[0]
         if not latency.known:
             raise DataError(f"The latency on {board} cannot be predicted: {latency.note}.", "name another board")
-        return replace(latency, name=LOOP_LATENCY)
+        return LATENCY_IN_THE_LOOP.relabel(latency)
     calls = _calls(bundle, engine, context)
-    return Measurement(LOOP_LATENCY, median(calls), "ms", samples=len(calls), note="median, one thread")
+    return LATENCY_IN_THE_LOOP.measurement(median(calls), samples=len(calls), note="median, one thread")
 
 
 def _calls(bundle: Bundle, engine: str, context: Context) -> Sequence[float]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from vlatool.accuracy.moved import START
 from vlatool.accuracy.paired import Outcome
 from vlatool.episodes.play import EpisodesJob, jobs_for
-from vlatool.report import Measurement, Row
+from vlatool.measures import series
+from vlatool.measures.success import SUCCESS_DROP
+from vlatool.report import Row
 from vlatool.stage.base import Context
 from vlatool.stats.starts import distinct, independent, too_few
 from vlatool.stats.success_sequential import GO_ON, Decision, plan
@@ -69,9 +70,9 @@ def told(decision: Decision) -> str:
 def with_decision(row: Row, decision: Decision) -> Row:
     """Return the row with the interval of its drop that holds over all interim analyses."""
     note = f"paired: {decision.lost} lost, {decision.won} won of {decision.pairs} episodes, {decision.most} at most"
-    note += f"; {distinct(row.raw[START])} distinct starts"
-    drop = Measurement("success_drop", decision.drop, "1", samples=decision.pairs, low=decision.low,
-                       high=decision.high, note=note)  # fmt: skip
+    note += f"; {distinct(row.raw[series.START])} distinct starts"
+    low, high = decision.low, decision.high
+    drop = SUCCESS_DROP.measurement(decision.drop, samples=decision.pairs, low=low, high=high, note=note)
     return replace(row, measurements=tuple(drop if item.name == drop.name else item for item in row.measurements))
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from vlatool.accuracy.disturbed import worst_record
-from vlatool.accuracy.moved import ADDED, RATIO, STEPS, WORST, pairs_above_none, worst_task
-from vlatool.evaluate._loop_latency import LOOP_LATENCY
+from vlatool.accuracy.moved import pairs_above_none, worst_task
+from vlatool.measures.latency import LATENCY_IN_THE_LOOP
+from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
+from vlatool.measures.success import WORST_TASK_DROP
 from vlatool.report import Measurement, Row
 
 LEAST = 1.005
@@ -23,20 +25,20 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
         board: What latencies in the loop are predicted for; measured here when empty.
     """
     row = rows[-1]
-    worst, steps = row.get(WORST), row.get(STEPS)
+    worst, steps = row.get(WORST_TASK_DROP), row.get(STEPS_RATIO)
     if worst and worst.value > 0:
         yield f"The task that loses most is {worst_task(worst)}: {100 * worst.value:.3g} points."
-    changed = [item for item in row.measurements if item.name.endswith(RATIO) and item is not steps]
-    if rougher := [item for item in changed if _is_more(item)]:
-        words = (f"{item.name.removesuffix(RATIO).replace('_', ' ')} {_times(item.value)}" for item in rougher)
+    changed = {metric: item for metric, item in RATIO.members(row).items() if item is not steps}
+    if rougher := {metric: item for metric, item in changed.items() if _is_more(item)}:
+        words = (f"{metric.replace('_', ' ')} {_times(item.value)}" for metric, item in rougher.items())
         yield f"Where both succeed, more than the baseline's: {', '.join(words)}."
     if new := list(_added(rows)):
         yield f"Where both succeed, the baseline has none of these: {', '.join(new)}."
     if steps and _is_more(steps):
         yield f"Over all episodes, it needs {_times(steps.value)} the steps."
     yield from _disturbed(row)
-    latencies = {one.name: item.value for one in rows for item in one.measurements if item.name == LOOP_LATENCY}
-    if latencies:
+    if latencies := {one.name: item.value for one in rows for origin in ("measured", "predicted")
+                     if (item := one.get(LATENCY_IN_THE_LOOP, origin))}:  # fmt: skip
         late = ", ".join(f"{name} {ms:.3g} ms" for name, ms in latencies.items())
         where = f"predicted for {board}" if board else "measured here"
         yield f"Actions come as late as inferences take ({where}): {late}."
@@ -46,7 +48,7 @@ def _added(rows: Sequence[Row]) -> Iterator[str]:
     """Yield what the baseline has nothing of, and the variant in so many pairs that chance is no explanation."""
     if len(rows) < 2:
         return
-    added = {item.name.removesuffix(ADDED): item for item in rows[-1].measurements if item.name.endswith(ADDED)}
+    added = ADDED_MEAN.members(rows[-1])
     for name, (some, count) in pairs_above_none(rows[0], rows[-1], added).items():
         if some >= FEWEST_ADDED:
             yield f"{name.replace('_', ' ')} (in {some} of {count} episodes, {added[name].value:.3g} on average)"

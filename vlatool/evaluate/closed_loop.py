@@ -13,7 +13,6 @@ from pydantic_core import PydanticCustomError
 
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.disturbed import with_disturbed, without_effect
-from vlatool.accuracy.moved import START
 from vlatool.accuracy.paired import Outcome, compare_success, repeated_starts, success_row, with_chance
 from vlatool.accuracy.shown import with_episode
 from vlatool.bundle.bundle import MANIFEST, Bundle
@@ -32,6 +31,8 @@ from vlatool.evaluate._shown import check_video_of, played_again
 from vlatool.evaluate._told import told
 from vlatool.files.resumable_work import Store
 from vlatool.machine.host import cache_directory, fingerprint
+from vlatool.measures import series, with_derived
+from vlatool.measures.success import SUCCESS
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.module.source import describe
 from vlatool.report import Report, Row
@@ -227,7 +228,7 @@ class ClosedLoop(Measure):
         again = played_again(jobs[0], [*reference, outcomes], plays, bundles, context)
         if again.outcomes:
             rows, row = [with_episode(rows[0], again.outcomes[0])], with_episode(row, again.outcomes[1])
-        rows = [replace(row, measurements=(*row.measurements, latency)) if latency else row
+        rows = [with_derived(replace(row, measurements=(*row.measurements, latency)) if latency else row)
                 for row, latency in zip([*rows, row], latencies, strict=True)]  # fmt: skip
         row = rows[-1]
         count = len(outcomes)
@@ -235,9 +236,9 @@ class ClosedLoop(Measure):
         title = f"{source.manifest.name}{how} in {count} closed-loop episodes"
         how = f" with {self.control} actions in the place of the policy's" if self.control else how
         how += f" with the controller {','.join(self.controller)}" if self.controller else ""
-        text = f"{row.value('success'):.1%} of {count} episodes succeed{how and ',' + how}."
+        text = f"{row.value(SUCCESS):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
-        decided = (sentence(decision, distinct(row.raw[START])),) if decision else ()
+        decided = (sentence(decision, distinct(row.raw[series.START])),) if decision else ()
         summary = (*believed.sentences, *decided, text, *told(rows, self.board), *again.sentences)
         doubts = (*repeated_starts(row), *seen_in_training(bundles, jobs), *found_wrong(source))
         warnings = (*believed.warnings, *doubts, *again.warnings, *dict.fromkeys(context.notes))

@@ -23,6 +23,8 @@ from vlatool.errors import DataError
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._names import names_of
 from vlatool.machine.host import fingerprint
+from vlatool.measures import with_derived
+from vlatool.measures.actions import BASELINE, EXPERT, RELATIVE_ERROR, Reference
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
@@ -39,8 +41,8 @@ MAKE_OTHERWISE = (
 )
 KEPT = 4
 NEVER_VARIES = {
-    "expert": "the expert's action never varies, so no error relative to its spread",
-    "baseline": "the baseline's action never varies, so no error relative to its spread",
+    EXPERT.name: "the expert's action never varies, so no error relative to its spread",
+    BASELINE.name: "the baseline's action never varies, so no error relative to its spread",
 }
 """Why an error against the expert or the baseline is unknown."""
 REFERENCES: dict[tuple[Any, ...], Array] = {}
@@ -81,12 +83,12 @@ class Recorded(Measure):
         if self.baseline:
             reference = self._reference(bundles[0], source, recording, indices, context)
             own = alone(action, reference, expert, episodes)
-            rows.append(Row(names[0], "baseline", measurements=tuple(own)))
+            rows.append(with_derived(Row(names[0], "baseline", measurements=tuple(own))))
         actions = run_recorded(source, recording, indices, self.engine, context)
         measurements = alone(action, actions, expert, episodes)
         if reference is not None:
-            measurements += compare(action, actions, reference, "baseline")
-        rows.append(Row(names[-1], measurements=tuple(measurements)))
+            measurements += compare(action, actions, reference, BASELINE)
+        rows.append(with_derived(Row(names[-1], measurements=tuple(measurements))))
         kind = "calibration" if reservation else "recorded"
         title = f"{source.manifest.name} on {len(indices)} {kind} observations"
         trust = credibility(rows[0]) if self.baseline else Credibility()
@@ -116,27 +118,29 @@ class Recorded(Measure):
 
 def _summary(row: Row) -> str:
     sentences = []
-    for whose, words in (("expert", "the expert"), ("baseline", "the baseline")):
-        agreement, error = row.get(f"agreement_{whose}"), row.get(f"error_{whose}")
+    for reference in (EXPERT, BASELINE):
+        agreement, error = row.get(reference.agreement), row.get(reference.error)
         if agreement is not None:
-            sentences.append(f"{agreement.value:.1%} of the actions are those of {words}")
+            sentences.append(f"{agreement.value:.1%} of the actions are those of the {reference.name}")
         elif error is not None and error.known:
-            sentences.append(f"actions differ from {words}'s by {error.value:.1%} of their standard deviation")
+            sentences.append(
+                f"actions differ from the {reference.name}'s by {error.value:.1%} of their standard deviation"
+            )
         elif error is not None:
-            sentences.append(f"{error.note}; {_worst(row, f'error_{whose}.')}")
+            sentences.append(f"{error.note}; {_worst(row, reference)}")
     return "; ".join(sentences) or "nothing to compare with"
 
 
-def _worst(row: Row, start: str) -> str:
+def _worst(row: Row, reference: Reference) -> str:
     """Return the largest error of an element, in its unit."""
-    worst = max((error for error in row.measurements if error.name.startswith(start)), key=lambda error: error.value)
+    element, worst = max(reference.element_error.members(row).items(), key=lambda item: item[1].value)
     unit = "" if worst.unit == "1" else f" {worst.unit}"
-    return f"{worst.name.removeprefix(start)} is off by {worst.value:.3g}{unit} on average"
+    return f"{element} is off by {worst.value:.3g}{unit} on average"
 
 
 def alone(action: TensorSpec, got: Array, expert: Array | None, episodes: Array | None) -> list[Measurement]:
     """Return what the actions of one policy say without another one: against the expert's, and how much they vary."""
-    measured = compare(action, got, expert, "expert")
+    measured = compare(action, got, expert, EXPERT)
     if expert is not None:
         measured.append(skill(action, got, expert, episodes))
     return [*measured, *variation(action, got, expert)]
@@ -178,7 +182,7 @@ def moments_of(recording: Recording, indices: Sequence[int], *, keeps: bool) -> 
         episode = current
 
 
-def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) -> list[Measurement]:
+def compare(action: TensorSpec, got: Array, wanted: Array | None, reference: Reference) -> list[Measurement]:
     """Compare actions with the expert's or the baseline's.
 
     Returns:
@@ -193,7 +197,7 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
         same = agreeing(got, wanted)
         hits, total = int(np.sum(same)), same.size
         low, high = wilson(hits, total)
-        return [Measurement(f"agreement_{whose}", hits / total, "1", samples=total, low=low, high=high)]
+        return [reference.agreement.measurement(hits / total, samples=total, low=low, high=high)]
     steps = min(got.shape[1], wanted.shape[1])
     got, wanted = got[:, :steps].astype(np.float64), wanted[:, :steps].astype(np.float64)
     labels = action.labels or tuple(str(index) for index in range(action.width))
@@ -202,18 +206,17 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
     scale = scale_of(action, wanted)
     varies = bool(scale.any())
     relative = float(np.mean(mean / scale)) if varies else math.nan
-    note = "mean |error| / standard deviation" if varies else NEVER_VARIES[whose]
+    note = "mean |error| / standard deviation" if varies else NEVER_VARIES[reference.name]
     norms = np.linalg.norm(wanted.reshape(count, -1), axis=1)
     distances = np.linalg.norm((got - wanted).reshape(count, -1), axis=1) / np.where(norms > 0, norms, 1.0)
-    measured = [Measurement(f"error_{whose}", relative, "1", samples=count, note=note)]
-    if whose == "baseline":
+    measured = [reference.error.measurement(relative, samples=count, note=note)]
+    if reference is BASELINE:
         note = "mean over samples of |difference|2 / |action|2"
-        measured.append(Measurement("relative_error", float(distances.mean()), "1", samples=count, note=note))
+        measured.append(RELATIVE_ERROR.measurement(float(distances.mean()), samples=count, note=note))
     for index, (label, unit) in enumerate(zip(labels, action.units(), strict=True)):
-        measured.append(
-            Measurement(f"error_{whose}.{label}", float(mean[index]), unit, samples=count, note="mean |error|")
-        )
-    measured += _gripper_flips(labels, got, wanted, whose)
+        quantity = reference.element_error.quantity(label, unit)
+        measured.append(quantity.measurement(float(mean[index]), samples=count, note="mean |error|"))
+    measured += _gripper_flips(labels, got, wanted, reference)
     return measured
 
 
@@ -223,7 +226,7 @@ def _middles(wanted: Array) -> Array:
     return np.where(low < high, (low + high) / 2, 0.0)
 
 
-def _gripper_flips(labels: Sequence[str], got: Array, wanted: Array, whose: str) -> list[Measurement]:
+def _gripper_flips(labels: Sequence[str], got: Array, wanted: Array, reference: Reference) -> list[Measurement]:
     columns = [index for index, label in enumerate(labels) if "grip" in label.lower()]
     if not columns:
         return []
@@ -231,4 +234,4 @@ def _gripper_flips(labels: Sequence[str], got: Array, wanted: Array, whose: str)
     flips = int(np.sum((got[..., columns] > middle) != (wanted[..., columns] > middle)))
     total = got[..., columns].size
     low, high = wilson(flips, total)
-    return [Measurement(f"gripper_flips_{whose}", flips / total, "1", samples=total, low=low, high=high)]
+    return [reference.gripper_flips.measurement(flips / total, samples=total, low=low, high=high)]

@@ -15,7 +15,9 @@ from vlatool.machine.host import isa
 from vlatool.machine.instruction_sets import saturates
 from vlatool.measurement.interleaved import latency_measurements, speedup
 from vlatool.measurement.reach import LIKELY_SHARE, share_of_reach
-from vlatool.report import Measurement, Row
+from vlatool.measures import series
+from vlatool.measures.actions import RAW_RELATIVE_ERROR
+from vlatool.report import Row
 from vlatool.sensitivity.layers import LayerError
 
 MOST = 10
@@ -232,7 +234,7 @@ def candidate_row(candidate: Candidate, contest: Contest, where: Mapping[str, An
     if not math.isnan(candidate.error) and candidate is not contest.baseline:
         note = "mean over observations of |difference|2 / |raw action|2, to float32"
         count = len(candidate.contestant.observations) if candidate.contestant else 0
-        measurements.append(Measurement("raw_relative_error", candidate.error, "1", samples=count, note=note))
+        measurements.append(RAW_RELATIVE_ERROR.measurement(candidate.error, samples=count, note=note))
     role, reason = "subject", ""
     if candidate is contest.baseline:
         role = "baseline"
@@ -240,7 +242,7 @@ def candidate_row(candidate: Candidate, contest: Contest, where: Mapping[str, An
         role = "chosen"
     if candidate.stage is not None:
         reason = command(candidate.stage, source)
-    return Row(candidate.name, role, reason, tuple(measurements), {"latency_ms": samples} if samples else {}, where)
+    return Row(candidate.name, role, reason, tuple(measurements), {series.LATENCY: samples} if samples else {}, where)
 
 
 def suggestion(contest: Contest, source: str) -> list[str]:

@@ -21,7 +21,9 @@ from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
 from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.validity import busy, throttling, validity
-from vlatool.report import Finding, Measurement, Report, Row
+from vlatool.measures import series, tables
+from vlatool.measures.latency import LATENCY_P50
+from vlatool.report import Finding, Report, Row
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context, content_hash
 from vlatool.telemetry import Recorder, open_all
@@ -61,7 +63,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
         findings += tuple(replace(finding, effect="note") for finding in busy(host))
     name = candidate.manifest.name
     row = _row("candidate", candidate, timed, results)
-    row = replace(row, details={**row.details, "measured with": _measured_with(evidence)})
+    row = replace(row, details={**row.details, tables.SETTINGS: _measured_with(evidence)})
     rows = (_row("baseline", baseline, timed, results), row)
     return Report(KIND, f"Gate of {name}", worst(result.verdict.outcome for result in results).value,
                   (*_summary(name, results), f"{inputs.description()}."), rows,
@@ -119,19 +121,19 @@ def _measured_with(evidence: Evidence) -> list[dict[str, Any]]:
 
 def _row(name: str, bundle: Bundle, timed: Timed, results: Sequence[_Result]) -> Row:
     calls = timed.calls(name)
-    measured = [Measurement("latency_p50", median(calls), "ms", samples=len(calls))] if calls else []
-    raw = {"latency_ms": calls} if calls else {}
+    measured = [LATENCY_P50.measurement(median(calls), samples=len(calls))] if calls else []
+    raw = {series.LATENCY: calls} if calls else {}
     reason = f"{bundle.manifest.name}, {bundle.hash[:19]}"
     if name == "baseline":
         measured += [number for result in results for number in result.verdict.baseline]
         return Row(name, "baseline", reason, tuple(measured), raw)
     measured += [number for result in results for number in result.verdict.measurements]
     if calls:
-        raw["log_ratio"] = [pairs.log_ratio for pairs in timed.pairs]
-        raw["log_mean_ratio"] = [pairs.mean_log_ratio for pairs in timed.pairs]
+        raw[series.LOG_RATIO] = [pairs.log_ratio for pairs in timed.pairs]
+        raw[series.LOG_MEAN_RATIO] = [pairs.mean_log_ratio for pairs in timed.pairs]
     claims = [{"claim": result.title, "verdict": result.verdict.outcome.value, "found": result.sentence}
               for result in results]  # fmt: skip
-    return Row(name, "subject", reason, tuple(measured), raw, {"claims": claims})
+    return Row(name, "subject", reason, tuple(measured), raw, {tables.CLAIMS: claims})
 
 
 def _summary(name: str, results: Sequence[_Result]) -> tuple[str, ...]:

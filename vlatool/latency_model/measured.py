@@ -17,6 +17,7 @@ from vlatool.hardware.profile import Profile, load_profile, names
 from vlatool.latency_model.board import Candidate, place_of
 from vlatool.latency_model.features import Question, Work
 from vlatool.machine.host import matches
+from vlatool.measures.latency import LATENCY_P50
 from vlatool.report import read_report
 
 PLACES = "VLATOOL_CALIBRATIONS"
@@ -77,7 +78,7 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
         how = "was paced (--rate)" if run.get("rate_hz") else f"emulates {run['emulates']} on another machine"
         raise DataError(f"{report} cannot calibrate {profile.name}: it {how}.", "measure back to back, on the board")
     for row in benchmark.rows:
-        latency = row.get("latency_p50")
+        latency = row.get(LATENCY_P50)
         if latency is None or not latency.known:
             continue
         tables = row.details.get(WORK) or [whole_work(load) if load else {}]

@@ -11,9 +11,11 @@ from vlatool.hardware.profile import Profile
 from vlatool.latency_model.board import Candidate, Outcome, engine_for, outcomes, quantized_as
 from vlatool.latency_model.measured import measured_questions
 from vlatool.latency_model.model import LEVEL, Predicted, shipped
+from vlatool.measures.latency import LATENCY_P50, LATENCY_PER_ACTION
+from vlatool.measures.resources import ENERGY, ENERGY_PER_ACTION, MEMORY, USABLE_MEMORY, WATTS
 from vlatool.report import Measurement
 
-SHOWN = ("latency_p50", "memory", "energy")
+SHOWN = (LATENCY_P50.name, MEMORY.name, ENERGY.name)
 
 
 def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Measurement]:
@@ -41,18 +43,19 @@ def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
     note = latency.why or f"{way}: {EVIDENCE[latency.regime]}; without pre- and postprocessing"
     low, high = (latency.low, latency.high) if latency.known else (None, None)
     memory, power = outcome.memory_mb, outcome.watts
+    usable = 1e3 * outcome.candidate.profile.usable_memory_gb.value
+
     measurements = [
-        Measurement("latency_p50", latency.ms, "ms", "predicted", where, 0, low, high, LEVEL, note),
-        Measurement("memory", memory[0], "MB", "predicted", where, 0, memory[1], memory[2], LEVEL, JUDGED),
-        Measurement("usable_memory", 1e3 * outcome.candidate.profile.usable_memory_gb.value, "MB", "predicted", where),
-        Measurement("watts", power[0], "W", "predicted", where, 0, power[1], power[2], LEVEL, JUDGED),
+        LATENCY_P50.prediction(latency.ms, where, low, high, LEVEL, note),
+        MEMORY.prediction(memory[0], where, memory[1], memory[2], LEVEL, JUDGED),
+        USABLE_MEMORY.prediction(usable, where),
+        WATTS.prediction(power[0], where, power[1], power[2], LEVEL, JUDGED),
     ]
     if latency.known:
         ends = (power[1] * latency.low / 1e3, power[2] * latency.high / 1e3)
-        measurements.append(Measurement("energy", outcome.joules, "J", "predicted", where, 0, *ends, LEVEL, JUDGED))
-        per_action = (("latency_per_action", latency.ms, "ms"), ("energy_per_action", outcome.joules, "J"))
-        for name, value, unit in per_action:
-            measurements.append(Measurement(name, value / execute, unit, "predicted", where))
+        measurements.append(ENERGY.prediction(outcome.joules, where, *ends, LEVEL, JUDGED))
+        for quantity, value in ((LATENCY_PER_ACTION, latency.ms), (ENERGY_PER_ACTION, outcome.joules)):
+            measurements.append(quantity.prediction(value / execute, where))
     return measurements
 
 

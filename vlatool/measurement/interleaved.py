@@ -13,6 +13,8 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.measurement.answers import Answers
+from vlatool.measures import Family
+from vlatool.measures.latency import LATENCY, LATENCY_MAX, SPEEDUP
 from vlatool.report import Measurement
 from vlatool.runtime.policy import Policy
 from vlatool.stats.intervals import quantile_interval
@@ -111,12 +113,12 @@ def latency_measurements(
         refusals, most, seconds: as in ``percentile_measurements``; back to back when ``seconds`` is None.
     """
     taken = sum(samples) / 1e3 if seconds is None else seconds
-    percentiles = percentile_measurements("latency", samples, PERCENTILES, refusals, most, taken)
-    return [*percentiles, Measurement("latency_max", max(samples), "ms", samples=len(samples))]
+    percentiles = percentile_measurements(LATENCY, samples, PERCENTILES, refusals, most, taken)
+    return [*percentiles, LATENCY_MAX.measurement(max(samples), samples=len(samples))]
 
 
 def percentile_measurements(
-    what: str,
+    what: Family,
     samples: Sequence[float],
     percents: Sequence[float],
     refusals: bool = False,
@@ -130,7 +132,7 @@ def percentile_measurements(
     it. Any other percentile that is not bounded is left out, or, with ``refusals``, named with what it would take.
 
     Args:
-        what: name before ``_p50``.
+        what: quantity of the percentiles.
         samples: samples in ms, in the order in which they were taken.
         percents: 0-100.
         refusals: whether a percentile that the samples cannot bound is named.
@@ -140,15 +142,15 @@ def percentile_measurements(
     measured, count = [], len(samples)
     for percent in percents:
         bounded = percentile(samples, percent, most=most)
-        name = f"{what}_{bounded.name}"
+        quantity = what.quantity(bounded.name)
         value = float(np.median(samples)) if percent == PERCENTILES[0] else bounded.value
         if bounded.known:
             high, confidence = max(bounded.bound, value), bounded.confidence
-            measured.append(Measurement(name, value, "ms", samples=count, high=high, confidence=confidence))
+            measured.append(quantity.measurement(value, samples=count, high=high, confidence=confidence))
         elif percent == PERCENTILES[0]:
-            measured.append(Measurement(name, value, "ms", samples=count))
+            measured.append(quantity.measurement(value, samples=count))
         elif refusals:
-            measured.append(Measurement(name, math.nan, "ms", samples=count, note=_lacks(bounded, count, seconds)))
+            measured.append(quantity.measurement(math.nan, samples=count, note=_lacks(bounded, count, seconds)))
     return measured
 
 
@@ -178,7 +180,7 @@ def speedup_of(
     _, low, high = quantile_interval(ratios, 0.5)
     low, high = (min(low, value) if low else low), (max(high, value) if high else high)
     note = f"ratio of medians to {reference_name}, interleaved"
-    return Measurement("speedup", value, "x", samples=count, low=low, high=high, note=note)
+    return SPEEDUP.measurement(value, samples=count, low=low, high=high, note=note)
 
 
 def unique_names(contestants: Sequence[Contestant]) -> None:

@@ -17,6 +17,8 @@ from typing import Any
 from vlatool.measurement.answers import Answers
 from vlatool.measurement.interleaved import percentile_measurements
 from vlatool.measurement.results import Pace
+from vlatool.measures import Family
+from vlatool.measures.latency import AGE, AGE_MAX, DEADLINE_MISSES, WAKEUP
 from vlatool.report import Measurement
 from vlatool.runtime.policy import Policy
 from vlatool.stats.intervals import wilson
@@ -140,18 +142,18 @@ def paced_measurements(pace: Pace, ticks: int, rate: float) -> list[Measurement]
     low, high = wilson(min(size, round(pace.misses * size / ticks)), size) if size else (None, None)
     note = f"ticks at {rate:g} Hz whose action came after the next tick, {pace.period_ms:g} ms later; "
     note += f"{pace.inferences:,} inferences, {pace.passed_over:,} ticks passed over while the policy computed"
-    measured = [Measurement("deadline_misses", pace.misses / ticks, "1", samples=ticks, low=low, high=high, note=note)]
+    measured = [DEADLINE_MISSES.measurement(pace.misses / ticks, samples=ticks, low=low, high=high, note=note)]
     if ages := pace.age_ms:
         about = "age of the observation behind the newest action when a tick is due"
-        measured += _percentiles("age", ages, size, ticks / rate, about)
-        measured.append(Measurement("age_max", max(ages), "ms", samples=len(ages), note=about))
+        measured += _percentiles(AGE, ages, size, ticks / rate, about)
+        measured.append(AGE_MAX.measurement(max(ages), samples=len(ages), note=about))
     if pace.wakeup_ms:
         about = "how late the loop wakes up for a tick that it slept until"
-        measured += _percentiles("wakeup", pace.wakeup_ms, size, ticks / rate, about)
+        measured += _percentiles(WAKEUP, pace.wakeup_ms, size, ticks / rate, about)
     return measured
 
 
-def _percentiles(what: str, samples: Sequence[float], size: float, seconds: float, about: str) -> list[Measurement]:
+def _percentiles(what: Family, samples: Sequence[float], size: float, seconds: float, about: str) -> list[Measurement]:
     percentiles = percentile_measurements(what, samples, (50.0, 99.0), True, size, seconds)
     return [replace(percentile, note=percentile.note or about) for percentile in percentiles]
 

@@ -14,6 +14,9 @@ from vlatool.measurement.cold_start import PARTS, ColdStart
 from vlatool.measurement.interleaved import latency_measurements, percentile_measurements, speedup_of
 from vlatool.measurement.paced import is_overloaded, paced_measurements
 from vlatool.measurement.results import Benchmark, PolicyRun
+from vlatool.measures import latency, resources, series
+from vlatool.measures import tables as titles
+from vlatool.measures.actions import GOLDEN_ERROR
 from vlatool.report import Measurement
 from vlatool.telemetry import DEGREE, THROTTLE, Absent, Recorded
 
@@ -50,18 +53,18 @@ def measurements(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | 
         numbers.append(_throughput(samples))
     numbers.append(_jitter(samples))
     busy = measured.cpu_s / max(measured.wall_s, 1e-9)
-    numbers.append(Measurement("cpu", busy, "cores", note="user and system time of the process over the run"))
+    numbers.append(resources.CPU.measurement(busy, note="user and system time of the process over the run"))
     board = _board(measured, pace.inferences if pace else len(samples))
     return [*numbers, *board, *_golden(policy), *cold_rows(policy)]
 
 
 def _throughput(samples: Sequence[float]) -> Measurement:
-    return Measurement("throughput", 1e3 / float(np.mean(samples)), "1/s", samples=len(samples), note="back to back")
+    return latency.THROUGHPUT.measurement(1e3 / float(np.mean(samples)), samples=len(samples), note="back to back")
 
 
 def _jitter(samples: Sequence[float]) -> Measurement:
     value = float(np.subtract(*np.percentile(samples, [75, 25])))
-    return Measurement("jitter", value, "ms", samples=len(samples), note="between the quartiles of the latency")
+    return latency.JITTER.measurement(value, samples=len(samples), note="between the quartiles of the latency")
 
 
 def _board(measured: Benchmark, actions: int) -> list[Measurement]:
@@ -72,86 +75,86 @@ def _board(measured: Benchmark, actions: int) -> list[Measurement]:
     numbers = []
     for energy in telemetry.energy[:1]:
         note = f"{energy.label} ({energy.source}), idle power included"
-        numbers.append(Measurement("power_mean", energy.mean_w, "W", samples=energy.samples, note=note))
+        numbers.append(resources.POWER_MEAN.measurement(energy.mean_w, samples=energy.samples, note=note))
         if energy.seconds >= ENERGY_S:
             joules = energy.mean_w * (measured.ended_s - measured.begun_s)
-            numbers.append(Measurement("energy_per_action", joules / actions, "J", samples=actions, note=note))
+            numbers.append(resources.ENERGY_PER_ACTION.measurement(joules / actions, samples=actions, note=note))
         else:
             short = f"the run took {energy.seconds:.1f} s; pass --duration {ENERGY_S:g} or more"
-            numbers.append(Measurement("energy_per_action", math.nan, "J", note=short))
+            numbers.append(resources.ENERGY_PER_ACTION.measurement(math.nan, note=short))
     if hot := [(gauge.max, name) for name, gauge in telemetry.gauges.items() if gauge.unit == DEGREE]:
         value, name = max(hot)
-        numbers.append(Measurement("temperature_max", value, DEGREE, note=name))
+        numbers.append(resources.TEMPERATURE_MAX.measurement(value, note=name))
     return numbers
 
 
 def _golden(policy: PolicyRun) -> list[Measurement]:
     note = "relative difference of the golden action from the recorded one"
     error = policy.golden_error
-    return [] if error is None else [Measurement("golden_error", error, "1", samples=1, note=note)]
+    return [] if error is None else [GOLDEN_ERROR.measurement(error, samples=1, note=note)]
 
 
 def cold_rows(policy: PolicyRun) -> list[Measurement]:
     """Return the cold start and the memory of fresh processes."""
     starts = policy.cold
     if policy.cold_error:
-        return [Measurement("cold_start", math.nan, "ms", note=policy.cold_error)]
+        return [latency.COLD_START.measurement(math.nan, note=policy.cold_error)]
     if not starts:
         return []
     fresh = f"fresh process; median of {len(starts)}"
     values = (
-        ("peak_rss", "MB", f"import, load, inferences in a {fresh}", [start.peak_rss_mb for start in starts]),
-        ("steady_rss", "MB", f"after some inferences in a {fresh}", [[*start.rss_mb.values()][-1] for start in starts]),
-        ("cold_start", "ms", f"start of the process to the first action, its files in the page cache; {fresh}",
+        (resources.PEAK_RSS, f"import, load, inferences in a {fresh}", [start.peak_rss_mb for start in starts]),
+        (resources.STEADY_RSS, f"after some inferences in a {fresh}",
+         [[*start.rss_mb.values()][-1] for start in starts]),
+        (latency.COLD_START, f"start of the process to the first action, its files in the page cache; {fresh}",
          [start.total_ms for start in starts]),
     )  # fmt: skip
-    return [
-        Measurement(name, median(samples), unit, samples=len(starts), note=note) for name, unit, note, samples in values
-    ]
+    return [quantity.measurement(median(samples), samples=len(starts), note=note) for quantity, note, samples in values]
 
 
 def sustained_rows(samples: Sequence[float]) -> list[Measurement]:
     """Return the median at the start of a long run and at its end, each with its bound, and their ratio."""
     count = max(1, int(WINDOW * len(samples)))
     ends = []
-    for name, which, part in (("start", "first", samples[:count]), ("sustained", "last", samples[-count:])):
-        (middle,) = percentile_measurements(f"latency_{name}", part, (50.0,))
-        ends.append(replace(middle, note=f"median of the {which} {100 * WINDOW:g} % of the run"))
+    parts = ((latency.LATENCY_START, "first", samples[:count]), (latency.LATENCY_SUSTAINED, "last", samples[-count:]))
+    for which, position, part in parts:
+        (middle,) = percentile_measurements(which, part, (50.0,))
+        ends.append(replace(middle, note=f"median of the {position} {100 * WINDOW:g} % of the run"))
     slowdown = ends[1].value / ends[0].value
     note = "end over start of the run"
-    return [*ends, Measurement("sustained_slowdown", slowdown, "x", samples=2 * count, note=note)]
+    return [*ends, latency.SUSTAINED_SLOWDOWN.measurement(slowdown, samples=2 * count, note=note)]
 
 
 def raw(measured: Benchmark, policy: PolicyRun, alone: bool) -> dict[str, list[float]]:
     """Return every sample: latencies, when each call began, and, of a run alone, what the board told meanwhile."""
-    series = {"latency_ms": policy.samples, "at_s": list(policy.at_s)}
+    taken = {series.LATENCY: policy.samples, series.START_TIMES: list(policy.at_s)}
     if not alone or measured.telemetry is None:
-        return series
+        return taken
     moments: list[float] = []
     for name, gauge in measured.telemetry.gauges.items():
         times = [round(when - measured.begun_s, 3) for when in gauge.times]
-        series |= {f"telemetry.{name}": list(gauge.values), f"telemetry.{name}.at_s": times}
+        taken |= {series.READING.name(name): list(gauge.values), series.READING_TIMES.name(name): times}
         if gauge.unit == THROTTLE:
             moments += [when for when, value in zip(times, gauge.values, strict=True) if value]
-    return {**series, **({"throttled_at_s": sorted(moments)} if moments else {})}
+    return {**taken, **({series.THROTTLE_TIMES: sorted(moments)} if moments else {})}
 
 
 def tables(measured: Benchmark, policy: PolicyRun, alone: bool) -> dict[str, list[dict[str, Any]]]:
     """Return what belongs to a policy as tables: engine, phases, memory and cold start by part, telemetry."""
     details: dict[str, list[dict[str, Any]]] = {}
     if policy.engines:
-        details["engine"] = [
+        details[titles.ENGINE] = [
             {"graph": graph.graph, "engine": graph.engine, "version": graph.version, "providers": graph.providers,
              "computes in": graph.computes_in, "MACs in": graph.macs_in}
             for graph in policy.engines
         ]  # fmt: skip
     if policy.phases:
-        details["time by phase"] = [
+        details[titles.PHASES] = [
             {"phase": phase.name, "calls": phase.calls, "p50 ms": phase.p50_ms, "share %": phase.share_percent}
             for phase in policy.phases
         ]
     if policy.cold:
-        details |= {"memory by part": _memory_parts(policy.cold), "cold start by part": _start_parts(policy.cold)}
+        details |= {titles.MEMORY_PARTS: _memory_parts(policy.cold), titles.START_PARTS: _start_parts(policy.cold)}
     if alone and measured.telemetry:
         details |= _telemetry(measured.telemetry)
     return details
@@ -187,7 +190,7 @@ def _telemetry(telemetry: Recorded) -> dict[str, list[dict[str, Any]]]:
         if name not in OWN_COUNTERS
     ]
     unmeasured = _absent_table(telemetry.unmeasured)
-    return {"telemetry": [*gauges, *counters], **({"unmeasured": unmeasured} if unmeasured else {})}
+    return {titles.TELEMETRY: [*gauges, *counters], **({titles.MISSING_VALUES: unmeasured} if unmeasured else {})}
 
 
 def _absent_table(absent: Sequence[Absent]) -> list[dict[str, str]]:

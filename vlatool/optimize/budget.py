@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from vlatool.errors import RecipeError, suggest
+from vlatool.measures import quantity_of
+from vlatool.measures.actions import AGREEMENT_BASELINE, DISAGREEMENT, ERROR_BASELINE, ERROR_BASELINE_OF
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
@@ -30,14 +32,14 @@ class Budget:
 
     def of(self, row: Row) -> Measurement | None:
         """Return the measurement of a row that the budget is about, None when there is none."""
-        if self.name == "disagreement":
-            agreement = row.get("agreement_baseline")
+        if self.name == DISAGREEMENT.name:
+            agreement = row.get(AGREEMENT_BASELINE)
             return None if agreement is None else replace(agreement, name=self.name, value=1.0 - agreement.value)
         if self.name.startswith("unit:"):
             unit = self.name.partition(":")[2]
-            alike = [m for m in row.measurements if m.name.startswith("error_baseline.") and m.unit == unit]
+            alike = (m for m in ERROR_BASELINE_OF.members(row).values() if m.unit == unit)
             return max(alike, key=lambda m: m.value, default=None)
-        return row.get(self.name) or row.get(f"error_baseline.{self.name}")
+        return row.get(quantity_of(self.name)) or row.get(ERROR_BASELINE_OF.quantity(self.name))
 
     def required(self, row: Row) -> Measurement:
         """Return the measurement of a row that the budget is about.
@@ -48,8 +50,9 @@ class Budget:
         measurement = self.of(row)
         if measurement is not None:
             return measurement
-        known = [m.name.removeprefix("error_baseline.") for m in row.measurements if m.origin == "measured"]
-        units = {f"unit:{m.unit}" for m in row.measurements if m.name.startswith("error_baseline.")}
+        elements = ERROR_BASELINE_OF.members(row)
+        known = [ERROR_BASELINE_OF.pattern.part(m.name) or m.name for m in row.measurements if m.origin == "measured"]
+        units = {f"unit:{m.unit}" for m in elements.values()}
         raise RecipeError(
             f"--max-drop names '{self.name}', which is not measured on this policy; "
             f"{suggest(self.name, [*known, *sorted(units)])}.",
@@ -68,7 +71,7 @@ def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:
     """
     if limits.metric:
         return Budget(limits.metric, limits.max_metric or 0.0)
-    name = "disagreement" if spec.action.kind == "discrete" else "error_baseline"
+    name = DISAGREEMENT.name if spec.action.kind == "discrete" else ERROR_BASELINE.name
     return Budget(name, min(max(PROXY, limits.max_drop), limits.max_distance) if proxy else limits.max_drop)
 
 
@@ -77,4 +80,4 @@ def distance_of(row: Row) -> Measurement | None:
 
     Continuous: the mean |difference| by float32's standard deviation; discrete: the share of other answers.
     """
-    return Budget("disagreement", 0.0).of(row) or row.get("error_baseline")
+    return Budget(DISAGREEMENT.name, 0.0).of(row) or row.get(ERROR_BASELINE)

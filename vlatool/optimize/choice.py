@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from vlatool.measures.latency import LATENCY_P50, SPEEDUP
+from vlatool.measures.resources import SIZE
+from vlatool.measures.success import SUCCESS
 from vlatool.optimize.evidence import TIE
 from vlatool.optimize.judge import Judged, p50
 from vlatool.report import Row
@@ -97,13 +100,13 @@ def is_faster(row: Row, base: Row, origin: str = "measured") -> bool:
     """
     if ratio(row, base, origin) < LEAST:
         return False
-    speedup = row.get("speedup")
+    speedup = row.get(SPEEDUP)
     return origin == "predicted" or (speedup is not None and speedup.low is not None and speedup.low > 1.0)
 
 
 def ratio(row: Row, base: Row, origin: str = "measured") -> float:
     """Return how many times as fast a row is as another: its speed-up, or the quotient of medians; 0 when unknown."""
-    if origin == "measured" and (speedup := row.get("speedup")) is not None and speedup.known:
+    if origin == "measured" and (speedup := row.get(SPEEDUP)) is not None and speedup.known:
         return speedup.value
     own, reference = p50(row, origin), p50(base, origin)
     return reference / own if 0 < own < float("inf") and reference < float("inf") else 0.0
@@ -121,7 +124,7 @@ def _times(row: Row, base: Row) -> str:
 
 def foretold(row: Row, base: Row, elsewhere: str) -> str:
     """Return a sentence on what a row is predicted to need on a board, with its range; empty without a board."""
-    latency = row.get("latency_p50", "predicted")
+    latency = row.get(LATENCY_P50, "predicted")
     if not elsewhere:
         return ""
     if latency is None or not latency.known:
@@ -131,7 +134,7 @@ def foretold(row: Row, base: Row, elsewhere: str) -> str:
         if latency.low is None or latency.high is None
         else f" ({latency.low:.3g} to {latency.high:.3g}, {latency.confidence:.0%})"
     )
-    reference = base.get("latency_p50", "predicted")
+    reference = base.get(LATENCY_P50, "predicted")
     beside = f", {base.name} {reference.value:.3g} ms" if row is not base and reference and reference.known else ""
     return f" Predicted for {elsewhere}, not measured there: {latency.value:.3g} ms{span}{beside}."
 
@@ -144,7 +147,7 @@ def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
         base: What it is held against.
         elsewhere: The board that it is for, when it is not this host: only the ratio is told, as the table has it.
     """
-    speedup = row.get("speedup")
+    speedup = row.get(SPEEDUP)
     known = speedup is not None and speedup.low is not None and speedup.high is not None
     span = f"; {speedup.low:.2f} to {speedup.high:.2f}" if speedup and known else ""
     times = ratio(row, base)
@@ -158,7 +161,7 @@ def _praise(best: Judged, judged: list[Judged], small: bool, elsewhere: str) -> 
     row, base = best.row, judged[0].row
     if best is judged[0]:
         return _float32_kept(judged, elsewhere)
-    success = f" {_episodes(row)}." if row.get("success") else ""
+    success = f" {_episodes(row)}." if row.get(SUCCESS) else ""
     why = ""
     if not is_faster(row, base):
         reason = "memory was asked for" if small and judged[0].within else f"{base.name} is outside: {base.reason}"
@@ -169,11 +172,11 @@ def _praise(best: Judged, judged: list[Judged], small: bool, elsewhere: str) -> 
 
 
 def _size(row: Row, base: Row) -> str:
-    return f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
+    return f"its graphs take {row.value(SIZE):.3g} MB instead of {base.value(SIZE):.3g} MB"
 
 
 def _episodes(row: Row) -> str:
-    success = row.get("success")
+    success = row.get(SUCCESS)
     return f"{success.value:.1%} of {success.samples} closed-loop episodes succeed" if success else ""
 
 
@@ -205,7 +208,7 @@ def _foretell(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
     row, base = best.row, judged[0].row
     if best is judged[0]:
         return (f"{base.name} was kept: no candidate inside the limits is predicted to be faster; not measured there.",)
-    own, reference = row.get("latency_p50", "predicted"), base.get("latency_p50", "predicted")
+    own, reference = row.get(LATENCY_P50, "predicted"), base.get(LATENCY_P50, "predicted")
     if own is None or reference is None:
         return (f"{row.name} was chosen.",)
     low, high = own.low or own.value, own.high or own.value
@@ -213,7 +216,7 @@ def _foretell(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
     faster = is_faster(row, base, "predicted")
     speed = f"{times:.2f}x as fast as {base.name}" if faster else f"not faster than {base.name} ({times:.3g}x)"
     here = f" Measured on this host: {_size(row, base)}"
-    here += f", and {_episodes(row)}" if row.get("success") else ""
+    here += f", and {_episodes(row)}" if row.get(SUCCESS) else ""
     overlap = ""
     if faster and reference.low is not None and reference.low < high:
         overlap = f" (whose range, {reference.low:.4g} to {reference.high or reference.value:.4g} ms, overlaps)"

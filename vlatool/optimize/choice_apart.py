@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from vlatool.machine.instruction_sets import ENGINE, BoardSet
+from vlatool.measures.latency import LATENCY_P50, OPENVINO_FLOAT32_P50, SPEEDUP
 from vlatool.optimize.choice import choose, chosen_of, speed_words
 from vlatool.optimize.judge import Judged, p50
-from vlatool.optimize.timings import IN_OPENVINO, OWN_SET, REFERENCE
+from vlatool.optimize.timings import IN_OPENVINO, OWN_SET
 from vlatool.report import Row
 
 
@@ -79,11 +80,11 @@ def _firsts(judged: list[Judged], engines: Mapping[str, str], small: bool) -> tu
 
 def _reference(base: Judged, engine: str) -> Judged:
     """Return float32 as an engine runs it."""
-    latency = base.row.get(REFERENCE)
+    latency = base.row.get(OPENVINO_FLOAT32_P50)
     if engine != ENGINE or latency is None:
         return base
-    rest = (other for other in base.row.measurements if other.name != "latency_p50" or other.origin != "measured")
-    row = replace(base.row, name=IN_OPENVINO, measurements=(replace(latency, name="latency_p50"), *rest))
+    rest = (other for other in base.row.measurements if other.name != LATENCY_P50.name or other.origin != "measured")
+    row = replace(base.row, name=IN_OPENVINO, measurements=(LATENCY_P50.relabel(latency), *rest))
     return replace(base, row=row)
 
 
@@ -99,7 +100,7 @@ def on_board(row: Row, base: Row, engines: Mapping[str, str]) -> float:
 
     What is predicted for it; for a plan of OpenVINO what is predicted for float32 there, by the measured speed-up.
     """
-    reference, speedup = base.get(REFERENCE, "predicted"), row.value("speedup")
+    reference, speedup = base.get(OPENVINO_FLOAT32_P50, "predicted"), row.value(SPEEDUP)
     if engines.get(row.name) != ENGINE or reference is None or not reference.known or not speedup > 0:
         return p50(row, "predicted")
     return reference.value / speedup

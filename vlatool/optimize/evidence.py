@@ -7,12 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from vlatool.accuracy.paired import ABSENT, compare_success, with_chance
+from vlatool.accuracy.paired import compare_success, with_chance
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import carries_evaluation, recordings_of
 from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
+from vlatool.measures import tables
+from vlatool.measures.latency import LATENCY_P50
+from vlatool.measures.success import SUCCESS, SUCCESS_WRONG_INSTRUCTION
 from vlatool.optimize.budget import distance_of
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
@@ -84,7 +87,7 @@ def in_order(rows: Sequence[Row]) -> list[Row]:
 
 
 def _latency(row: Row) -> float:
-    latency = row.get("latency_p50")
+    latency = row.get(LATENCY_P50)
     return latency.value if latency is not None and latency.known else math.inf
 
 
@@ -123,17 +126,17 @@ def told_wrong(bundle: Bundle, loop: ClosedLoop | None, cache: Path, context: Co
         return None
     context.progress("episodes with the wrong instruction", None)
     try:
-        rate = cached_measure(loop.told_wrong(), bundle, cache, context).rows[-1].get("success")
+        rate = cached_measure(loop.told_wrong(), bundle, cache, context).rows[-1].get(SUCCESS)
     except (DataError, SourceError):  # it played the right one: what it cannot do is another
         return None
-    return rate and replace(rate, name="success_wrong_instruction")
+    return rate and SUCCESS_WRONG_INSTRUCTION.relabel(rate)
 
 
 def _joined(row: Row, played: Row) -> Row:
     measurements = (*row.measurements, *played.measurements)
     raw, details = {**row.raw, **played.raw}, {**row.details, **played.details}
-    if lacking := [*row.details.get(ABSENT, ()), *played.details.get(ABSENT, ())]:
-        details[ABSENT] = lacking
+    if lacking := [*row.details.get(tables.MISSING_VALUES, ()), *played.details.get(tables.MISSING_VALUES, ())]:
+        details[tables.MISSING_VALUES] = lacking
     return replace(row, measurements=measurements, raw=raw, details=details)
 
 

@@ -6,6 +6,10 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from vlatool.measures import Quantity, actions, quantity_of
+from vlatool.measures.latency import LATENCY_P50, LATENCY_P90
+from vlatool.measures.resources import MEMORY, PEAK_RSS
+from vlatool.measures.success import SUCCESS, SUCCESS_DROP
 from vlatool.optimize.budget import Budget, distance_of
 from vlatool.optimize.moves import Held, judge_moves
 from vlatool.optimize.recipe import Limits
@@ -16,11 +20,11 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-12
 AGAINST_FLOAT32 = "against float32"
-FROM_FLOAT32 = ("relative_error", "disagreement", "error_baseline", "gripper_flips_baseline")
-"""Beginnings of the measurements that are distances from float32 themselves."""
-RECORDED = ("agreement_drop", "error_increase")
-DROPS = ("success_drop", *RECORDED)
-"""Which accuracy decides: the closed loop where there is one, else recorded observations."""
+FROM_FLOAT32 = (actions.RELATIVE_ERROR, actions.DISAGREEMENT, actions.ERROR_BASELINE, actions.GRIPPER_FLIPS_BASELINE)
+"""What is a distance from float32 itself, beside the errors by element."""
+RECORDED_DROPS = {actions.AGREEMENT_DROP: "agreement with the expert", actions.ERROR_INCREASE: "action error"}
+DROPS = {SUCCESS_DROP: "success", **RECORDED_DROPS}
+"""Which accuracy decides, and what of it in words: the closed loop where there is one, else recorded observations."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_b
     if is_baseline:
         reason = "; ".join(miss.words for miss in rate.missed) or "the reference"
         return Judged(replace(row, reason=reason), not rate.missed, 0.0, rate.miss, (), rate.warnings)
-    if row.reason and baseline.get("success") is not None and row.get("success") is None:
+    if row.reason and baseline.get(SUCCESS) is not None and row.get(SUCCESS) is None:
         return Judged(row, False, math.nan, math.inf)  # its episodes were not played, and the reason says why
     found = Held.all((_judge_accuracy(row, decisive, limits), _judge_distance(row, decisive, limits),
                       judge_moves(row, limits)))  # fmt: skip
@@ -93,9 +97,11 @@ class _Decisive:
 
 
 def _decisive(row: Row, limits: Limits, from_float32: bool) -> _Decisive | None:
-    drop = next((measured for name in DROPS if (measured := row.get(name)) is not None), None)
+    drop = next((measured for drop in DROPS if (measured := row.get(drop)) is not None), None)
     measured = Budget(limits.metric, 0.0).of(row) if limits.metric else drop
-    return None if measured is None else _Decisive(measured, from_float32 and measured.name in RECORDED)
+    return (
+        None if measured is None else _Decisive(measured, from_float32 and quantity_of(measured.name) in RECORDED_DROPS)
+    )
 
 
 def _judge_accuracy(row: Row, decisive: _Decisive | None, limits: Limits) -> Held:
@@ -138,11 +144,13 @@ def _judge_distance(row: Row, decisive: _Decisive | None, limits: Limits) -> Hel
 
 def _is_distance(decisive: _Decisive) -> bool:
     """Return whether what decides is a distance from float32 itself, so that the limit on it is the user's."""
-    return decisive.from_float32 or decisive.measured.name.startswith(FROM_FLOAT32)
+    name = decisive.measured.name
+    distance = quantity_of(name) in FROM_FLOAT32 or actions.ERROR_BASELINE_OF.pattern.part(name) is not None
+    return decisive.from_float32 or distance
 
 
 def _distance_words(distance: Measurement) -> str:
-    if distance.name == "disagreement":
+    if distance.name == actions.DISAGREEMENT.name:
         return f"{_percent(distance.value)} of the answers are not those of float32"
     return f"the action differs from float32's by {_percent(distance.value)} of its standard deviation"
 
@@ -154,22 +162,29 @@ def _percent(share: float) -> str:
 def _recorded_drops(row: Row, baseline: Row) -> tuple[list[Measurement], bool]:
     """Return the drops on recorded observations, more is worse; and whether they are distances from float32 itself."""
     drops = []
-    for name, drop, sign in (("agreement_expert", "agreement_drop", -1.0), ("error_expert", "error_increase", 1.0)):
-        own, base = row.get(name), baseline.get(name)
+    for quantity, drop, sign in (
+        (actions.AGREEMENT_EXPERT, actions.AGREEMENT_DROP, -1.0),
+        (actions.ERROR_EXPERT, actions.ERROR_INCREASE, 1.0),
+    ):
+        own, base = row.get(quantity), baseline.get(quantity)
         if own is not None and base is not None and own.known:
             drops.append(_drop(drop, sign * (own.value - base.value), own, "recorded observations"))
     if drops:
         return drops, False
-    agreement, error = row.get("agreement_baseline"), row.get("error_baseline")
+    agreement, error = row.get(actions.AGREEMENT_BASELINE), row.get(actions.ERROR_BASELINE)
     if agreement is not None:
-        drops = [_drop("agreement_drop", 1.0 - agreement.value, agreement, AGAINST_FLOAT32)] if agreement.known else []
+        drops = (
+            [_drop(actions.AGREEMENT_DROP, 1.0 - agreement.value, agreement, AGAINST_FLOAT32)]
+            if agreement.known
+            else []
+        )
     elif error is not None and error.known:
-        drops = [_drop("error_increase", error.value, error, AGAINST_FLOAT32)]
+        drops = [_drop(actions.ERROR_INCREASE, error.value, error, AGAINST_FLOAT32)]
     return drops, bool(drops)
 
 
-def _drop(name: str, value: float, own: Measurement, note: str) -> Measurement:
-    return Measurement(name, value, "1", where=own.where, samples=own.samples, note=note)
+def _drop(quantity: Quantity, value: float, own: Measurement, note: str) -> Measurement:
+    return quantity.measurement(value, where=own.where, samples=own.samples, note=note)
 
 
 def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> Held:
@@ -177,7 +192,7 @@ def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: b
     if limits.max_memory_mb is None:
         return Held()
     measured = profile is None or on_board
-    memory = row.get("peak_rss") if measured else row.get("memory", "predicted")
+    memory = row.get(PEAK_RSS) if measured else row.get(MEMORY, "predicted")
     if memory is None or not memory.known:
         return Held(warnings=(f"{row.name}: its memory is not known, so {limits.max_memory_mb:g} MB is unjudged",))
     if memory.value <= limits.max_memory_mb:
@@ -192,11 +207,11 @@ def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: boo
     if budget_ms is None:
         return Held()
     if on_board or profile is None:
-        latency = row.get("latency_p90") or row.get("latency_p50")
+        latency = row.get(LATENCY_P90) or row.get(LATENCY_P50)
         p90 = latency.value if latency else math.inf
         late = f"p90 latency {p90:.3g} ms > {budget_ms:.3g} ms"
         return Held.missing(p90 / budget_ms - 1, late) if p90 > budget_ms else Held()
-    predicted = row.get("latency_p50", "predicted")
+    predicted = row.get(LATENCY_P50, "predicted")
     if predicted is None or not predicted.known:
         unjudged = f"{row.name}: no latency can be predicted for {profile.name}, so {_rate(limits)} is unjudged"
         return Held(warnings=(unjudged,))
@@ -224,20 +239,15 @@ def _allowed(limits: Limits, decisive: _Decisive) -> str:
 
 def _drop_words(decisive: _Decisive) -> str:
     drop = decisive.measured
-    if drop.name not in DROPS:
+    name = DROPS.get(quantity_of(drop.name))
+    if name is None:
         return f"{drop.name} is {drop.value:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
-    subject = {
-        "success_drop": "success",
-        "agreement_drop": "agreement with the expert",
-        "error_increase": "action error",
-    }
-    name = subject[drop.name]
     if decisive.from_float32:
-        return _distance_words(drop if drop.name == "error_increase" else replace(drop, name="disagreement"))
-    if drop.name == "error_increase":
+        return _distance_words(drop if drop.name == actions.ERROR_INCREASE.name else actions.DISAGREEMENT.relabel(drop))
+    if drop.name == actions.ERROR_INCREASE.name:
         return f"{name} {'rises' if drop.value >= 0 else 'falls'} by {_points(abs(drop.value))}"
     verb = "drops" if drop.value > 0 else ("is unchanged" if drop.value == 0 else "rises")
-    note = f" ({drop.note})" if drop.note and drop.name == "success_drop" else ""
+    note = f" ({drop.note})" if drop.note and drop.name == SUCCESS_DROP.name else ""
     return f"{name} {verb}{'' if drop.value == 0 else f' by {_points(abs(drop.value))}'}{note}"
 
 
@@ -248,5 +258,5 @@ def _points(share: float) -> str:
 
 def p50(row: Row, origin: str = "measured") -> float:
     """Return the median latency of a row in ms, infinite when it is not known."""
-    latency = row.get("latency_p50", origin)
+    latency = row.get(LATENCY_P50, origin)
     return latency.value if latency is not None and latency.known else math.inf

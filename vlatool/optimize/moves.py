@@ -6,7 +6,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vlatool.accuracy.moved import RATIO, SPEEDUP, STEPS, WORST, worst_task
+from vlatool.accuracy.moved import worst_task
+from vlatool.measures.latency import SPEEDUP
+from vlatool.measures.motion import RATIO, STEPS_RATIO, TASK_SPEEDUP
+from vlatool.measures.success import SUCCESS_DROP, WORST_TASK_DROP
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
@@ -57,7 +60,7 @@ class Held:
 
 def limited(row: Row) -> dict[str, str]:
     """Return the metrics that a limit on motion is about, for what is known of a row -> their names in sentences."""
-    of_body = any(row.get(f"{name}{RATIO}") for name in LIMITED if name != "task_time")
+    of_body = any(row.get(RATIO.quantity(name)) for name in LIMITED if name != "task_time")
     return LIMITED if of_body else OF_ACTIONS
 
 
@@ -67,9 +70,11 @@ def judge_moves(row: Row, limits: Limits) -> Held:
 
 
 def _motion(row: Row, limits: Limits) -> Iterator[Held]:
-    if limits.max_motion is None or row.get("success_drop") is None:
+    if limits.max_motion is None or row.get(SUCCESS_DROP) is None:
         return
-    known = {words: ratio for name, words in limited(row).items() if (ratio := row.get(f"{name}{RATIO}")) is not None}
+    known = {
+        words: ratio for name, words in limited(row).items() if (ratio := row.get(RATIO.quantity(name))) is not None
+    }
     if not known:
         yield Held.missing(1.0, "its motion is unknown: it shares no success with float32")
     for words, ratio in known.items():
@@ -84,7 +89,7 @@ def _motion(row: Row, limits: Limits) -> Iterator[Held]:
 
 def _steps(row: Row, limits: Limits) -> Iterator[Held]:
     """Yield a reason against a candidate that needs so many more steps that little of its speed-up is left."""
-    steps = row.get(STEPS)
+    steps = row.get(STEPS_RATIO)
     if steps is None or steps.low is None or steps.low <= 1 or 1 / steps.value >= limits.min_task_share:
         return
     span = f" ({steps.low:.2f} to {steps.high or steps.value:.2f})"
@@ -94,10 +99,10 @@ def _steps(row: Row, limits: Limits) -> Iterator[Held]:
 
 
 def _worst(row: Row, limits: Limits) -> Iterator[Held]:
-    worst = row.get(WORST) or row.get("success_drop")  # of one task there is none worse
+    worst = row.get(WORST_TASK_DROP) or row.get(SUCCESS_DROP)  # of one task there is none worse
     if limits.worst_task is None or worst is None:
         return
-    where = f"in {worst_task(worst)}" if worst.name == WORST else "in its only task"
+    where = f"in {worst_task(worst)}" if worst.name == WORST_TASK_DROP.name else "in its only task"
     span = "" if worst.low is None else f" ({100 * worst.low:.3g} to {100 * (worst.high or worst.value):.3g})"
     drop = f"success {where} drops by {100 * worst.value:.3g} points{span}"
     allowed = f"allowed {100 * limits.worst_task:.3g} (--worst-task)"
@@ -114,7 +119,7 @@ def _grows(ratio: Measurement) -> str:
 
 def slower_task(row: Row) -> str:
     """Return what is said of a candidate whose task gains less than its inferences; empty where it gains as much."""
-    task, speed, steps = row.get(SPEEDUP), row.get("speedup"), row.get(STEPS)
+    task, speed, steps = row.get(TASK_SPEEDUP), row.get(SPEEDUP), row.get(STEPS_RATIO)
     if task is None or speed is None or steps is None:
         return ""
     words = f"{row.name} does its task {task.value:.2f}x as fast as float32, where inferences set the pace: its "

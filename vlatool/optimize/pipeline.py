@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.accuracy.credibility import Credibility, credibility
-from vlatool.accuracy.moved import with_task_speedup
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import NOT_POSSIBLE, DataError, RecipeError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
@@ -23,6 +22,9 @@ from vlatool.files.directory_writer import write_directory
 from vlatool.files.messages import from_json, to_json
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import MAX_CPU_ISA
+from vlatool.measures import with_derived
+from vlatool.measures.actions import AGREEMENT_EXPERT, ERROR_EXPERT
+from vlatool.measures.success import SUCCESS, SUCCESS_DROP
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.choice import choose, chosen_of, is_faster
 from vlatool.optimize.choice_apart import choose_apart
@@ -219,7 +221,7 @@ def _measured(
     where = plan.board_set
     rows, warnings = Timing(plan.recipe.effort, where, plan.cache, context, plan.fresh).rows(source, bundles)
     rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context, _enough(plan))
-    rows = {name: with_task_speedup(row) for name, row in rows.items()}
+    rows = {name: with_derived(row) for name, row in rows.items()}
     rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged(bundles[BASELINE], plan.closed_loop, plan.cache, context))
     warnings = (*warnings, *dict.fromkeys(context.notes))
@@ -236,7 +238,7 @@ def _enough(plan: Plan) -> Enough | None:
         return None
 
     def enough(row: Row, baseline: Row) -> bool:
-        judged = judge(with_task_speedup(row), baseline, plan.recipe.limits, plan.profile, plan.on_board)
+        judged = judge(with_derived(row), baseline, plan.recipe.limits, plan.profile, plan.on_board)
         return judged.within and is_faster(row, baseline)
 
     return enough
@@ -301,9 +303,9 @@ def _write_bundle(plan: Plan, chosen: Row, bundle: Bundle, draft: Path) -> None:
 def _accuracy(row: Row) -> dict[str, Any]:
     """Return what the manifest says of the accuracy."""
     accuracy = {}
-    for name in ("success", "success_drop", "agreement_expert", "error_expert"):
-        measured = row.get(name)
+    for quantity in (SUCCESS, SUCCESS_DROP, AGREEMENT_EXPERT, ERROR_EXPERT):
+        measured = row.get(quantity)
         if measured is not None and measured.known:
             interval = {"low": measured.low, "high": measured.high} if measured.low is not None else {}
-            accuracy[name] = {"value": measured.value, **interval, "samples": measured.samples}
+            accuracy[quantity.name] = {"value": measured.value, **interval, "samples": measured.samples}
     return accuracy

@@ -18,6 +18,9 @@ from vlatool.errors import NOT_POSSIBLE, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.files.resumable_work import work_directory
 from vlatool.machine.version import VERSION
+from vlatool.measures.latency import SPEEDUP
+from vlatool.measures.success import SUCCESS_DROP
+from vlatool.measures.training import TRAINING_TIME
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.made import candidate
 from vlatool.optimize.moves import Held, judge_moves
@@ -27,7 +30,7 @@ from vlatool.optimize.search import QUICK
 from vlatool.optimize.space import Shape, Space, quantizations, space_of
 from vlatool.optimize.study import Study, Tried
 from vlatool.optimize.trained import trainings
-from vlatool.report import TRAINING_TIME, Row
+from vlatool.report import Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
 from vlatool.stage.cache import STREAMS
@@ -129,7 +132,7 @@ class PrunedSearch:
         engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self.plan.board_set.confined else ""
         threads = self.plan.recipe.effort.threads
         timing = Latency(against=(bundle.path,), iterations=TIMED, threads=threads, engine=engine, **QUICK)
-        return cached_measure(timing, self.baseline, self.plan.cache, self.context).rows[-1].value("speedup")
+        return cached_measure(timing, self.baseline, self.plan.cache, self.context).rows[-1].value(SPEEDUP)
 
     def _judged(self, bundle: Bundle) -> tuple[float, Held]:
         """Return what a policy loses in paired episodes, and whether it moves worse than allowed.
@@ -144,7 +147,7 @@ class PrunedSearch:
         )
         rows = [cached_measure(loop, each, self.plan.cache, self.context).rows[-1] for each in (self.baseline, bundle)]
         compared = compare_success(*rows)
-        return compared.value("success_drop"), judge_moves(compared, self.plan.recipe.limits)
+        return compared.value(SUCCESS_DROP), judge_moves(compared, self.plan.recipe.limits)
 
     def _error(self, bundle: Bundle) -> float:
         if not carries_evaluation(self.baseline):
@@ -210,7 +213,7 @@ def with_measured(table: list[dict[str, Any]], rows: Mapping[str, Row]) -> list[
     """
     lines = []
     for line in table:
-        speed = rows[line["policy"]].get("speedup") if line["policy"] in rows else None
+        speed = rows[line["policy"]].get(SPEEDUP) if line["policy"] in rows else None
         if not line["within"] and speed is not None and speed.known:
             line = {**line, "speed-up": f"{speed.value:.2f}x", "note": MEASURED_AGAIN}
         lines.append(line)
@@ -238,8 +241,7 @@ def _best_of_each(tried: list[Tried]) -> list[Tried]:
 
 def _training_s(made: list[Bundle]) -> float:
     """Return the seconds that the trainings of a policy took when it was trained."""
-    taken = (item for row in trainings(made) for item in row.measurements if item.name.startswith(TRAINING_TIME))
-    return sum(item.value for item in taken)
+    return sum(item.value for row in trainings(made) for item in TRAINING_TIME.members(row).values())
 
 
 def _titled(elsewhere: int) -> str:

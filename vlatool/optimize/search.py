@@ -31,6 +31,7 @@ from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
 from vlatool.machine.instruction_sets import board_set
 from vlatool.machine.target import target_of
+from vlatool.measures.latency import SPEEDUP
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Limits, StageList
@@ -175,7 +176,7 @@ class Search:
                 raise GraphError(f"It has the graphs of {twin}.", f"look at {twin} in its place")
             engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self._apart else ""
             timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, engine=engine, **QUICK)
-            timed = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].get("speedup")
+            timed = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].get(SPEEDUP)
             speedup, fastest = (timed.value, timed.high or timed.value) if timed else (math.nan, math.nan)
             error = self._error(bundle, quiet)
             trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine, fastest)

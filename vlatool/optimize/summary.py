@@ -9,6 +9,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import pip_install
 from vlatool.machine.host import fingerprint
 from vlatool.machine.instruction_sets import ENGINE, BoardSet, about_onnx_runtime
+from vlatool.measures.latency import SPEEDUP
 from vlatool.optimize.choice import chosen_of
 from vlatool.optimize.judge import Judged
 from vlatool.optimize.moves import slower_task
@@ -104,7 +105,7 @@ def about_int8(rows: Mapping[str, Row], engines: Mapping[str, str], where: Board
         return (f"{words}Whether it is was not measured: OpenVINO does not compute in that set here.",)
     words += "It was tried all the same: "
     tried = {name: speedup for name, row in rows.items()
-             if engines.get(name) == ENGINE and (speedup := row.get("speedup"))}  # fmt: skip
+             if engines.get(name) == ENGINE and (speedup := row.get(SPEEDUP))}  # fmt: skip
     if not tried:
         return (f"{words}no int8 plan of OpenVINO could be made.",)
     name, fastest = max(tried.items(), key=lambda pair: pair[1].value)

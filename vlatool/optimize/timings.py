@@ -12,14 +12,13 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.hardware.profile import Profile
 from vlatool.latency_model.predict import predictions
 from vlatool.machine.instruction_sets import ENGINE, BoardSet
+from vlatool.measures.latency import LATENCY_P50, OPENVINO_FLOAT32_P50, SPEEDUP, TORCH_EAGER_P50
 from vlatool.optimize.recipe import Effort
 from vlatool.report import Measurement, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_measure
 
-REFERENCE = "openvino_float32_latency_p50"
-"""Of the baseline's row: float32 in OpenVINO, of the run that timed OpenVINO's plans."""
 IN_OPENVINO = "float32 in OpenVINO"
 OWN_SET = "this host's own instruction set"
 Timed = tuple[dict[str, Row], tuple[str, ...]]
@@ -71,9 +70,9 @@ class Timing:
         kept = (f"the latencies were measured before, at {report.created}; --fresh measures again",)
         rows = dict(zip(bundles, report.rows, strict=False))
         named = {name: replace(row, name=name) for name, row in rows.items()}
-        eager = report.rows[-1].get("latency_p50") if torch else None
+        eager = report.rows[-1].get(LATENCY_P50) if torch else None
         if eager is not None:
-            own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
+            own = TORCH_EAGER_P50.relabel(eager, "eager torch, same run")
             named[base] = replace(named[base], measurements=(*named[base].measurements, own))
         seen = [
             "; ".join(filter(None, (finding.reason, finding.remedy)))
@@ -94,9 +93,10 @@ def joined(ours: Mapping[str, Row], theirs: Mapping[str, Row], order: Sequence[s
     """
     base = order[0]
     rows = {name: replace(row, measurements=_noted(row, OWN_SET)) for name, row in ours.items()}
-    reference = theirs[base].get("latency_p50") if theirs else None
+    reference = theirs[base].get(LATENCY_P50) if theirs else None
     if reference is not None:
-        own = replace(reference, name=REFERENCE, where=where.where, note=f"{IN_OPENVINO}, in the run of its plans")
+        note = f"{IN_OPENVINO}, in the run of its plans"
+        own = replace(OPENVINO_FLOAT32_P50.relabel(reference, note), where=where.where)
         rows[base] = replace(rows[base], measurements=(*rows[base].measurements, own))
     rows[base] = replace(rows[base], role="baseline")  # of a run alone it is none
     rows |= {name: replace(row, measurements=_noted(row, where.ratio)) for name, row in theirs.items() if name != base}
@@ -107,7 +107,7 @@ def _noted(row: Row, what: str) -> tuple[Measurement, ...]:
     """Say of a row's speed-up what it is a ratio of."""
     of = IN_OPENVINO if what != OWN_SET else "float32 in ONNX Runtime"
     note = f"ratio of medians to {of}, interleaved: {what}"
-    return tuple(replace(number, note=note) if number.name == "speedup" else number for number in row.measurements)
+    return tuple(replace(number, note=note) if number.name == SPEEDUP.name else number for number in row.measurements)
 
 
 def placed(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> dict[str, Row]:
@@ -137,7 +137,7 @@ def foretold_by_engine(
     predicted = {name: predictions(profile, bundle) for name, bundle in bundles.items()}
     (base, baseline), *_ = bundles.items()
     own = predictions(profile, baseline, ENGINE) if where.confined else []
-    predicted[base] += [replace(number, name=REFERENCE) for number in own if number.name == "latency_p50"]
+    predicted[base] += [OPENVINO_FLOAT32_P50.relabel(number) for number in own if number.name == LATENCY_P50.name]
     return predicted
 
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 from vlatool.bundle.bundle import REPORTS, Bundle
 from vlatool.errors import DataError
-from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Row, read_report
+from vlatool.measures import series, tables
+from vlatool.measures.training import TRAINING_TIME
+from vlatool.report import Measurement, Row, read_report
 
 
 def trainings(stages: Iterable[Bundle]) -> tuple[Row, ...]:
@@ -34,7 +36,7 @@ def with_wrong_instruction(row: Row, told: Measurement | None, reference: Measur
     said = f"{told.value:.1%} of {told.samples} episodes succeed (float32: {reference.value:.1%})"
     teachers = {
         name: [{**record, "with the wrong instruction": said} for record in records]
-        for name, records in row.details.items() if name.startswith(TRAINED) and name.endswith(TEACHER)
+        for name, records in row.details.items() if tables.TEACHER.part(name) is not None
     }  # fmt: skip
     return replace(row, measurements=(*row.measurements, told), details={**row.details, **teachers})
 
@@ -42,9 +44,9 @@ def with_wrong_instruction(row: Row, told: Measurement | None, reference: Measur
 def with_trainings(row: Row, trained: Iterable[Row]) -> Row:
     """Return the row of a candidate with losses, rounds and times of its trainings."""
     for other in trained:
-        raw = {name: values for name, values in other.raw.items() if name.startswith(TRAINED)}
-        details = {name: records for name, records in other.details.items() if name.startswith(TRAINED)}
-        took = tuple(item for item in other.measurements if item.name.startswith(TRAINING_TIME))
+        raw = {name: values for name, values in other.raw.items() if series.LOSSES.part(name) is not None}
+        details = {name: records for name, records in other.details.items() if tables.ROUNDS.part(name) is not None}
+        took = TRAINING_TIME.members(other).values()
         row = replace(row, raw={**row.raw, **raw}, details={**row.details, **details},
                       measurements=(*row.measurements, *took))  # fmt: skip
     return row

@@ -7,44 +7,16 @@ import re
 import unicodedata
 from typing import Any
 
+from vlatool.measures import PERCENT, PLAIN, POINTS, quantity_of
 from vlatool.report import COUNT, NO_INTERVAL, Measurement
 
 UNMEASURED = "unmeasured"
 NARROW_SPACE = "\u202f"
 MINUS = "\u2212"
-LABELS = {
-    "speedup": "speed-up",
-    "peak_rss": "peak memory",
-    "steady_rss": "steady memory",
-    "latency_p99.9": "latency p99.9",
-    "latency_start_p50": "latency p50 at the start",
-    "latency_sustained_p50": "latency p50 sustained",
-    "sustained_slowdown": "sustained slow-down",
-    "cpu": "processor use",
-    "power_mean": "mean power",
-    "temperature_max": "highest temperature",
-    "age_p50": "observation age p50",
-    "age_p99": "observation age p99",
-    "age_max": "observation age max",
-    "wakeup_p50": "wake-up delay p50",
-    "wakeup_p99": "wake-up delay p99",
-    "mcnemar_p": "McNemar p",
-    "success_drop": "success drop",
-    "success_chance": "success by chance",
-    "success_wrong_instruction": "success with the wrong instruction",
-    "skill_expert": "skill against a constant action",
-    "variation": "variation of the actions",
-    "relative_error": "relative error (L2)",
-    "raw_relative_error": "relative error (L2) of the raw action",
-}
 LIMIT_UNITS = {
     "ms": "ms", "s": "s", "mb": "MB", "gb": "GB", "hz": "Hz", "w": "W", "mj": "mJ", "j": "J", "m": "m", "rad": "rad",
     "points": "points", "percent": "%",
 }  # fmt: skip
-POINTS = ("_drop", "_points", "_difference")
-ABOVE_1 = ("reach_share",)
-"""Shares that may be more than the whole."""
-NOT_SHARES = re.compile(r"^error|^skill|^variation|(^|_)p(_?value)?$|ratio")
 
 
 def plain(text: object) -> str:
@@ -57,11 +29,7 @@ def plain(text: object) -> str:
 
 def label(name: str) -> str:
     """Return a measurement's name as words: ``latency_p50`` -> ``latency p50``."""
-    if name in LABELS:
-        return LABELS[name]
-    whole, dot, part = name.partition(".")
-    words = re.sub(r"^(error|agreement|gripper_flips)_(baseline|expert)$", r"\1 vs \2", whole).replace("_", " ")
-    return plain(f"{words}, {part}" if dot else words)
+    return plain(quantity_of(name).words)
 
 
 def decimals_of(value: float, digits: int = 3) -> int:
@@ -123,21 +91,22 @@ def count(samples: int) -> str:
 
 def is_share(measurement: Measurement) -> bool:
     """Return whether a number without a unit is a share of something, to be shown in per cent."""
-    if measurement.unit != "1" or NOT_SHARES.search(measurement.name):
+    form = quantity_of(measurement.name).form
+    if measurement.unit != "1" or form == PLAIN:
         return False
-    return not measurement.known or abs(measurement.value) <= 1 or measurement.name in ABOVE_1
+    return not measurement.known or abs(measurement.value) <= 1 or form == PERCENT
 
 
 def is_points(measurement: Measurement) -> bool:
     """Return whether a share is a difference of shares, to be shown in percentage points."""
-    return is_share(measurement) and measurement.name.endswith(POINTS)
+    return is_share(measurement) and quantity_of(measurement.name).form == POINTS
 
 
 def _scale(measurement: Measurement) -> tuple[float, str]:
     """Return what the number is multiplied by, and the unit beside it; action errors in metres are in millimetres."""
     if is_share(measurement):
         return 100.0, "points" if is_points(measurement) else "%"
-    if measurement.unit == "m" and measurement.name.startswith("error"):
+    if measurement.unit == "m" and quantity_of(measurement.name).form == PLAIN:
         return 1000.0, "mm"
     return 1.0, {"1": "", COUNT: "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
 

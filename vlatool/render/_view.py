@@ -2,57 +2,48 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
+from vlatool.measures import (
+    ELEMENTS,
+    FURTHER,
+    HEADLINE,
+    LAST_POSITION,
+    MOTION,
+    RECORDED_ACCURACY,
+    Quantity,
+    quantity_of,
+)
+from vlatool.measures.latency import LATENCY_P50, OF_LATENCY, latency_of_limit
+from vlatool.measures.success import SUCCESS
+from vlatool.measures.tables import MISSING_VALUES
 from vlatool.render._format import cell, interval, is_usual, label, plain
 from vlatool.report import ON_BOARD, Measurement, Report, Row
 
-ACCURACY = ("success", "agreement", "agreement_expert", "agreement_baseline")
-ERRORS = ("error", "error_expert", "error_baseline")
 ROLES = {"subject": "measured", "within": "within limits", "outside": "outside limits"}
-ERROR_OF_DIMENSION = re.compile(r"^(error\w*)\.(.+)$")
-PERCENTILES = ("latency_p50", "latency_p90", "latency_p95", "latency_p99", "latency_p99.9", "latency_max")
-ORDER = (
-    "speedup", "throughput", "gmacs", "reach_share", "jitter", "deadline_misses",
-    "age_p50", "age_p99", "age_max", "wakeup_p50", "wakeup_p99",
-    "latency_start_p50", "latency_sustained_p50", "sustained_slowdown", "cold_start", "cpu",
-    "size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max",
-)  # fmt: skip
-"""The order in which the numbers of a benchmark are shown; others follow in the order of the report."""
-ABSENT = "unmeasured"
-"""The details table that says what could not be had; shown with the numbers that are NaN."""
-BY_TASK, UNDER = "success by task", "under disturbances"
-"""Tables of details that the section on motion draws, beside those against the baseline."""
-SHOWN = "the episode that differs most"
-AGAINST_BASELINE = "against the baseline"
-OF_MOTION = ("task_speedup", "steps_ratio", "success_disturbed", "worst_task_drop")
-"""Measurements of that section, beside the ratios of metrics."""
-BOARDS = "hwselect"
-"""The kind of a report that ranks boards: its rows are no variants."""
-SHORT = {"success_drop": "drop", "latency_p50": "latency p50", "peak_rss": "memory"}
+RANKING = "hwselect"
+"""The kind of a report that ranks boards: its rows are not variants."""
 
 
 @dataclass(frozen=True)
 class Latency:
     """The latency that a chart shows, the limit on it when one was asked for, and what a drawing calls that."""
 
-    name: str
+    quantity: Quantity
     limit: float | None
     word: str = "limit"
 
 
 def ranks_boards(report: Report) -> bool:
     """Return whether the rows are boards, not variants."""
-    return report.kind == BOARDS
+    return report.kind == RANKING
 
 
-def measured(report: Report, name: str) -> list[Measurement | None]:
-    """Return the measured number of that name, one for each row."""
-    return [row.get(name) for row in report.rows]
+def measurements(report: Report, quantity: Quantity) -> list[Measurement | None]:
+    """Return the measured number of a quantity, one for each row."""
+    return [row.get(quantity) for row in report.rows]
 
 
 def of_origin(report: Report, origin: str, where: str | None = None) -> Iterator[Measurement]:
@@ -61,9 +52,9 @@ def of_origin(report: Report, origin: str, where: str | None = None) -> Iterator
         yield from (item for item in row.measurements if item.origin == origin and where in (None, item.where))
 
 
-def names(report: Report, origin: str = "measured", where: str | None = None) -> list[str]:
-    """Return the names of measurements in the order of their first appearance."""
-    return list(dict.fromkeys(item.name for item in of_origin(report, origin, where)))
+def quantities(report: Report, origin: str = "measured", where: str | None = None) -> list[Quantity]:
+    """Return the quantities in the order of their first appearance."""
+    return [quantity_of(name) for name in dict.fromkeys(item.name for item in of_origin(report, origin, where))]
 
 
 def places(report: Report, origin: str) -> list[str]:
@@ -71,46 +62,39 @@ def places(report: Report, origin: str) -> list[str]:
     return list(dict.fromkeys(item.where for item in of_origin(report, origin)))
 
 
-def headline(report: Report) -> list[str]:
-    """Return the names of the few measured numbers that decide."""
-    present = names(report)
-    accuracy = ["success", "success_drop"] if "success" in present else [*ACCURACY[1:], *ERRORS]
-    deciding = ["latency_p50", "deadline_misses", "speedup", *accuracy, "size", "peak_rss"]
-    return [name for name in deciding if name in present]
+def headline(report: Report) -> list[Quantity]:
+    """Return the few measured quantities that decide, each a column of the variants."""
+    present = quantities(report)
+    sections = (HEADLINE,) if SUCCESS in present else (HEADLINE, RECORDED_ACCURACY)
+    return sorted((each for each in present if each.section in sections), key=lambda each: each.order)
 
 
-def other_names(report: Report) -> list[str]:
-    """Return the measured names that neither the headline nor the error table shows."""
-    shown = {*headline(report), *percentile_names(report), *motion_names(report)}
-    others = [name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name)]
-    return sorted(others, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
+def further(report: Report) -> list[Quantity]:
+    """Return the measured quantities that neither the headline nor another table shows."""
+    shown = [*headline(report), *percentiles(report), *motions(report)]
+    rest = (each for each in quantities(report) if each not in shown and each.section != ELEMENTS)
+    return sorted(rest, key=lambda each: each.order if each.section == FURTHER else LAST_POSITION)
 
 
-def motion_names(report: Report) -> list[str]:
-    """Return the names of the measured numbers that say how the variants move beside the baseline."""
-    present = names(report)
-    others = sorted(name for name in present if name.endswith(("_ratio", "_added")) and name not in OF_MOTION)
-    return [*(name for name in OF_MOTION if name in present), *others]
+def motions(report: Report) -> list[Quantity]:
+    """Return the measured quantities that say how the variants move beside the baseline."""
+    found = (each for each in quantities(report) if each.section == MOTION)
+    return sorted(found, key=lambda each: (each.order, each.name))
 
 
-def percentile_names(report: Report) -> list[str]:
+def percentiles(report: Report) -> list[Quantity]:
     """Return the measured percentiles of the latency when there are enough of them for a table of their own."""
-    present = names(report)
-    percentiles = [name for name in PERCENTILES if name in present]
-    return percentiles if len(percentiles) > 2 else []
+    present = quantities(report)
+    found = [each for each in OF_LATENCY if each in present]
+    return found if len(found) > 2 else []
 
 
-def short(name: str) -> str:
-    """Return the column title of a headline number."""
-    return SHORT.get(name, label(name))
-
-
-def error_groups(report: Report) -> dict[str, list[str]]:
-    """Return ``error_baseline`` -> the full names of its measured dimensions."""
-    groups: dict[str, list[str]] = {}
-    for name in names(report):
-        if group := ERROR_OF_DIMENSION.match(name):
-            groups.setdefault(group[1], []).append(name)
+def elements(report: Report) -> dict[str, list[Quantity]]:
+    """Return ``error vs baseline`` -> its measured quantities, one for each element of an action."""
+    groups: dict[str, list[Quantity]] = {}
+    for each in quantities(report):
+        if each.section == ELEMENTS:
+            groups.setdefault(each.group, []).append(each)
     return groups
 
 
@@ -152,8 +136,8 @@ def notes(report: Report, origin: str, where: str | None = None) -> list[str]:
     by_note: dict[str, dict[str, None]] = {}
     for item in of_origin(report, origin, where):
         if item.note and (item.known or origin == "predicted"):
-            group = ERROR_OF_DIMENSION.match(item.name)
-            words = f"{label(group[1])} by dimension" if group else label(item.name)
+            group = quantity_of(item.name).group
+            words = f"{group} by dimension" if group else label(item.name)
             by_note.setdefault(plain(item.note), {})[words] = None
     return [f"{', '.join(labels)}: {note}" for note, labels in by_note.items()]
 
@@ -164,12 +148,12 @@ def unmeasured(report: Report, shown: Callable[[str], bool], *, further: bool = 
     Args:
         report: The report.
         shown: Says of the name of a measurement whether its reason is asked for.
-        further: Add what is no measurement of a row, from its details.
+        further: Add what is not a measurement of a row, from its details.
     """
     missing = [(row, _missing(item), plain(item.note)) for row in report.rows for item in row.measurements
                if not item.known and shown(item.name)]  # fmt: skip
     for row in report.rows if further else ():
-        records = row.details.get(ABSENT, ())
+        records = row.details.get(MISSING_VALUES, ())
         missing += [(row, plain(record.get("what", "")), plain(record.get("why", ""))) for record in records]
     rows_of: dict[tuple[str, str], dict[str, None]] = {}
     for row, what, why in missing:
@@ -194,44 +178,43 @@ def latency(report: Report) -> Latency:
     """Return which latency percentile the limit speaks of, and the limit.
 
     A benchmark at a rate (``hz``) without one has its period as the deadline, and so have several that are compared.
-    What ``optimize`` was asked for is no limit on this host when it is for another board.
+    What ``optimize`` was asked for is not a limit on this host when it is for another board.
     """
-    present = names(report)
-    for_board = names(report, "predicted") and report.kind == "optimize" and ON_BOARD not in report.environment
+    present = quantities(report)
+    for_board = quantities(report, "predicted") and report.kind == "optimize" and ON_BOARD not in report.environment
     for name, limit in () if for_board else report.limits.items():
-        if _is_number(limit) and name.endswith("_ms") and ("latency" in name or "deadline" in name):
-            percentile = re.search(r"p\d+(\.\d+)?|max(?=_)", name.removeprefix("max_"))
-            limited = f"latency_{percentile[0]}" if percentile else "latency_p50"
-            if limited in present:
-                return Latency(limited, float(limit), "deadline" if "deadline" in name else "limit")
+        limited = latency_of_limit(name) if _is_number(limit) else None
+        if limited is not None and quantity_of(limited.name) in present:
+            return Latency(quantity_of(limited.name), float(limit), "deadline" if "deadline" in name else "limit")
     rate = report.limits.get("hz")
     if report.kind in ("benchmark", "compare") and _is_number(rate) and rate > 0:
-        return Latency("latency_p50", 1e3 / rate, "deadline")
-    return Latency("latency_p50", None)
+        return Latency(LATENCY_P50, 1e3 / rate, "deadline")
+    return Latency(LATENCY_P50, None)
 
 
 def _is_number(value: Any) -> TypeGuard[int | float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def accuracy(report: Report) -> str:
-    """Return the name of the number that says how well the variants do their task; empty when there is none."""
-    for name in (*ACCURACY, *ERRORS):
-        if any(item is not None and math.isfinite(item.value) for item in measured(report, name)):
-            return name
-    return ""
+def accuracy(report: Report) -> Quantity | None:
+    """Return the quantity that says how well the variants do their task; None when there is none."""
+    recorded = sorted(
+        (each for each in quantities(report) if each.section == RECORDED_ACCURACY), key=lambda each: each.order
+    )
+    known = (each for each in (SUCCESS, *recorded) if any(item and item.known for item in measurements(report, each)))
+    return next(known, None)
 
 
-def floor(report: Report, name: str) -> float | None:
+def floor(report: Report, quantity: Quantity) -> float | None:
     """Return the least success that the limits allow: given, or the baseline's less the allowed drop."""
     for key, limit in report.limits.items():
-        if name != "success" or "success" not in key or not _is_number(limit):
+        if quantity != SUCCESS or SUCCESS.name not in key or not _is_number(limit):
             continue
         share = limit / 100 if key.endswith(("_points", "_percent")) else float(limit)
         if "drop" not in key:
             return share
         for row in report.rows:
-            if row.role == "baseline" and (success := row.get(name)) and success.known:
+            if row.role == "baseline" and (success := row.get(quantity)) and success.known:
                 return success.value - share
     return None
 

@@ -6,7 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from vlatool.render._format import cell, count, fixed, label, plain, quantity, span
+from vlatool.measures import Quantity
+from vlatool.render._format import cell, count, fixed, plain, quantity, span
 from vlatool.render._view import notes
 from vlatool.render.charts.svg import tinted
 from vlatool.render.document import MISSING, Bar, Cell, Column, Line, Notes, Table
@@ -27,22 +28,24 @@ def texts(contents: Iterable[str]) -> tuple[Cell, ...]:
     return tuple(Cell(text) for text in contents)
 
 
-def matrix(report: Report, shown: Sequence[str], origin: str, where: str | None = None) -> Table:
+def matrix(report: Report, shown: Sequence[Quantity], origin: str, where: str | None = None) -> Table:
     """Return a table of one kind of numbers from one place: a number a line, a variant a column.
 
     Args:
         report: The report.
-        shown: Names of measurements.
+        shown: The quantities.
         origin: Measured or predicted.
         where: Only the numbers from there.
     """
     variants = []
     for row, css in tinted(report.rows):
         items = {item.name: item for item in row.measurements if item.origin == origin and where in (None, item.where)}
-        if any(name in items for name in shown):
+        if any(each.name in items for each in shown):
             variants.append((Column(plain(row.name), css=css), items))
     columns = (Column("measurement", False), *(column for column, _ in variants))
-    lines = (Line((Cell(label(name)), *(number(items.get(name)) for _, items in variants))) for name in shown)
+    lines = (
+        Line((Cell(plain(each.words)), *(number(items.get(each.name)) for _, items in variants))) for each in shown
+    )
     return Table(columns, tuple(lines))
 
 

@@ -9,9 +9,11 @@ from typing import Any
 
 from vlatool.bundle.bundle import REPORTS, Bundle
 from vlatool.machine.host import fingerprint
+from vlatool.measures import series, tables
+from vlatool.measures.training import TRAINING_TIME
 from vlatool.module.stage import TRAINING
 from vlatool.render import write_reports
-from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Report, Row
+from vlatool.report import Report, Row
 from vlatool.training.forecast import duration
 from vlatool.training.generalization_gap import ADVICE_RATIO, LOSS_KEY, NEW_ROUND, PREVIOUS_ROUND
 from vlatool.training.supervision import teacher_lines, teacher_record
@@ -33,14 +35,14 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
     training = json.loads(made.file(TRAINING).read_bytes())
     stage = str(made.manifest.made_by["stage"])
     losses, steps = training["losses"], len(training["losses"])
-    took = Measurement(f"{TRAINING_TIME}{stage}", seconds, "s")
+    took = TRAINING_TIME.quantity(stage).measurement(seconds)
     row = Row(
         made.manifest.name,
         measurements=(took,),
-        raw={f"{TRAINED}{stage}": losses},
+        raw={series.LOSSES.name(stage): losses},
         details={
-            f"{TRAINED}{stage}": [_round(round_) for round_ in training["rounds"]],
-            f"{TRAINED}{stage}{TEACHER}": [teacher_record(training)],
+            tables.ROUNDS.name(stage): [_round(round_) for round_ in training["rounds"]],
+            tables.TEACHER.name(stage): [teacher_record(training)],
         },
     )
     few = max(1, steps // 20)

@@ -10,8 +10,9 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import UsageError
 from vlatool.machine.host import fingerprint
+from vlatool.measures.actions import ERROR_MAX_OF, RELATIVE_ERROR_MAX
 from vlatool.module.factory import factory_file, split_factory
-from vlatool.report import Measurement, Report, Row
+from vlatool.report import Report, Row
 from vlatool.stage.base import Context
 from vlatool.user_code import children, trust
 
@@ -87,10 +88,11 @@ def _report(bundle: Bundle, options: Options, comparison: Mapping[str, Any]) -> 
     compared = f"Compared: {steps} of the {spec.chunk} steps of a chunk, of which {spec.executed} are executed"
     sentences += [f"{compared}, on {count} {observations}."] if spec.chunk > 1 else []
     note = f"action, in physical units, {steps} of {spec.chunk} steps"
-    measurements = [Measurement("relative_error_max", worst, "1", samples=count, note=note)]
+    measurements = [RELATIVE_ERROR_MAX.measurement(worst, samples=count, note=note)]
     measurements += [
-        Measurement(f"error_max.{element['element']}", float(element["max error"]), str(element["unit"]), samples=count,
-                    note="largest |difference|") for element in comparison["elements"]
+        ERROR_MAX_OF.quantity(str(element["element"]), str(element["unit"])).measurement(
+            float(element["max error"]), samples=count, note="largest |difference|"
+        ) for element in comparison["elements"]
     ]  # fmt: skip
     details = {ELEMENTS: list(comparison["elements"]), STAGES: list(comparison["stages"])}
     row = Row(name, measurements=tuple(measurements), details={key: value for key, value in details.items() if value})

@@ -18,6 +18,7 @@ from vlatool.gate.claims.accuracy import Accuracy, drop_words
 from vlatool.gate.evidence import recorded_data
 from vlatool.gate.plan import Plan
 from vlatool.gate.verdict import judge_interval
+from vlatool.measures.actions import RECORDED_DROP
 from vlatool.report import Measurement
 
 
@@ -151,7 +152,7 @@ def test_what_is_decided_needs_no_more() -> None:
 
 
 def test_one_recorded_episode_decides_nothing() -> None:
-    alone = Accuracy()._held("recorded_drop", "away:", (0.2, -math.inf, math.inf), 60)
+    alone = Accuracy()._held(RECORDED_DROP, "away:", (0.2, -math.inf, math.inf), 60)
     assert (alone.outcome, alone.measured.low) == ("inconclusive", None)
     assert drop_words(alone) == (
         "away: +20.00% (unbounded to unbounded, 60 of them; allowed: +1.00%), of one episode alone, "

@@ -12,7 +12,6 @@ from pydantic import Field
 
 from vlatool.accuracy.credibility import DECIDE, Credibility, credibility
 from vlatool.accuracy.losses import drop, losses
-from vlatool.accuracy.moved import START
 from vlatool.accuracy.paired import few_starts, repeated_starts
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import read_recording
@@ -22,6 +21,9 @@ from vlatool.gate.claim import Claim
 from vlatool.gate.evidence import Evidence, recorded_data
 from vlatool.gate.plan import Need, Plan
 from vlatool.gate.verdict import CONFIDENCE, Judgement, Outcome, Reason, Verdict, judge_interval, samples_wanted
+from vlatool.measures import Quantity, series
+from vlatool.measures.actions import RECORDED_DROP
+from vlatool.measures.success import SUCCESS, SUCCESS_DROP
 from vlatool.report import Measurement, Row
 from vlatool.stats.starts import distinct, independent
 from vlatool.stats.success_sequential import exact_drop
@@ -84,16 +86,16 @@ class Accuracy(Claim):
         return replace(found, outcome=outcome, reason=reason, measurements=measured)
 
     def _in_episodes(self, baseline: Row, candidate: Row) -> _Part:
-        before, after = (row.raw["success"] for row in (baseline, candidate))
+        before, after = (row.raw[series.SUCCESS] for row in (baseline, candidate))
         lost = sum(one > two for one, two in zip(before, after, strict=True))
         won = sum(one < two for one, two in zip(before, after, strict=True))
-        starts = baseline.raw[START]
+        starts = baseline.raw[series.START]
         interval = exact_drop(lost, won, len(before), CONFIDENCE, independent(starts))
-        judged = self._held("success_drop", "more failed episodes:", interval, len(before), distinct(starts))
+        judged = self._held(SUCCESS_DROP, "more failed episodes:", interval, len(before), distinct(starts))
         if few := few_starts(baseline):
             judged = replace(judged, outcome=Outcome.INCONCLUSIVE, reason=Reason.FEW_STARTS,
                              facts={**judged.facts, "few": few})  # fmt: skip
-        own = tuple(number for number in candidate.measurements if number.name == "success")
+        own = tuple(number for number in candidate.measurements if number.name == SUCCESS.name)
         return _Part(judged, baseline.measurements, own, repeated_starts(baseline))
 
     def _on_recordings(self, evidence: Evidence, data: Path) -> _Part:
@@ -113,16 +115,17 @@ class Accuracy(Claim):
             off, before = losses(action, mine, expert), losses(action, theirs, expert)
             title = "more distance from the expert's actions than the baseline has:"
         interval = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
-        judged = self._held("recorded_drop", title, interval, len(indices))
+        judged = self._held(RECORDED_DROP, title, interval, len(indices))
         return _Part(judged, tuple(alone(action, theirs, expert, episodes)), notes=recording.unjudged_steps)
 
     def _held(
-        self, name: str, title: str, drop: tuple[float, float, float], samples: int, starts: int = 0
+        self, quantity: Quantity, title: str, drop: tuple[float, float, float], samples: int, starts: int = 0
     ) -> Judgement:
         value, *ends = drop
         low, high = (end if math.isfinite(end) else None for end in ends)
-        measured = Measurement(name, value, "1", samples=samples, low=low, high=high, confidence=CONFIDENCE,
-                               note=title.rstrip(":"))  # fmt: skip
+        measured = quantity.measurement(
+            value, samples=samples, low=low, high=high, confidence=CONFIDENCE, note=title.rstrip(":")
+        )
         return judge_interval(measured, self.max_drop, title, starts=starts)
 
     def sentence(self, verdict: Verdict) -> str:

@@ -13,6 +13,7 @@ from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Need, Plan
 from vlatool.gate.verdict import Judgement, Outcome, Reason, Verdict
 from vlatool.measurement.agreement import SEQUENCE, OutputAgreement
+from vlatool.measures.actions import FOLLOWS
 from vlatool.report import Measurement
 
 KINDS = {
@@ -59,10 +60,10 @@ class Answers(Claim):
     def _follows(self, followed: Sequence[OutputAgreement]) -> Judgement:
         """Judge the output that follows the baseline's least."""
         if not (least := _least(followed)):
-            return Judgement(Outcome.INCONCLUSIVE, "follows", reason=Reason.NO_EVIDENCE)
+            return Judgement(Outcome.INCONCLUSIVE, FOLLOWS.name, reason=Reason.NO_EVIDENCE)
         (lowest,) = least
         outcome = Outcome.PASS if lowest.correlation >= (self.follows or 0.0) else Outcome.FAIL
-        return Judgement(outcome, "follows", _measured(lowest), self.follows, facts={"followed": lowest})
+        return Judgement(outcome, FOLLOWS.name, _measured(lowest), self.follows, facts={"followed": lowest})
 
     def sentence(self, verdict: Verdict) -> str:
         """Return both findings, what fails first."""
@@ -80,7 +81,7 @@ def _steady(evidence: Evidence) -> Judgement:
 
 def _measured(followed: OutputAgreement) -> Measurement:
     note = f"least correlation with the baseline's answers: {followed.output}, {KINDS[followed.kind]}"
-    return Measurement("follows", followed.correlation, "1", samples=followed.samples, note=note)
+    return FOLLOWS.measurement(followed.correlation, samples=followed.samples, note=note)
 
 
 def _words(judged: Judgement) -> str:

@@ -9,7 +9,7 @@ from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Need
 from vlatool.gate.timed import Timed
 from vlatool.gate.verdict import Judgement, Outcome, Verdict
-from vlatool.report import Measurement
+from vlatool.measures.latency import LATENCY
 from vlatool.stats.percentiles import PERCENTILES, Percentile, percentile, proven_above
 
 MIN_PROCESSES, MAX_PROCESSES = 10, 60
@@ -51,9 +51,10 @@ class Deadline(Claim):
         below = Outcome.PASS if bounded.known and bounded.bound <= self.ms else Outcome.INCONCLUSIVE
         measured = None
         if bounded.known:
-            measured = Measurement(f"latency_{bounded.name}", bounded.value, "ms", samples=len(calls), low=None,
-                                   high=bounded.bound, confidence=bounded.confidence,
-                                   note="upper bound, distribution-free")  # fmt: skip
+            high, confidence, note = bounded.bound, bounded.confidence, "upper bound, distribution-free"
+            measured = LATENCY.quantity(bounded.name).measurement(
+                bounded.value, samples=len(calls), high=high, confidence=confidence, note=note
+            )
         facts = {"percentile": bounded, "calls": len(calls)}
         return Verdict.of([Judgement(Outcome.FAIL if above else below, bounded.name, measured, self.ms, facts=facts)])
 

@@ -14,11 +14,12 @@ from vlatool.gate.plan import Need, Plan
 from vlatool.gate.timed import Timed
 from vlatool.gate.verdict import CONFIDENCE, Judgement, Outcome, Verdict
 from vlatool.measurement.turns import CONFIRM
-from vlatool.report import Measurement
+from vlatool.measures import Quantity
+from vlatool.measures.latency import LATENCY_MEAN_RATIO, LATENCY_RATIO, ratio_at_threads
 from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES, Decision, jointly
 from vlatool.stats.signed_rank import fewest
 
-MEASURED = (("latency_ratio", "medians"), ("latency_mean_ratio", "means of ratios"))
+MEASURED = ((LATENCY_RATIO, "medians"), (LATENCY_MEAN_RATIO, "means of ratios"))
 """Statistics of the calls, and of the observations, each the median of its calls: the median and the mean."""
 MAX_PROCESSES = 1000
 """Number of processes beyond which it is not a useful advice that they would decide."""
@@ -82,7 +83,7 @@ class Latency(Claim):
         found = {self.name(): self.examine(evidence)}
         for threads in self.also_threads:
             verdict = self.examine_timed(evidence.timed.at_threads(threads))
-            measured = tuple(replace(one, name=f"{one.name}_{threads}_threads") for one in verdict.measurements)
+            measured = tuple(ratio_at_threads(one, threads) for one in verdict.measurements)
             found[f"{self.name()}, {threads} threads"] = replace(verdict, measurements=measured)
         return found
 
@@ -102,10 +103,12 @@ class Latency(Claim):
         found = Verdict.of(judged, slow=slow_observations(timed, self.worst))
         return replace(found, outcome=Outcome.FAIL) if found.facts["slow"] else found
 
-    def _judged(self, name: str, what: str, decision: Decision) -> Judgement:
+    def _judged(self, quantity: Quantity, what: str, decision: Decision) -> Judgement:
         note = f"candidate over baseline, {what}, fresh processes with both, Hodges-Lehmann"
-        measured = Measurement(name, decision.ratio, "x", samples=decision.processes, low=decision.low,
-                               high=decision.high, confidence=CONFIDENCE, note=note)  # fmt: skip
+        low, high, count = decision.low, decision.high, decision.processes
+        measured = quantity.measurement(
+            decision.ratio, samples=count, low=low, high=high, confidence=CONFIDENCE, note=note
+        )
         return Judgement(Outcome(decision.verdict), what, measured, 1 + self.margin, facts={"decision": decision})
 
     def sentence(self, verdict: Verdict) -> str:

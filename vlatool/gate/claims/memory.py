@@ -10,7 +10,7 @@ from vlatool.gate.inputs import MEMORY
 from vlatool.gate.plan import Need
 from vlatool.gate.verdict import Verdict
 from vlatool.measurement.cold_start import cold_start
-from vlatool.report import Measurement
+from vlatool.measures.resources import PEAK_RSS
 
 PROBES = 3
 """Fresh processes that load each bundle once."""
@@ -37,4 +37,4 @@ class Memory(Growth):
                     taken.append(probed.peak_rss_mb)
         mine, theirs = map(median, peaks)
         note = f"load and some inferences, median of {PROBES} fresh processes"
-        return self.judge(Measurement("peak_rss", mine, "MB", samples=PROBES, note=note), theirs)
+        return self.judge(PEAK_RSS.measurement(mine, samples=PROBES, note=note), theirs)

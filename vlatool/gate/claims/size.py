@@ -8,7 +8,7 @@ from vlatool.files.ownership import LEDGER
 from vlatool.gate.claims._growth import Growth
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.verdict import Verdict
-from vlatool.report import Measurement
+from vlatool.measures.resources import SIZE
 
 ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, PLAYED, "recipe.yaml", "SIGNATURE",
          "reports/report.html", "reports/report.md", "reports/report.json", "reports/difference.json",
@@ -25,7 +25,7 @@ class Size(Growth):
     def examine(self, evidence: Evidence) -> Verdict:
         """Examine the bytes of the graphs and assets."""
         mine, theirs = (deployed_bytes(bundle) / 1e6 for bundle in (evidence.candidate, evidence.baseline))
-        return self.judge(Measurement("size", mine, "MB", note="graphs and assets on disk"), theirs)
+        return self.judge(SIZE.measurement(mine, note="graphs and assets on disk"), theirs)
 
 
 def deployed_bytes(bundle: Bundle) -> int:

@@ -7,10 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from vlatool.measures import series
+from vlatool.measures.latency import LATENCY
 from vlatool.render.charts.svg import tinted
 from vlatool.report import Report, Row
 
-SERIES_NAME, TIMES = "latency_ms", "at_s"
 MOST = 8
 MARKED = {"p50": 0.5, "p90": 0.9, "p99": 0.99}
 """The percentiles that are marked on the curve and below the histogram."""
@@ -128,7 +129,7 @@ class Sampled:
 
 def left_out(report: Report) -> str:
     """Return a sentence about the variants for which the charts have no room."""
-    more = sum(len(finite(row.raw.get(SERIES_NAME) or [])) > 1 for row in report.rows) - MOST
+    more = sum(len(finite(row.raw.get(series.LATENCY) or [])) > 1 for row in report.rows) - MOST
     return f"Only the first {MOST} variants are drawn; {more} more in the tables." if more > 0 else ""
 
 
@@ -138,7 +139,7 @@ def sampled(report: Report) -> list[Sampled]:
     for row, css in tinted(report.rows):
         samples, times = _timed(row)
         if len(samples) > 1 and len(variants) < MOST:
-            reported = {share: row.value(f"latency_{name}") for name, share in MARKED.items()}
+            reported = {share: row.value(LATENCY.quantity(name)) for name, share in MARKED.items()}
             known = {share: value for share, value in reported.items() if math.isfinite(value)}
             variants.append(Sampled(row.name, css, samples, sorted(samples), known, times))
     return variants
@@ -146,7 +147,7 @@ def sampled(report: Report) -> list[Sampled]:
 
 def _timed(row: Row) -> tuple[list[float], list[float]]:
     """Return the samples, and when each call began; no times unless all are known and time went on."""
-    samples, times = row.raw.get(SERIES_NAME) or [], row.raw.get(TIMES) or []
+    samples, times = row.raw.get(series.LATENCY) or [], row.raw.get(series.START_TIMES) or []
     if len(times) != len(samples):
         return finite(samples), []
     kept = [time for time, sample in zip(times, samples, strict=True) if finite([sample])]

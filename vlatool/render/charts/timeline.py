@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from vlatool.measures.series import READING, READING_TIMES, THROTTLE_TIMES
+from vlatool.measures.tables import TELEMETRY
 from vlatool.render._format import fixed, plain, significant, tick
 from vlatool.render._view import Latency
-from vlatool.render.charts.samples import TIMES, Band, Sampled, envelope, finite
+from vlatool.render.charts.samples import Band, Sampled, envelope, finite
 from vlatool.render.charts.svg import Axis, Canvas, axis_for
 from vlatool.report import Report
 
-THROTTLED, GAUGE = "throttled_at_s", "telemetry."
 PANEL, GAUGE_PANEL, MOST_GAUGES = 104, 56, 6
 LEFT, RIGHT = 46.0, 14.0
 UNITS = {"degC": "°C", "1": ""}
@@ -31,16 +32,15 @@ class Gauge:
 
 def gauges(report: Report) -> list[Gauge]:
     """Return what was read of the machine, each once: temperatures, clocks, power, the rest."""
-    tables = [record for row in report.rows for record in row.details.get("telemetry", ())]
+    tables = [record for row in report.rows for record in row.details.get(TELEMETRY, ())]
     units = {str(record.get("reading")): str(record.get("unit", "")) for record in tables}
     shown: list[tuple[str, Gauge]] = []
     for row in report.rows:
-        for name, values in row.raw.items():
-            times = row.raw.get(f"{name}.{TIMES}") or []
-            if not name.startswith(GAUGE) or len(times) != len(values):
+        for reading, name in READING.among(row.raw).items():
+            values, times = row.raw[name], row.raw.get(READING_TIMES.name(reading)) or []
+            if len(times) != len(values):
                 continue
             pairs = sorted(pair for pair in zip(times, values, strict=True) if len(finite(pair)) == 2)
-            reading = name.removeprefix(GAUGE)
             gauge = Gauge(reading, units.get(reading, ""), [pair[0] for pair in pairs], [pair[1] for pair in pairs])
             if len(pairs) > 1 and all(gauge != other for _, other in shown):
                 shown.append((row.name, gauge))
@@ -59,7 +59,7 @@ def _kind(gauge: Gauge) -> int:
 
 def throttled(report: Report) -> list[float]:
     """Return the moments at which throttling was seen."""
-    return sorted({moment for row in report.rows for moment in finite(row.raw.get(THROTTLED) or [])})
+    return sorted({moment for row in report.rows for moment in finite(row.raw.get(THROTTLE_TIMES) or [])})
 
 
 def over_time(report: Report, variants: Sequence[Sampled], aim: Latency, width: int) -> Canvas:

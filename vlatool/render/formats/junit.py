@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from xml.etree import ElementTree
 
+from vlatool.measures.tables import CLAIMS
 from vlatool.render._trust import reasons, sentence
 from vlatool.report import Report
 
@@ -63,7 +64,7 @@ def claims(report: Report) -> list[tuple[str, str, str]]:
     return [
         (str(record.get("claim", "")), str(record.get("verdict", "")), str(record.get("found", "")))
         for row in report.rows
-        for record in row.details.get("claims", ())
+        for record in row.details.get(CLAIMS, ())
     ]
 
 

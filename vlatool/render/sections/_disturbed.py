@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
+from vlatool.measures.success import SUCCESS
+from vlatool.measures.tables import UNDER
 from vlatool.render._format import plain
-from vlatool.render._view import UNDER
 from vlatool.render.charts.curves import Curve, curves
 from vlatool.render.charts.shares import Share, shares
 from vlatool.render.charts.svg import tinted
@@ -89,7 +90,7 @@ def _played(report: Report) -> Iterator[tuple[str, float, Share]]:
 
 def _undisturbed(report: Report) -> Iterator[Share]:
     for row, css in tinted(report.rows):
-        rate = row.get("success")
+        rate = row.get(SUCCESS)
         if rate is not None and (share := share_of(row.name, css, rate.value, rate.samples)):
             yield share
 

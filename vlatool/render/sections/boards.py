@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+from vlatool.measures import Quantity, resources
+from vlatool.measures.latency import LATENCY_P50
+from vlatool.measures.tables import WAY
 from vlatool.render._format import number, plain
 from vlatool.render._view import ranks_boards
 from vlatool.render.cells import texts
@@ -56,7 +59,7 @@ class Boards:
 
 def way(row: Row) -> dict[str, str]:
     """Return how a board is driven: state, power mode, engine, precision."""
-    records = row.details.get("way") or [{}]
+    records = row.details.get(WAY) or [{}]
     return {key: str(value) for key, value in records[0].items()}
 
 
@@ -73,10 +76,12 @@ def cells(row: Row) -> list[str]:
     """Return the cells of a row under ``HEADS``."""
     driven = way(row)
     dtype = driven.get("precision") or ("as it is" if driven.get("engine") else ABSENT)
-    latency, memory, usable = (row.get(name, "predicted") for name in ("latency_p50", "memory", "usable_memory"))
+    latency, memory, usable = (
+        row.get(each, "predicted") for each in (LATENCY_P50, resources.MEMORY, resources.USABLE_MEMORY)
+    )
     return [
         row.name, driven.get("power mode", ""), dtype, _spread(latency),
-        _of(memory, usable), _money(row.get("price", "predicted")),
+        _of(memory, usable), _money(row.get(resources.PRICE, "predicted")),
     ]  # fmt: skip
 
 
@@ -84,11 +89,14 @@ def cost_table(rows: Sequence[Row]) -> Table | None:
     """Return what power and money each board takes; columns that say nothing are left out."""
     body = []
     for row in rows:
-        if row.get("owned_cost", "predicted") is None:
+        if row.get(resources.OWNED_COST, "predicted") is None:
             continue
-        power = [_value(row, name) for name in ("watts", "average_watts", "energy", "battery_life")]
-        money = [_money(row.get(name, "predicted")) for name in ("owned_cost", "cloud_cost")]
-        body.append([plain(row.name), *power, *money, _value(row, "break_even")])
+        power = [
+            _value(row, each)
+            for each in (resources.WATTS, resources.AVERAGE_WATTS, resources.ENERGY, resources.BATTERY_LIFE)
+        ]
+        money = [_money(row.get(each, "predicted")) for each in (resources.OWNED_COST, resources.CLOUD_COST)]
+        body.append([plain(row.name), *power, *money, _value(row, resources.BREAK_EVEN)])
     shown = [place for place in range(len(COST)) if any(line[place] != ABSENT for line in body)]
     lines = tuple(Line(texts(line[place] for place in shown)) for line in body)
     return Table(tuple(Column(COST[place], place > 0) for place in shown), lines) if lines else None
@@ -111,8 +119,8 @@ def _of(memory: Measurement | None, usable: Measurement | None) -> str:
     return f"{memory.value / 1e3:.2g}/{usable.value / 1e3:.3g}"
 
 
-def _value(row: Row, name: str) -> str:
-    item = row.get(name, "predicted")
+def _value(row: Row, quantity: Quantity) -> str:
+    item = row.get(quantity, "predicted")
     return number(item.value, 2) if item is not None and item.known else ABSENT
 
 
@@ -135,7 +143,8 @@ def scatter(report: Report) -> Scatter | None:
             {"chosen": "ringed", "outside": "hollow"}.get(row.role, "dot"),
         )
         for row in report.rows
-        if (item := row.get("latency_p50", "predicted")) and item.known and (price := row.get("price", "predicted"))
+        if (item := row.get(LATENCY_P50, "predicted")) and item.known
+        and (price := row.get(resources.PRICE, "predicted"))
     ]  # fmt: skip
     if len(points) < 2:
         return None

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._view import ABSENT, AGAINST_BASELINE, SHOWN, UNDER, ranks_boards
+from vlatool.measures import tables as names
+from vlatool.render._view import ranks_boards
 from vlatool.render.cells import records_table
 from vlatool.render.document import Section, Table
 from vlatool.render.sections.parts import PARTS
-from vlatool.report import TRAINED, Report
+from vlatool.report import Report
+
+OTHER_SECTIONS = {
+    *PARTS, names.MISSING_VALUES, names.UNDER, names.EPISODE, names.AGAINST_BY_TASK, names.AGAINST_BY_INSTRUCTION,
+}  # fmt: skip
+"""What other sections draw."""
 
 
 class Details:
@@ -22,7 +28,6 @@ class Details:
 
 def tables(report: Report) -> list[Table]:
     """Return the tables, that of the telemetry first."""
-    titles = dict.fromkeys(("telemetry", *(title for row in report.rows for title in row.details)))
-    shown = (title for title in titles if title not in (ABSENT, *PARTS) and not title.startswith(TRAINED))
-    shown = (title for title in shown if title not in (UNDER, SHOWN) and not title.startswith(AGAINST_BASELINE))
+    titles = dict.fromkeys((names.TELEMETRY, *(title for row in report.rows for title in row.details)))
+    shown = (title for title in titles if title not in OTHER_SECTIONS and names.ROUNDS.part(title) is None)
     return [table for title in shown if (table := records_table(report, title))]

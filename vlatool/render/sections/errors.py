@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._format import label, plain
-from vlatool.render._view import error_groups
+from vlatool.render._format import plain
+from vlatool.render._view import elements
 from vlatool.render.cells import bars, number
 from vlatool.render.charts.svg import tinted
 from vlatool.render.document import Cell, Column, Line, Section, Table
@@ -17,16 +17,16 @@ class Errors:
 
     def build(self, report: Report) -> Iterator[Section]:
         """Return a dimension a line, a variant a column, and bars that compare the variants."""
-        for group, members in error_groups(report).items():
-            rows = [(row, css) for row, css in tinted(report.rows) if any(row.get(name) for name in members)]
+        for group, members in elements(report).items():
+            rows = [(row, css) for row, css in tinted(report.rows) if any(row.get(each) for each in members)]
             lines = []
-            for name in members:
-                items = [row.get(name) for row, _ in rows]
+            for each in members:
+                items = [row.get(each) for row, _ in rows]
                 drawn = map(number, items, bars(items, [css for _, css in rows]))
-                lines.append(Line((Cell(plain(name.partition(".")[2])), *drawn)))
+                lines.append(Line((Cell(plain(each.part)), *drawn)))
             heads = (Column("dimension", False), *(Column(plain(row.name), css=css) for row, css in rows))
             table = Table(heads, tuple(lines), style="small")
-            note = plain(next(item.note for row, _ in rows for name in members if (item := row.get(name))))
+            note = plain(next(item.note for row, _ in rows for each in members if (item := row.get(each))))
             about = f"{note[:1].upper()}{note[1:]}." if note else ""
-            title = f"Action {label(group)} by dimension"
+            title = f"Action {group} by dimension"
             yield Section(title, (table,), 80, "measured", about=about, brief=False, folded=True)

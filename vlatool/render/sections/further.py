@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._view import (
-    other_names,
-    percentile_names,
-    ranks_boards,
-    unmeasured,
-)
+from vlatool.render._view import further, percentiles, ranks_boards, unmeasured
 from vlatool.render.cells import matrix, remarks
 from vlatool.render.document import Block, Notes, Section
 from vlatool.report import Report
@@ -22,7 +17,7 @@ class Further:
         """Return the table, the methods, and the reasons for what is missing."""
         if ranks_boards(report):
             return
-        shown, elsewhere = other_names(report), percentile_names(report)
+        shown, elsewhere = further(report), {each.name for each in percentiles(report)}
         blocks: list[Block] = [matrix(report, shown, "measured")] if shown else []
         blocks += remarks(report, "measured", "Methods")
         if missing := unmeasured(report, lambda name: name not in elsewhere, further=True):

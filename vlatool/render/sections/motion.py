@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
+from vlatool.measures import series, tables
 from vlatool.render._format import plain
-from vlatool.render._view import BY_TASK, SHOWN, UNDER, motion_names
+from vlatool.render._view import motions
 from vlatool.render.cells import matrix, records_table
 from vlatool.render.charts.episode import Played, episode
 from vlatool.render.charts.samples import finite
@@ -23,9 +24,6 @@ ABOUT = (
 TASKS = "Success by task"
 CAPTION = "Dots: share of episodes that succeed, with its 95 % interval; the worst first."
 HELP = "Paths end at the dot; the actions of each step are below, and short marks show where a new chunk begins."
-EPISODE = "episode."
-AGAINST = "against the baseline, by task"
-INSTRUCTIONS = "against the baseline, by instruction"
 
 
 class Motion:
@@ -34,14 +32,17 @@ class Motion:
     def build(self, report: Report) -> Iterator[Section]:
         """Return one section, when episodes were played."""
         blocks: list[Block] = []
-        if shown := motion_names(report):
+        if shown := motions(report):
             blocks.append(matrix(report, shown, "measured"))
         if groups := _by_task(report):
             blocks.append(Chart(partial(shares, groups, TASKS, "task"), f"{TASKS}. {CAPTION}"))
         if chart := disturbed(report, CAPTION):
             blocks.append(chart)
-        tables = (records_table(report, title) for title in (AGAINST, INSTRUCTIONS, UNDER))
-        blocks += [table for table in tables if table]
+        found = (
+            records_table(report, title)
+            for title in (tables.AGAINST_BY_TASK, tables.AGAINST_BY_INSTRUCTION, tables.UNDER)
+        )
+        blocks += [table for table in found if table]
         blocks += _episode(report)
         if blocks:
             about = ABOUT if shown else ""
@@ -50,8 +51,8 @@ class Motion:
 
 def _episode(report: Report) -> list[Block]:
     """Return the drawing of the episode in which the variants differ most, and how it ended for each."""
-    played = [Played(plain(row.name), css, series) for row, css in tinted(report.rows) if (series := _series(row))]
-    table = records_table(report, SHOWN)
+    played = [Played(plain(row.name), css, steps) for row, css in tinted(report.rows) if (steps := _series(row))]
+    table = records_table(report, tables.EPISODE)
     if len(played) < 2 or table is None:
         return []
     title = "The episode in which the variants differ most"
@@ -60,17 +61,17 @@ def _episode(report: Report) -> list[Block]:
 
 def _series(row: Row) -> dict[str, list[float]]:
     """Return the steps of the episode that a row shows; nothing where one of them is no number."""
-    series = {name.removeprefix(EPISODE): list(values) for name, values in row.raw.items() if name.startswith(EPISODE)}
-    usable = all(values and len(finite(values)) == len(values) for values in series.values())
-    lengths = {len(values) for name, values in series.items() if name.startswith("position")}
-    return series if usable and "fresh" in series and len(lengths) < 2 else {}
+    steps = {step: list(row.raw[name]) for step, name in series.EPISODE.among(row.raw).items()}
+    usable = all(values and len(finite(values)) == len(values) for values in steps.values())
+    lengths = {len(values) for name, values in steps.items() if name.startswith("position")}
+    return steps if usable and "fresh" in steps and len(lengths) < 2 else {}
 
 
 def _by_task(report: Report) -> list[tuple[str, list[Share]]]:
     """Return task -> how often each variant succeeds, that with the worst variant first; nothing for one task."""
     groups: dict[str, list[Share]] = {}
     for row, css in tinted(report.rows):
-        for record in row.details.get(BY_TASK, ()):
+        for record in row.details.get(tables.BY_TASK, ()):
             if share := share_of(row.name, css, record.get("success"), record.get("episodes")):
                 groups.setdefault(plain(record.get("task", "")), []).append(share)
     return worst_first(groups) if len(groups) > 1 else []

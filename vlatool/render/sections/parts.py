@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from vlatool.measures import tables
 from vlatool.render.cells import records_table
 from vlatool.render.document import Section
 from vlatool.report import Report
 
-PARTS = {"memory by part": "MB", "time by phase": "share %", "cold start by part": "ms"}
+PARTS = {tables.MEMORY_PARTS: "MB", tables.PHASES: "share %", tables.START_PARTS: "ms"}
 """Title of a details table -> the column of which bars are drawn."""
 
 
@@ -17,5 +18,5 @@ class Parts:
 
     def build(self, report: Report) -> Iterator[Section]:
         """Return the tables that there are."""
-        if tables := tuple(table for title, key in PARTS.items() if (table := records_table(report, title, key))):
-            yield Section("Where memory and time go", tables, 70, "measured", brief=False, folded=True)
+        if found := tuple(table for title, key in PARTS.items() if (table := records_table(report, title, key))):
+            yield Section("Where memory and time go", found, 70, "measured", brief=False, folded=True)

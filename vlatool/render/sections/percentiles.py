@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+from vlatool.measures import Quantity
+from vlatool.measures.latency import LATENCY
 from vlatool.render._format import count, decimals_of, fixed, interval, number, plain
-from vlatool.render._view import percentile_names, unmeasured
+from vlatool.render._view import percentiles, unmeasured
 from vlatool.render.charts.svg import tinted
 from vlatool.render.document import ABSENT, Cell, Column, Line, Notes, Section, Table
 from vlatool.report import Measurement, Report, Row
@@ -17,26 +19,25 @@ class Percentiles:
 
     def build(self, report: Report) -> Iterator[Section]:
         """Return the table, and below it why a percentile could not be had."""
-        shown = percentile_names(report)
-        rows = [(row, css) for row, css in tinted(report.rows) if any(row.get(name) for name in shown)]
+        shown = percentiles(report)
+        rows = [(row, css) for row, css in tinted(report.rows) if any(row.get(each) for each in shown)]
         if not rows:
             return
-        items = {name: [row.get(name) for row, _ in rows] for name in shown}
+        items = {each: [row.get(each) for row, _ in rows] for each in shown}
         digits = [_decimals(column) for column in zip(*items.values(), strict=True)]
-        lines = tuple(Line((Cell(_short(name)), *map(_cell, items[name], digits))) for name in shown)
+        lines = tuple(
+            Line((Cell(LATENCY.pattern.part(each.name) or each.words), *map(_cell, items[each], digits)))
+            for each in shown
+        )
         bounded = any(cell.interval for line in lines for cell in line.cells)
         known = [item for line in items.values() for item in line if item is not None and item.known]
         heads = (Column("latency, ms", False), *(Column(plain(row.name), css=css) for row, css in rows))
         table = Table(heads, lines, beside=_title(known) if bounded else "", style="percentiles")
         variants = [row for row, _ in rows]
-        reasons = tuple(unmeasured(report, shown.__contains__))
+        reasons = tuple(unmeasured(report, {each.name for each in shown}.__contains__))
         about = _calls(report, variants, shown)
         blocks = (table, Notes(reasons)) if reasons else (table,)
         yield Section("Latency percentiles", blocks, 30, "measured", about=about, brief=len(rows) == 1)
-
-
-def _short(name: str) -> str:
-    return name.removeprefix("latency_")
 
 
 def _decimals(items: Sequence[Measurement | None]) -> int:
@@ -59,11 +60,11 @@ def _title(items: Sequence[Measurement]) -> str:
     return ("at most" if all(item.low is None for item in bounded) else "interval") + cover
 
 
-def _calls(report: Report, rows: Sequence[Row], shown: Sequence[str]) -> str:
+def _calls(report: Report, rows: Sequence[Row], shown: Sequence[Quantity]) -> str:
     """Return the number of calls, or of ticks of a control loop, in a sentence."""
     what = "ticks" if report.kind == "benchmark" and "hz" in report.limits else "calls"
     counts = {
-        plain(row.name): count(max(item.samples for name in shown if (item := row.get(name)))).removeprefix("n = ")
+        plain(row.name): count(max(item.samples for each in shown if (item := row.get(each)))).removeprefix("n = ")
         for row in rows
     }
     if len(set(counts.values())) == 1:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from vlatool.render._columns import board
 from vlatool.render._format import plain
-from vlatool.render._view import brackets, names, places, ranks_boards
+from vlatool.render._view import brackets, places, quantities, ranks_boards
 from vlatool.render.cells import matrix, remarks
 from vlatool.render.document import Section
 from vlatool.report import Report
@@ -18,7 +18,7 @@ class Predicted:
     def build(self, report: Report) -> Iterator[Section]:
         """Return a section for each profile."""
         for where in () if ranks_boards(report) else places(report, "predicted"):
-            table = matrix(report, names(report, "predicted", where), "predicted", where)
+            table = matrix(report, quantities(report, "predicted", where), "predicted", where)
             yield Section(
                 f"Predicted for {plain(where)}",
                 (table, *remarks(report, "predicted", where=where)),

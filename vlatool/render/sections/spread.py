@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
+from vlatool.measures.latency import LATENCY_P99
+from vlatool.measures.series import LATENCY
 from vlatool.render._columns import board
 from vlatool.render._format import count, plain
-from vlatool.render._view import latency, percentile_names
+from vlatool.render._view import latency, percentiles
 from vlatool.render.cells import number, texts
 from vlatool.render.charts.distribution import beyond, distribution
-from vlatool.render.charts.samples import SERIES_NAME, finite, left_out, sampled, sparkline
+from vlatool.render.charts.samples import finite, left_out, sampled, sparkline
 from vlatool.render.document import Cell, Chart, Column, Line, Section, Table
 from vlatool.report import Report
 
@@ -33,13 +35,13 @@ class Spread:
 
 
 def _blocks(report: Report) -> Table:
-    known = any((tail := row.get("latency_p99")) and tail.known for row in report.rows)
-    tails = known and not percentile_names(report)
+    known = any((tail := row.get(LATENCY_P99)) and tail.known for row in report.rows)
+    tails = known and not percentiles(report)
     lines = []
     for row in report.rows:
-        samples = finite(row.raw.get(SERIES_NAME) or [])
+        samples = finite(row.raw.get(LATENCY) or [])
         if len(samples) > 1:
-            tail = row.get("latency_p99") if tails else None
+            tail = row.get(LATENCY_P99) if tails else None
             last = number(tail) if tail else Cell(count(len(samples)))
             lines.append(Line((*texts((plain(row.name), sparkline(samples, 20))), last)))
     where = ", this host" if board(report) else ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+from vlatool.measures.latency import LATENCY_P50, LATENCY_P99, SPEEDUP
 from vlatool.render._columns import about, columns
 from vlatool.render._format import plain, quantity, span
 from vlatool.render._view import brackets, latency, place, places, ranks_boards, role
@@ -13,7 +14,6 @@ from vlatool.render.charts.svg import tinted
 from vlatool.render.document import Bar, Cell, Column, Line, Section, Table, Text
 from vlatool.report import Measurement, Report, Row
 
-LATENCY = "latency_p50"
 FAR = 2.5
 """A limit that is further away than this many times the longest bar is left out."""
 
@@ -32,10 +32,10 @@ class Variants:
         numbers = any(item.known for row in report.rows for item in row.measurements if item.origin == "measured")
         if not shown and numbers and not any(row.reason for row in report.rows):
             return  # what was measured stands in another section
-        heads = (Column(title, bars=name == LATENCY) for name, title in shown.items())
+        heads = (Column(title, bars=each == LATENCY_P50) for each, title in shown.items())
         lines = []
         for (row, css), bar in zip(tinted(report.rows), _bars(report), strict=True):
-            items = [row.get(name) for name in shown]
+            items = [row.get(each) for each in shown]
             where = next((item.where for item in items if item), "this host")
             note = f"on {place(report, where)}" if len(places(report, "measured")) > 1 else ""
             cells = (Cell(plain(row.name), note=note, css=css), *(_cell(row, item, bar, where) for item in items))
@@ -48,13 +48,13 @@ class Variants:
 
 def _cell(row: Row, item: Measurement | None, bar: Bar | None, where: str) -> Cell:
     """Return the cell of a number: latencies have a bar and their p99, what was measured elsewhere says so."""
-    beside, tail = row.get(LATENCY), row.get("latency_p99")
+    beside, tail = row.get(LATENCY_P50), row.get(LATENCY_P99)
     if item is None:
         return number(item)
-    if item.name == "speedup" and beside is not None and item.samples == beside.samples:
+    if item.name == SPEEDUP.name and beside is not None and item.samples == beside.samples:
         item = replace(item, samples=0)
     note = f"on {plain(item.where)}" if item.where != where else ""
-    if item.name != LATENCY:
+    if item.name != LATENCY_P50.name:
         return number(item, note=note)
     known = tail is not None and tail.known
     spoken = f"p99 {quantity(tail)}{f' ({span(tail)})' if span(tail) else ''}" if known and tail is not None else ""
@@ -62,7 +62,7 @@ def _cell(row: Row, item: Measurement | None, bar: Bar | None, where: str) -> Ce
 
 
 def _bars(report: Report) -> list[Bar | None]:
-    aim, items = latency(report), [row.get(LATENCY) for row in report.rows]
+    aim, items = latency(report), [row.get(LATENCY_P50) for row in report.rows]
     longest = max((reach(item) for item in items if item is not None), default=0.0)
-    near = aim.name == LATENCY and aim.limit is not None and aim.limit < FAR * longest
+    near = aim.quantity == LATENCY_P50 and aim.limit is not None and aim.limit < FAR * longest
     return bars(items, [css for _, css in tinted(report.rows)], aim.limit if near else None)

@@ -1,0 +1,1 @@
+"""Reports that were made apart, as one report: ``vlatool compare``."""
