@@ -14,7 +14,7 @@ from _qdq_reference import IMAGE, OPS, STYLES, X, close, conv, graph, quantized,
 from vlatool.errors import GraphError
 from vlatool.graph.layers import find_layers, hoisted, split_gemm
 from vlatool.graph.nodes import name_nodes
-from vlatool.quantize._reductions import keep_axes
+from vlatool.quantize.int8.reductions import keep_axes
 from vlatool.runtime.engines.openvino import OpenvinoSession
 
 

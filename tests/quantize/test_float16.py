@@ -12,9 +12,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.errors import DataError, GraphError, RecipeError
 from vlatool.graph.files import load, save
-from vlatool.quantize._float16_graph import around, look_at_weights, phase_nodes, to_float16
-from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize.float16 import Float16
+from vlatool.quantize.floats.float16_graph import around, look_at_weights, phase_nodes, to_float16
+from vlatool.quantize.floats.overflow import find_beyond
 from vlatool.sources.onnx import OnnxFile
 from vlatool.stage.base import Context
 

@@ -21,8 +21,15 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.hardware.profile import load_profile
 from vlatool.module.to_onnx import quiet_exporter
 from vlatool.module.torch_policy import load_modules, torch_policy
-from vlatool.quantize._blocks import METHODS, Format, Scratch, dequantize, planes_of_rows, quantize_planes
 from vlatool.quantize.qat import Qat
+from vlatool.quantize.streamed._block_quantization import (
+    METHODS,
+    Format,
+    Scratch,
+    dequantize,
+    planes_of_rows,
+    quantize_planes,
+)
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error

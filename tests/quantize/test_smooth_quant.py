@@ -12,8 +12,8 @@ from vlatool.bundle.manifest import Graph
 from vlatool.errors import BundleError, DataError, GraphError, RecipeError
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import find_layers
-from vlatool.quantize._smooth_groups import find_groups
-from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
+from vlatool.quantize.int8.smoothing_groups import find_groups
+from vlatool.quantize.int8.smoothing_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.quantize.smooth_quant import SmoothQuant, _Writer
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage.build import build_stage

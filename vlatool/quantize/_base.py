@@ -24,7 +24,7 @@ from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
 from vlatool.graph.precision import FLOATS
-from vlatool.quantize._not_finite import finite_layers
+from vlatool.quantize.calibration.non_finite import finite_layers
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of

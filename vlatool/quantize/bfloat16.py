@@ -10,7 +10,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.graph.files import load, save
 from vlatool.quantize._base import Quantization
-from vlatool.quantize._conv1x1 import use_convolutions
+from vlatool.quantize.int8.convolutions import use_convolutions
 from vlatool.runtime.engine import computing, engine_class
 from vlatool.stage.base import Context
 

@@ -17,11 +17,11 @@ from vlatool.graph.layers import check_opset
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.machine.risky import risky
 from vlatool.quantize._base import Quantization
-from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
-from vlatool.quantize._moments import recorded_moments
-from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize._trial_compile import open_apart
-from vlatool.quantize._underflow import find_small, too_small
+from vlatool.quantize.calibration.samples import recorded_moments
+from vlatool.quantize.floats.float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
+from vlatool.quantize.floats.overflow import find_beyond
+from vlatool.quantize.floats.underflow import find_small, too_small
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of

@@ -12,8 +12,8 @@ from vlatool.errors import require
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import Style, calibrated_values
 from vlatool.quantize._base import QUANTIZED_OPS, check_ops
-from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._float8_qdq import Float8Writer
+from vlatool.quantize._calibrated_base import Calibrated
+from vlatool.quantize.floats.float8_qdq import Float8Writer
 from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:

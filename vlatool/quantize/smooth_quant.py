@@ -16,12 +16,12 @@ from vlatool.errors import GraphError
 from vlatool.graph.files import foreign_errors, load, save
 from vlatool.graph.nodes import reads
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.quantize._calibrate import calibrate
-from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._moments import recorded_moments
-from vlatool.quantize._ranges import Statistics
-from vlatool.quantize._smooth_groups import Edit, Group, find_groups
-from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
+from vlatool.quantize._calibrated_base import Calibrated
+from vlatool.quantize.calibration.activation_statistics import calibrate
+from vlatool.quantize.calibration.ranges import Statistics
+from vlatool.quantize.calibration.samples import recorded_moments
+from vlatool.quantize.int8.smoothing_groups import Edit, Group, find_groups
+from vlatool.quantize.int8.smoothing_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.runtime.golden import load_golden
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of

@@ -31,14 +31,14 @@ from vlatool.quantize._base import (
     left_whole,
     reduced_on_this_host,
 )
-from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._conv1x1 import use_convolutions
-from vlatool.quantize._early import quantize_early
-from vlatool.quantize._frames import fold_frames
-from vlatool.quantize._integer_matmul import use_integer_matmul
-from vlatool.quantize._ranges import Statistics, choose_range
-from vlatool.quantize._reductions import keep_axes
+from vlatool.quantize._calibrated_base import Calibrated
 from vlatool.quantize._trial_compile import open_apart
+from vlatool.quantize.calibration.ranges import Statistics, choose_range
+from vlatool.quantize.int8.convolutions import use_convolutions
+from vlatool.quantize.int8.frame_normalization import fold_frames
+from vlatool.quantize.int8.integer_matmul import use_integer_matmul
+from vlatool.quantize.int8.quantizer_hoisting import quantize_early
+from vlatool.quantize.int8.reductions import keep_axes
 from vlatool.runtime.engine import (
     DEFAULT_ENGINE,
     STANDARD_LAYOUT,

@@ -22,12 +22,12 @@ from vlatool.graph.precision import precision_shares
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import takes_shards
 from vlatool.module.to_onnx import IMPORTS
-from vlatool.quantize._compute import records_of
-from vlatool.quantize._records import Record
-from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, weights_fingerprint
-from vlatool.quantize._stream import Written, work_root, write_records
-from vlatool.quantize._weight_options import WeightOptions
-from vlatool.quantize._weights_plan import WeightsPlan, make_plan
+from vlatool.quantize.streamed.graph_templates import BLOCKED_OPSET, skeletons_of, weights_fingerprint
+from vlatool.quantize.streamed.options import WeightOptions
+from vlatool.quantize.streamed.record_file import Written, work_root, write_records
+from vlatool.quantize.streamed.records import Record
+from vlatool.quantize.streamed.tensor_jobs import records_of
+from vlatool.quantize.streamed.weights_plan import WeightsPlan, make_plan
 from vlatool.runtime.engine import STANDARD_LAYOUT, class_for
 from vlatool.stage.base import Context, SampleSet, source_of
 from vlatool.stage.counted import counted_shares
@@ -173,7 +173,7 @@ class WeightOnly(WeightOptions):
 
     def _records(self, plan: WeightsPlan, bundle: Bundle, place: Path, samples: SampleSet | None) -> list[Record]:
         if samples is not None:
-            from vlatool.quantize._calibrated import calibrated_records
+            from vlatool.quantize.streamed.sequential_calibration import calibrated_records
 
             return calibrated_records(plan, bundle, self, place, samples)
         tolerance = self.form.largest_error

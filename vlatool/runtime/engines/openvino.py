@@ -216,8 +216,8 @@ class OpenvinoSession(Engine):
     def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
         """Return bfloat16 where the processor has it, and int8 with what is not quantized in that.
 
-        With matrix units (AMX) products are written as convolutions, too, as ``quantize._conv1x1`` says; where int8
-        products saturate, weights are such that none does.
+        With matrix units (AMX) products are written as convolutions, too, as ``quantize.int8.convolutions`` says; where
+        int8 products saturate, weights are such that none does.
         """
         plans: dict[str, Stages] = {}
         forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if has(*AMX) else {"": {}}

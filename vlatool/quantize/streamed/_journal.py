@@ -1,0 +1,105 @@
+"""Which records of a file are finished, so that a killed run is continued."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from vlatool.errors import SourceError
+from vlatool.quantize.streamed.records import Record
+from vlatool.weights.shards import Reader, StoredTensor, reading
+
+DATA, JOURNAL = "data", "journal"
+CHECKED_BYTES = 1 << 23
+
+
+class Journal:
+    """A line of JSON for each finished record, after one for the plan.
+
+    A line holds the figures of its record and the SHA-256 of the data up to its end, so that a record counts only when
+    all before it are whole too.
+
+    Args:
+        place: The work directory.
+        plan: Identifies everything that the bytes depend on.
+    """
+
+    def __init__(self, place: Path, plan: str) -> None:
+        self._path, self._data = place / JOURNAL, place / DATA
+        self._head = (json.dumps({"plan": plan}) + "\n").encode()
+        self._stream: Any = None
+
+    def resume(self, records: list[Record]) -> tuple[Any, list[dict[str, Any]]]:
+        """Return the running hash of the finished data and the figures of the finished records; cut off the rest."""
+        lines = self._path.read_bytes().splitlines(keepends=True) if self._path.is_file() else []
+        digest, offset, kept = hashlib.sha256(), 0, len(self._head)
+        notes: list[dict[str, Any]] = []
+        if not lines or lines[0] != self._head or not self._data.is_file():
+            self._path.write_bytes(self._head)
+            lines = []
+        with reading() as reader:
+            for record, line in zip(records, lines[1:], strict=False):
+                entry, ahead = _parsed(line), digest.copy()
+                if entry is None or not _is_whole(reader, self._data, offset, record.size, ahead, entry["sha256"]):
+                    break
+                digest = ahead
+                offset += record.size
+                notes.append(entry["note"])
+                kept += len(line)
+        self._data.touch()
+        os.truncate(self._data, offset)
+        self._stream = self._path.open("r+b")
+        self._stream.truncate(kept)
+        self._stream.seek(kept)
+        return digest, notes
+
+    def add(self, note: dict[str, Any], sha256: str) -> None:
+        """Note a record whose data is written: a killed process keeps it, a power cut what was flushed."""
+        self._stream.write((json.dumps({"sha256": sha256, "note": note}) + "\n").encode())
+        self._stream.flush()
+
+    def flush(self) -> None:
+        """Bring data and journal to the disk, in this order."""
+        handle = os.open(self._data, os.O_RDONLY)
+        try:
+            os.fdatasync(handle)
+        finally:
+            os.close(handle)
+        os.fdatasync(self._stream.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+
+def _parsed(line: bytes) -> dict[str, Any] | None:
+    """Return the entry of a line, None when it was cut off."""
+    try:
+        entry = json.loads(line)
+    except ValueError:
+        return None
+    return entry if line.endswith(b"\n") and isinstance(entry, dict) and {"sha256", "note"} <= set(entry) else None
+
+
+def _is_whole(reader: Reader, file: Path, offset: int, size: int, digest: Any, sha256: str) -> bool:
+    try:
+        hash_part(reader, file, offset, size, digest)
+    except SourceError:  # the file is shorter
+        return False
+    return bool(digest.hexdigest() == sha256)
+
+
+def hash_part(reader: Reader, file: Path, offset: int, size: int, digest: Any) -> None:
+    """Update a hash with part of a file, as it is on the disk.
+
+    Raises:
+        SourceError: when the file ends before.
+    """
+    part = StoredTensor(file.name, file, offset, "U8", (size,))
+    for begin in range(0, size, CHECKED_BYTES):
+        digest.update(reader.read(part, begin, min(CHECKED_BYTES, size - begin)).data)

@@ -1,0 +1,113 @@
+"""A part of a large file: what computes it, with what, and how it gets to its place."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import mmap
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.quantize.streamed._block_quantization import Scratch
+from vlatool.weights.shards import PAGE, Reader, open_direct
+
+Array = NDArray[Any]
+DIRECT = getattr(os, "O_DIRECT", 0)
+
+
+@dataclass
+class Tools:
+    """What one process computes with; reused from record to record.
+
+    Args:
+        read: Reader of the stored weights.
+        scratch: Buffers of the arithmetic.
+        buffer: Page-aligned memory for a record.
+    """
+
+    read: Reader = field(default_factory=Reader)
+    scratch: Scratch = field(default_factory=Scratch)
+    buffer: mmap.mmap | None = None
+
+    def record(self, size: int) -> Array:
+        """Return (size,) uint8 zeros that may be written past the page cache."""
+        if self.buffer is None or len(self.buffer) < size:
+            self.buffer = mmap.mmap(-1, size)
+        data = np.frombuffer(self.buffer, np.uint8, size)
+        data[:] = 0
+        return data
+
+
+Fill = Callable[[Tools, Array], dict[str, Any]]
+"""Fills the zeroed bytes of a record, (size,) uint8, and returns its figures as JSON values."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One part of the file.
+
+    Args:
+        name: Of the tensor or layer, for progress and messages.
+        size: Bytes; a multiple of the page size, so that it is written past the page cache.
+        fill: Computes it; a ``Job`` when it is portable.
+        weights: Parameters that it covers, for the progress.
+        portable: Whether another process can compute it.
+        verb: What is done to it, for the progress.
+    """
+
+    name: str
+    size: int
+    fill: Fill
+    weights: int = 0
+    portable: bool = True
+    verb: str = "quantized"
+
+
+def padded(size: int) -> int:
+    """Return ``size`` rounded up to whole pages."""
+    return -(-size // PAGE) * PAGE
+
+
+def compute(fill: Fill, size: int, file: Path, offset: int, tools: Tools) -> dict[str, Any]:
+    """Compute one record, write it to its place, and return its figures.
+
+    Raises:
+        OSError: when the disk is full.
+        VlatoolError: what ``fill`` raises.
+    """
+    data = tools.record(size)
+    note = fill(tools, data)
+    handle = open_direct(file, os.O_WRONLY | os.O_CREAT)
+    try:
+        _write(handle, data.data, offset)
+    finally:
+        os.close(handle)
+    return note
+
+
+def _write(handle: int, view: memoryview, offset: int) -> None:
+    """Write whole pages; through the page cache where the file system or a short write leaves no other way."""
+    done = 0
+    while done < len(view):
+        try:
+            done += os.pwrite(handle, view[done:], offset + done)
+        except OSError as error:
+            if error.errno != errno.EINVAL or not _is_direct(handle):
+                raise
+            _through_cache(handle)
+        if done % PAGE:
+            _through_cache(handle)
+
+
+def _is_direct(handle: int) -> bool:
+    return bool(DIRECT and fcntl.fcntl(handle, fcntl.F_GETFL) & DIRECT)
+
+
+def _through_cache(handle: int) -> None:
+    fcntl.fcntl(handle, fcntl.F_SETFL, fcntl.fcntl(handle, fcntl.F_GETFL) & ~DIRECT)
