@@ -14,7 +14,7 @@ from _qdq_reference import IMAGE, OPS, STYLES, X, close, conv, graph, quantized,
 from vlatool.errors import GraphError
 from vlatool.graph.layers import find_layers, hoisted, split_gemm
 from vlatool.graph.nodes import name_nodes
-from vlatool.quantize.int8.reductions import keep_axes
+from vlatool.quantize.int8.reductions import keep_reduced_axes
 from vlatool.runtime.engines.openvino import OpenvinoSession
 
 
@@ -136,7 +136,7 @@ def test_reductions_are_computed_right_by_openvino(kind: str, before: str, tmp_p
     wide = {"x": (-4.0, 4.0), "m": (-150.0, 150.0) if kind == "ReduceSum" else (-40.0, 40.0)}
     model, _ = quantized(graph(text, **known), style, wide)
     wanted = run(model, x=x)["y"]
-    assert keep_axes(model) == 1
+    assert keep_reduced_axes(model) == 1
     onnx.checker.check_model(model, full_check=True)
     np.testing.assert_array_equal(run(model, x=x)["y"], wanted)
     onnx.save(model, tmp_path / "a.onnx")
@@ -147,13 +147,13 @@ def test_reductions_are_computed_right_by_openvino(kind: str, before: str, tmp_p
 def test_reductions_of_older_opsets_and_those_that_keep_their_axes() -> None:
     x = weight(4, 6, seed=3)
     old = graph("(float[4,6] x) => (float[4] y) { y = ReduceMean<axes=[1], keepdims=0>(x) }", opset=13)
-    assert keep_axes(old) == 1
+    assert keep_reduced_axes(old) == 1
     close(run(old, x=x)["y"], x.mean(1))
     everything = graph("(float[4,6] x) => (float y) { y = ReduceMean<keepdims=0>(x) }")
-    assert keep_axes(everything) == 1
+    assert keep_reduced_axes(everything) == 1
     close(run(everything, x=x)["y"], x.mean())
     for kept in ("y = ReduceMean(x)", "y = ReduceMean<keepdims=1>(x)", "y = Relu(x)"):
-        assert keep_axes(graph(f"(float[4,6] x) => (float[a,b] y) {{ {kept} }}")) == 0
+        assert keep_reduced_axes(graph(f"(float[4,6] x) => (float[a,b] y) {{ {kept} }}")) == 0
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
 from vlatool.prune._selection import Selection, protected_parts
-from vlatool.prune.depth import PROTECTED, Depth, spread
+from vlatool.prune.depth import PROTECTED, Depth, evenly_spaced
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
@@ -92,7 +92,7 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
     assert of_parts.protects("trunk2.blocks")
     assert not of_parts.protects("trunk3")
     assert not of_parts.has(("trunk2.blocks",))
-    assert Selection(("trunk2.blocks",), (), PROTECTED, of_parts.parts).has(("trunk2.blocks",))
+    assert Selection(("trunk2.blocks",), (), PROTECTED, of_parts.parts).selects(("trunk2.blocks",))
     protects = Selection((), (), PROTECTED).protects
     assert protects("model.lm_expert.layers")
     assert protects("model.vision_tower.layers")
@@ -128,7 +128,7 @@ def test_blocks_that_are_named_stay(source_bundle: Bundle, keep: object, stay: t
     (4, 1, [0]), (4, 2, [0, 3]), (5, 3, [0, 2, 4]), (16, 8, [0, 2, 4, 6, 9, 11, 13, 15]), (3, 3, [0, 1, 2]),
 ])  # fmt: skip
 def test_even_keeps_both_ends(size: int, count: int, numbers: list[int]):
-    assert spread(size, count) == numbers
+    assert evenly_spaced(size, count) == numbers
 
 
 def test_even_takes_no_run(source_bundle: Bundle):

@@ -213,7 +213,7 @@ def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operato
 
 
 def test_convolutions_are_full_range_or_less():
-    with pytest.raises(RecipeError, match="The layout ort has no use for convolutions") as caught:
+    with pytest.raises(RecipeError, match="The layout ort does not use convolutions") as caught:
         StaticInt8(convolutions=True).check(None, None)
     assert caught.value.fix == "use layout openvino"
 

@@ -11,7 +11,7 @@ from _recurrent import LENGTH, exported, recorded
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import calibration_recording
 from vlatool.quantize.calibration.activation_statistics import calibrate
-from vlatool.quantize.calibration.samples import led_to, recorded_moments
+from vlatool.quantize.calibration.samples import recorded_moments, samples_with_state
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.streamed import sequential_calibration
@@ -70,7 +70,7 @@ def test_weights_are_rounded_by_what_layers_are_given_along_an_episode(tmp_path:
     bundle = exported(tmp_path / "sum", "sum", count=0)
     recording = calibration_recording(bundle, ones(tmp_path / "ones.npz", 2))
     moments = recorded_moments(bundle, recording, [0, 3, LENGTH, 2 * LENGTH - 1], SampleSet())
-    kept = [values["memory"].tolist() for _, values in led_to(bundle, moments)]
+    kept = [values["memory"].tolist() for _, values in samples_with_state(bundle, moments)]
     assert kept == [[[0, 0]], [[3, 3]], [[0, 0]], [[LENGTH - 1, LENGTH - 1]]]
 
 

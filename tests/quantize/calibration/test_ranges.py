@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from _full import small_or_full
 
-from vlatool.quantize.calibration.ranges import BINS, CLIPPED, LEVELS, PER_SAMPLE, Method, Statistics, choose_range
+from vlatool.quantize.calibration.ranges import (
+    BINS,
+    LEVELS,
+    MAX_CLIPPED_ENERGY,
+    MAX_SAMPLED_ELEMENTS,
+    Method,
+    Statistics,
+    choose_range,
+)
 
 METHODS: tuple[Method, ...] = ("minmax", "percentile", "entropy", "mse")
 
@@ -108,7 +116,7 @@ def test_large_tensors_are_seen_in_every_channel(shape: tuple[int, ...]) -> None
     values.flat[1] = 900.0
     found = of(values)
     assert found.high == 900.0
-    assert PER_SAMPLE // 3 < found.counts.sum() <= PER_SAMPLE
+    assert MAX_SAMPLED_ELEMENTS // 3 < found.counts.sum() <= MAX_SAMPLED_ELEMENTS
     seen = np.unique(np.floor(found.centres()[found.counts > 0]))
     assert len(seen) >= min(60, shape[-1])
 
@@ -209,7 +217,7 @@ def slow_entropy(values: np.ndarray, statistics: Statistics) -> float:
     counts = [a + b for a, b in zip(above, below, strict=True)]
     energy = [count * (i + 0.5) ** 2 for i, count in enumerate(counts)]
     last = max((i for i, count in enumerate(counts) if count), default=-1) + 1
-    first = next(i + 1 for i in range(half) if sum(energy[i + 1 :]) <= CLIPPED * sum(energy))
+    first = next(i + 1 for i in range(half) if sum(energy[i + 1 :]) <= MAX_CLIPPED_ENERGY * sum(energy))
     best, threshold = math.inf, last
     for stop in range(max(128, first), last + 1, 8):
         p = counts[:stop]
@@ -264,7 +272,7 @@ def test_entropy_is_not_decided_by_zeros_and_keeps_what_matters(kind: str, symme
     normal = np.random.default_rng(5).standard_normal(50_000)
     values = SPARSE[kind](normal).astype(np.float32)
     low, high = choose_range(of(values), "entropy", 99, symmetric, unsigned=True)
-    assert error(values, low, high) < 5 * CLIPPED * float((values.astype(np.float64) ** 2).sum())
+    assert error(values, low, high) < 5 * MAX_CLIPPED_ENERGY * float((values.astype(np.float64) ** 2).sum())
 
 
 @pytest.mark.parametrize("seed", range(small_or_full(6, 20)))

@@ -10,8 +10,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.graph.layers import Style, find_layers
 from vlatool.graph.qdq import insert_qdq
-from vlatool.quantize.int8.frame_normalization import fold_frames
-from vlatool.quantize.int8.quantizer_hoisting import quantize_early
+from vlatool.quantize.int8.frame_normalization import fold_normalization
+from vlatool.quantize.int8.quantizer_hoisting import hoist_quantizers
 
 RANDOM = np.random.default_rng(0)
 FRAME = RANDOM.integers(0, 256, (1, 8, 8, 3)).astype(np.uint8)
@@ -50,7 +50,7 @@ def run(made: onnx.ModelProto) -> list[np.ndarray]:
 
 def folded(made: onnx.ModelProto, names: tuple[str, ...] = ("make y",)) -> dict[str, tuple[float, float]]:
     before = run(made)
-    found = fold_frames(made, names)
+    found = fold_normalization(made, names)
     for got, wanted in zip(run(made), before, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-4)
     return found
@@ -88,7 +88,7 @@ def test_padding_becomes_a_border_of_pixels(way, pads):
     """The mean is no whole pixel, so that the border is off by half a pixel at most, as quantized zeros would be."""
     made = model(*WAYS[way], ("Conv", "t w bias", "y", {"strides": [2, 2], "pads": pads}))
     (before,) = run(made)
-    ((_, (low, high)),) = fold_frames(made, ("make y",)).items()
+    ((_, (low, high)),) = fold_normalization(made, ("make y",)).items()
     assert high - low == 255
     (after,) = run(made)
     assert after.shape == before.shape
@@ -148,10 +148,10 @@ def test_only_convolutions_that_are_named_are_changed():
 def test_a_folded_frame_is_quantized_as_the_pixels_that_it_is(way, pads):
     made = model(*WAYS[way], ("Conv", "t w bias", "y", {"strides": [2, 2], "pads": pads}))
     (wanted,) = run(made)
-    ranges = fold_frames(made, ("make y",))
+    ranges = fold_normalization(made, ("make y",))
     style = Style(fused_convolutions=True)
     insert_qdq(made, find_layers(made, ("Conv",)), ranges, style)
-    quantize_early(made)
+    hoist_quantizers(made)
     assert "QuantizeLinear" not in kinds(made), "pixels need no quantizer"
     assert "Cast" not in kinds(made)
     (got,) = run(made)

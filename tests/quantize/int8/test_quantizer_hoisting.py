@@ -8,7 +8,7 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.quantize.int8.quantizer_hoisting import quantize_early
+from vlatool.quantize.int8.quantizer_hoisting import hoist_quantizers
 
 RANDOM = np.random.default_rng(0)
 FRAME = RANDOM.integers(0, 256, (1, 4, 4, 3)).astype(np.uint8)
@@ -44,7 +44,7 @@ def raised(*nodes: Any, outputs: tuple[str, ...] = ("y",)) -> list[Any]:
     )  # fmt: skip
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
     before = run(model)
-    quantize_early(model)
+    hoist_quantizers(model)
     for got, wanted in zip(run(model), before, strict=True):
         np.testing.assert_array_equal(got, wanted)
     return list(model.graph.node)

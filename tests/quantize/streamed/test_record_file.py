@@ -19,17 +19,17 @@ from vlatool.errors import GraphError, OutputError, SourceError
 from vlatool.files import work
 from vlatool.files.work import work_directory
 from vlatool.quantize.streamed import record_file
-from vlatool.quantize.streamed._block_quantization import Format
+from vlatool.quantize.streamed._block_quantization import BlockFormat
 from vlatool.quantize.streamed._graph_rewrite import Task, copy_task, weight_task
 from vlatool.quantize.streamed._journal import DATA, JOURNAL
 from vlatool.quantize.streamed._worker import serve
 from vlatool.quantize.streamed.record_file import write_records
 from vlatool.quantize.streamed.records import Record
-from vlatool.quantize.streamed.tensor_jobs import Job, records_of
+from vlatool.quantize.streamed.tensor_jobs import Job, records_for
 from vlatool.stage.base import Tell
 from vlatool.weights.shards import StoredTensor, fingerprint, read_header, read_shards, reading, stored_array
 
-FORM = Format()
+FORM = BlockFormat()
 
 
 class LayerLike:
@@ -59,7 +59,7 @@ def records(shard: Path) -> list[Record]:
         task: Task = (
             weight_task(layer, tensor, FORM, "ort", False) if quantized else copy_task(tensor.name, tensor, True)
         )
-        found += records_of(task, FORM, "searched", FORM.largest_error)
+        found += records_for(task, FORM, "searched", FORM.largest_error)
     return found
 
 
@@ -67,13 +67,13 @@ def silent(_what: str, _share: float | None) -> None:
     pass
 
 
-def write(parts: list[Record], place: Path, processes: int = 0, plan: str = "a", tell=silent) -> record_file.Written:
+def write(parts: list[Record], place: Path, processes: int = 0, plan: str = "a", tell=silent) -> record_file.RecordFile:
     with work_directory(place):
         return write_records(parts, plan, place, processes, tell)
 
 
 @pytest.fixture
-def reference(shard, tmp_path) -> record_file.Written:
+def reference(shard, tmp_path) -> record_file.RecordFile:
     return write(records(shard), tmp_path / "work" / "reference")
 
 
@@ -213,7 +213,7 @@ def test_a_loss_beyond_the_bits_is_an_error(shard, tmp_path):
     tensor = next(each for each in read_header(shard) if each.name == "layer.0")
     task = weight_task(LayerLike("layer.0", 128, 64), tensor, FORM, "ort", False)
     with pytest.raises(GraphError, match=r"Quantizing 'layer\.0' .* loses 0\.0\d+ of its norm; allowed: 0\.01"):
-        write(records_of(task, FORM, "rtn", 0.01), tmp_path / "work" / "a")
+        write(records_for(task, FORM, "rtn", 0.01), tmp_path / "work" / "a")
 
 
 def test_a_worker_ends_with_its_parent(tmp_path):

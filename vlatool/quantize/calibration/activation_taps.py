@@ -1,4 +1,4 @@
-"""Run a policy on recorded observations while chosen values inside its graphs are looked at; none of them is kept."""
+"""Run a policy on recorded observations and observe selected values inside its graphs, without storing them."""
 
 from __future__ import annotations
 
@@ -20,92 +20,92 @@ from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context
 
-SAMPLE_OR_POLICY = "remove that sample from the recording, or correct the policy where it may come"
-SAMPLE = "Calibration sample"
+SAMPLE_FIX = "remove that sample from the recording, or correct the policy where it may come"
+SAMPLE_LABEL = "Calibration sample"
 
 
-class Watcher:
-    """A session of a graph with further outputs, which the program does not see.
+class ActivationTap:
+    """A session of a graph with additional outputs, which are hidden from the program.
 
     Args:
-        path: The graph; large weights stay where they are.
-        copy: Where it is written with the further outputs.
-        show: Adds them.
+        path: File of the graph; large weights stay in their files.
+        copy: Path of the copy with additional outputs.
+        add_outputs: Function that adds the outputs.
     """
 
-    def __init__(self, path: Path, copy: Path, show: Callable[[OnnxGraph], None]) -> None:
+    def __init__(self, path: Path, copy: Path, add_outputs: Callable[[OnnxGraph], None]) -> None:
         graph = OnnxGraph(require("onnx", "build").load(str(path), load_external_data=False))
         self.sample = 0
-        self.counts = True
+        self.observing = True
         self._outputs = [value.name for value in graph.graph.output]
-        show(graph)
-        self._about = f"the graph '{path.stem}' with further outputs"
-        with risky(engine_class(), f"opened {self._about}"):
+        add_outputs(graph)
+        self._description = f"the graph '{path.stem}' with additional outputs"
+        with risky(engine_class(), f"opened {self._description}"):
             self._session = engine_class()(write_beside(graph.model, path, copy), 1)
 
-    def watch(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
-        """Look at what one run was fed and gave."""
+    def observe(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+        """Observe inputs and outputs of one run."""
         raise NotImplementedError
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run, look at the values, return the graph's own outputs."""
-        with risky(engine_class(), f"ran {self._about}"):
+        """Run the graph, observe the values, return the graph's own outputs."""
+        with risky(engine_class(), f"ran {self._description}"):
             values = self._session.run(feeds)
-        if self.counts:
-            self.watch(feeds, values)
+        if self.observing:
+            self.observe(feeds, values)
         return {name: values[name] for name in self._outputs}
 
 
-class _Passing(ObservationEncoder):
-    """An encoder that hands on what is encoded already."""
+class _PreEncoded(ObservationEncoder):
+    """An encoder that passes encoded observations through."""
 
     def __init__(self, encode: ObservationEncoder) -> None:
         self.names, self._encode = encode.names, encode
 
     def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Encode an observation, as ``ObservationEncoder`` does, where that is to be done."""
+        """Encode an observation as ``ObservationEncoder`` does, unless it is encoded already."""
         return observation if isinstance(observation, Encoded) else self._encode(observation)
 
 
-def run_watched(
+def run_with_taps(
     bundle: Bundle,
-    watchers: Mapping[str, Watcher],
+    taps: Mapping[str, ActivationTap],
     observations: Iterable[Mapping[str, Any] | Moment],
     context: Context,
-    what: str,
+    activity: str,
     numbers: Sequence[int] = (),
 ) -> None:
-    """Run a policy whose graphs are watched.
+    """Run a policy with taps on its graphs.
 
     Args:
         bundle: A float32 bundle.
-        watchers: Graph name -> session; graphs without one run as they are.
-        observations: Raw ones, or as the graphs take them (``Encoded``), consumed one at a time. Of moments, those that
-            do not count are not watched, and where an episode begins the policy forgets what it kept.
-        context: For progress.
-        what: Is being done, before the words "sample 3".
-        numbers: What messages call the observations: their places in the recording; counted from 0 when empty.
+        taps: Graph name -> session; graphs without one run unchanged.
+        observations: Raw ones, or encoded for the graphs (``Encoded``), consumed one at a time. Moments that do not
+            count are not observed, and the policy is reset where an episode begins.
+        context: Receiver of progress.
+        activity: Description of the work in progress messages, before the words "sample 3".
+        numbers: Indices of the observations in the recording, for messages; counted from 0 when empty.
 
     Raises:
-        DataError: when an observation does not fit the spec, or a watcher refuses a value; names the sample.
+        DataError: when an observation does not fit the spec, or a tap refuses a value; names the sample.
     """
     graphs = bundle.manifest.graphs
-    others = {name: open_graph(bundle, graphs[name], engine_class(), 1) for name in graphs if name not in watchers}
-    policy = Policy(bundle, Program(bundle.manifest.program, {**others, **watchers}, seed=0), DEFAULT_ENGINE)
-    policy.encode = _Passing(policy.encode)
-    for place, each in enumerate(observations):
-        moment = each if isinstance(each, Moment) else Moment(each, numbers[place] if numbers else place)
+    others = {name: open_graph(bundle, graphs[name], engine_class(), 1) for name in graphs if name not in taps}
+    policy = Policy(bundle, Program(bundle.manifest.program, {**others, **taps}, seed=0), DEFAULT_ENGINE)
+    policy.encode = _PreEncoded(policy.encode)
+    for index, each in enumerate(observations):
+        moment = each if isinstance(each, Moment) else Moment(each, numbers[index] if numbers else index)
         number = moment.number
-        if place % 8 == 0:
-            context.tell(f"{what} sample {number}", place / len(numbers) if place < len(numbers) else None)
-        for watcher in watchers.values():
-            watcher.sample, watcher.counts = number, moment.counts
+        if index % 8 == 0:
+            context.tell(f"{activity} sample {number}", index / len(numbers) if index < len(numbers) else None)
+        for tap in taps.values():
+            tap.sample, tap.observing = number, moment.counts
         if moment.begins:
             policy.reset(number)
         try:
-            with off_the_robot("what was recorded", SAMPLE_OR_POLICY):
+            with off_the_robot("what was recorded", SAMPLE_FIX):
                 policy.infer(moment.observation)
         except (GraphError, DataError) as error:
-            if error.message.startswith(SAMPLE):
+            if error.message.startswith(SAMPLE_LABEL):
                 raise
-            raise DataError(f"{SAMPLE} {number}: {error.message}", error.fix) from error
+            raise DataError(f"{SAMPLE_LABEL} {number}: {error.message}", error.fix) from error

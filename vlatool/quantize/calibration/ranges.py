@@ -1,4 +1,4 @@
-"""Ranges of activations from statistics that are collected as the values stream by."""
+"""Ranges of activations from streamed statistics."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Method = Literal["minmax", "percentile", "entropy", "mse"]
 
 BINS = 4096
 """Bins of a histogram over [-radius, radius)."""
-PER_SAMPLE = 1 << 16
-"""Elements of one tensor of one sample that enter its histogram, at an even stride; the extremes see all of them."""
+MAX_SAMPLED_ELEMENTS = 1 << 16
+"""Elements of one tensor of one sample that enter its histogram, at an even stride; the extremes cover all elements."""
 LEVELS = 256
-CLIPPED = 1e-3
-"""Share of the squared values that ``entropy`` may cut off: divergence alone would give up rare large ones, such as the
-peaks of a softmax, for many small ones."""
+MAX_CLIPPED_ENERGY = 1e-3
+"""Share of the squared values that ``entropy`` may clip: divergence alone would sacrifice rare large values, such as
+the peaks of a softmax, for many small ones."""
 
 
 @dataclass
@@ -30,8 +30,8 @@ class Statistics:
     bins in pairs, so one pass is enough and the order of the samples does not matter beyond the choice of elements.
 
     Args:
-        channels: Whether the largest magnitude of each entry of the last axis is kept too.
-        finite: False once a value was NaN or infinite where that is allowed: then there is no range.
+        channels: Whether the largest magnitude of each entry of the last axis is collected, too.
+        finite: False once a value was NaN or infinite where that is allowed: then the activation has no range.
     """
 
     channels: bool = False
@@ -45,7 +45,7 @@ class Statistics:
     finite: bool = True
 
     def add(self, values: Array) -> None:
-        """Take in one tensor of any shape, finite float."""
+        """Add one tensor of any shape, finite float."""
         flat = values.reshape(-1)
         if not flat.size:
             return
@@ -58,13 +58,13 @@ class Statistics:
         largest = max(abs(low), abs(high))
         if largest > 0:
             self._grow(largest)
-        chosen = flat[:: _stride(flat.size)]
-        self.zeros += len(chosen) - int(np.count_nonzero(chosen))
+        sampled = flat[:: _stride(flat.size)]
+        self.zeros += len(sampled) - int(np.count_nonzero(sampled))
         if not self.radius:  # zeros alone so far; their bin is the same at every radius
-            self.counts[BINS // 2] += len(chosen)
+            self.counts[BINS // 2] += len(sampled)
             return
-        places = ((chosen.astype(np.float64) + self.radius) * (BINS / (2 * self.radius))).astype(np.int64)
-        self.counts += np.bincount(np.clip(places, 0, BINS - 1), minlength=BINS)
+        bins = ((sampled.astype(np.float64) + self.radius) * (BINS / (2 * self.radius))).astype(np.int64)
+        self.counts += np.bincount(np.clip(bins, 0, BINS - 1), minlength=BINS)
 
     def _grow(self, largest: float) -> None:
         radius = 2.0 ** math.frexp(largest)[1]
@@ -77,17 +77,17 @@ class Statistics:
             self.radius *= 2
 
     def centres(self) -> NDArray[np.float64]:
-        """Middles of the bins."""
+        """Return the centres of the bins."""
         width = 2 * self.radius / BINS
         return (np.arange(BINS, dtype=np.float64) + 0.5) * width - self.radius
 
 
 def _stride(size: int) -> int:
-    """Return a stride that leaves at most ``PER_SAMPLE`` elements and meets every index of every axis.
+    """Return a stride that leaves at most ``MAX_SAMPLED_ELEMENTS`` elements and meets every index of every axis.
 
     A stride that shares a factor with the number of channels would see the same few channels in every row.
     """
-    stride = max(1, -(-size // PER_SAMPLE))
+    stride = max(1, -(-size // MAX_SAMPLED_ELEMENTS))
     while math.gcd(stride, size) > 1:
         stride += 1
     return stride
@@ -99,13 +99,13 @@ def choose_range(
     """Return (low, high) that an activation is quantized over.
 
     Args:
-        statistics: What was seen.
+        statistics: Statistics of the activation.
         method: ``minmax``: the extremes. ``percentile``: the central share of the values. ``entropy``: the clipping
             with the least Kullback-Leibler divergence (Migacz, 8-bit Inference with TensorRT, GTC 2017). ``mse``: the
             clipping with the least expected squared error.
         percentile: Share in percent, for ``percentile``.
         symmetric: Whether the range is mirrored at zero.
-        unsigned: Whether a range that is never negative is left as it is, even when symmetric.
+        unsigned: Whether a range that is never negative stays one-sided, even when symmetric.
     """
     low, high = statistics.low, statistics.high
     symmetric = symmetric and not (unsigned and low >= 0)
@@ -173,25 +173,25 @@ def _least_squares(statistics: Statistics, symmetric: bool) -> tuple[float, floa
 def _entropy(statistics: Statistics) -> float:
     """Return the threshold on magnitudes whose 128-level quantization loses the least information."""
     half = BINS // 2
-    counts = _informative(statistics.counts[half:]) + _informative(statistics.counts[:half][::-1])
+    counts = _side_counts(statistics.counts[half:]) + _side_counts(statistics.counts[:half][::-1])
     last = int(np.nonzero(counts)[0][-1]) + 1 if counts.any() else 0
     levels = LEVELS // 2
     if last <= levels:
         return max(-statistics.low, statistics.high)
-    best, chosen = math.inf, last
+    best, best_stop = math.inf, last
     for stop in range(_first_stop(counts, levels), last + 1, 8):
         loss = _divergence(counts, stop, levels)
         if loss < best:
-            best, chosen = loss, stop
+            best, best_stop = loss, stop
     width = statistics.radius / half
-    return min(chosen * width, max(-statistics.low, statistics.high))
+    return min(best_stop * width, max(-statistics.low, statistics.high))
 
 
-def _informative(side: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return counts of magnitudes with no more in the first bin than in the second.
+def _side_counts(side: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return counts of magnitudes, the first bin limited to the second.
 
-    Zero is a level of every range, so the zeros that a ReLU or a mask makes lose nothing by any; their number would
-    decide the divergence nevertheless. TensorRT's calibrator leaves the first bin out, too.
+    Zero is a level of every range, so the zeros of a ReLU or a mask are exact in any of them; their number would still
+    dominate the divergence. TensorRT's calibrator ignores the first bin, too.
     """
     counts = side.astype(np.float64)
     counts[0] = min(counts[:2])
@@ -199,10 +199,10 @@ def _informative(side: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _first_stop(counts: NDArray[np.float64], levels: int) -> int:
-    """Return the first bin, from ``levels``, beyond which at most ``CLIPPED`` of the squared magnitudes lie."""
+    """Return the first bin, from ``levels``, with at most ``MAX_CLIPPED_ENERGY`` of the squared magnitudes above it."""
     energy = counts * (np.arange(len(counts)) + 0.5) ** 2
     beyond = energy.sum() - np.cumsum(energy)
-    return max(levels, int(np.argmax(beyond <= CLIPPED * energy.sum())) + 1)
+    return max(levels, int(np.argmax(beyond <= MAX_CLIPPED_ENERGY * energy.sum())) + 1)
 
 
 def _divergence(counts: NDArray[np.float64], stop: int, levels: int) -> float:
@@ -219,5 +219,5 @@ def _divergence(counts: NDArray[np.float64], stop: int, levels: int) -> float:
     if total <= 0 or rounded <= 0:
         return math.inf
     p, q = clipped / total, quantized / rounded
-    seen = p > 0
-    return float(np.sum(p[seen] * np.log(p[seen] / np.maximum(q[seen], 1e-12))))
+    nonzero = p > 0
+    return float(np.sum(p[nonzero] * np.log(p[nonzero] / np.maximum(q[nonzero], 1e-12))))

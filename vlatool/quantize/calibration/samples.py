@@ -1,4 +1,4 @@
-"""What a policy is given while its activations are looked at: samples, and what leads to them where it keeps values."""
+"""Samples for a policy under calibration, with the observations before them where it keeps values."""
 
 from __future__ import annotations
 
@@ -13,31 +13,33 @@ from vlatool.runtime.policy import Policy
 from vlatool.stage.base import SampleSet
 
 
-def recorded_moments(bundle: Bundle, recording: Recording, numbers: Sequence[int], seen: SampleSet) -> Iterator[Moment]:
-    """Yield recorded samples; each after those before it in its episode, for a policy that keeps values.
+def recorded_moments(
+    bundle: Bundle, recording: Recording, numbers: Sequence[int], samples: SampleSet
+) -> Iterator[Moment]:
+    """Yield recorded samples; for a policy that keeps values, each after the earlier ones of its episode.
 
     Args:
-        bundle: Of the policy.
-        recording: Its observations.
-        numbers: Of the samples, ascending.
-        seen: Takes the hash of each sample that goes by.
+        bundle: Bundle of the policy.
+        recording: Recording of observations.
+        numbers: Indices of the samples, ascending.
+        samples: Collector of the hash of each sample.
     """
     keeps = keeps_values(bundle.manifest.program)
     plain = (Moment(recording.observation(number), number) for number in numbers)
-    return _hashed(recording.along(numbers) if keeps else plain, seen)
+    return _hash_samples(recording.along(numbers) if keeps else plain, samples)
 
 
-def played_moments(bundle: Bundle, seen: SampleSet) -> list[Moment]:
-    """Return what a training kept of its episodes, in order; none where it kept none."""
+def played_moments(bundle: Bundle, samples: SampleSet) -> list[Moment]:
+    """Return the observations of episodes that a training saved, in order; empty without any."""
     keeps = keeps_values(bundle.manifest.program)
     moments = (Moment(each, row, each.begins and keeps) for row, each in enumerate(played_observations(bundle)))
-    return list(_hashed(moments, seen))
+    return list(_hash_samples(moments, samples))
 
 
-def led_to(bundle: Bundle, moments: Iterable[Moment]) -> Iterator[tuple[Mapping[str, Any], dict[str, Any]]]:
-    """Yield the samples that count, each with what the policy, as it is, keeps before it: value name -> array.
+def samples_with_state(bundle: Bundle, moments: Iterable[Moment]) -> Iterator[tuple[Mapping[str, Any], dict[str, Any]]]:
+    """Yield the samples that count, each with the state that the unquantized policy keeps before it: name -> array.
 
-    A policy that keeps nothing is not run.
+    A policy without state is not run.
     """
     policy: Policy | None = None
     for moment in moments:
@@ -51,8 +53,8 @@ def led_to(bundle: Bundle, moments: Iterable[Moment]) -> Iterator[tuple[Mapping[
             policy.infer(moment.observation)
 
 
-def _hashed(moments: Iterable[Moment], seen: SampleSet) -> Iterator[Moment]:
+def _hash_samples(moments: Iterable[Moment], samples: SampleSet) -> Iterator[Moment]:
     for moment in moments:
         if moment.counts:
-            next(seen.watch([moment.observation]))
+            next(samples.watch([moment.observation]))
         yield moment

@@ -1,4 +1,4 @@
-"""Find the values of a policy that grow beyond what a narrower float type holds, on recorded observations."""
+"""Find the values of a policy that overflow a narrower float type, on recorded observations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.quantize.calibration.activation_taps import Watcher, run_watched
+from vlatool.quantize.calibration.activation_taps import ActivationTap, run_with_taps
 from vlatool.stage.base import Context
 
 PEAKS = "vlatool.peaks"
@@ -21,11 +21,11 @@ ZERO, ONE = "vlatool.zero", "vlatool.one"
 
 
 @dataclass
-class Beyond:
+class Overflow:
     """A value that is too large.
 
     Args:
-        sample: The first observation that makes it so.
+        sample: First observation on which it overflows.
         largest: Its largest finite magnitude over all observations.
     """
 
@@ -33,16 +33,16 @@ class Beyond:
     largest: float
 
 
-class _Watching(Watcher):
-    """Notes the values that are too large, from the largest magnitude of every value."""
+class _PeakTap(ActivationTap):
+    """Records the values that are too large, from the largest magnitude of every value."""
 
     def __init__(self, path: Path, copy: Path, limit: float) -> None:
-        self.beyond: dict[str, Beyond] = {}
+        self.overflows: dict[str, Overflow] = {}
         self._limit = limit
         self._names: list[str] = []
-        super().__init__(path, copy, self._show)
+        super().__init__(path, copy, self._add_peaks)
 
-    def _show(self, graph: OnnxGraph) -> None:
+    def _add_peaks(self, graph: OnnxGraph) -> None:
         """Add the largest finite magnitude of each float32 value, as one output."""
         self._names = graph.float_values()
         peaks = [f"{PEAKS}.{number}" for number in range(len(self._names))]
@@ -63,35 +63,35 @@ class _Watching(Watcher):
         graph.add(ONE, [1], np.int64)
         graph.graph.output.append(graph.onnx.ValueInfoProto(name=PEAKS))
 
-    def watch(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
-        """Take in the peaks."""
+    def observe(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+        """Update the overflows."""
         peaks = np.asarray(values.get(PEAKS, ()))
         for index in np.flatnonzero(peaks > self._limit):
-            known = self.beyond.setdefault(self._names[index], Beyond(self.sample, 0.0))
+            known = self.overflows.setdefault(self._names[index], Overflow(self.sample, 0.0))
             known.largest = max(known.largest, float(peaks[index]))
 
 
-def find_beyond(
+def find_overflows(
     bundle: Bundle,
     graphs: Iterable[str],
     observations: Iterable[Mapping[str, Any] | Moment],
     limit: float,
     context: Context,
-) -> dict[str, dict[str, Beyond]]:
-    """Return graph -> value -> where it goes beyond ``limit``; infinity does not count, every float type has it.
+) -> dict[str, dict[str, Overflow]]:
+    """Return graph -> value -> where it exceeds ``limit``; infinity does not count, since every float type has it.
 
     Args:
         bundle: A float32 bundle.
-        graphs: Names of the graphs that are watched.
-        observations: Raw observations, consumed one at a time; see ``run_watched``.
+        graphs: Names of the observed graphs.
+        observations: Raw observations, consumed one at a time; see ``run_with_taps``.
         limit: Largest finite magnitude that is allowed.
-        context: For progress.
+        context: Receiver of progress.
 
     Raises:
         DataError: when an observation does not fit the spec; names the sample.
     """
     files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in graphs}
     with scratch_directory() as scratch:
-        watchers = {graph: _Watching(file, scratch / f"{graph}.onnx", limit) for graph, file in files.items()}
-        run_watched(bundle, watchers, observations, context, "looking for large values in")
-    return {graph: watcher.beyond for graph, watcher in watchers.items()}
+        taps = {graph: _PeakTap(file, scratch / f"{graph}.onnx", limit) for graph, file in files.items()}
+        run_with_taps(bundle, taps, observations, context, "looking for large values in")
+    return {graph: tap.overflows for graph, tap in taps.items()}

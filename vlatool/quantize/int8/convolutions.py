@@ -1,9 +1,9 @@
 """Products with weights as 1 x 1 convolutions over padded rows, which OpenVINO computes faster on matrix units (AMX).
 
 A product of M rows is a convolution over an image of 1 x M pixels. Matrix units take rows in tiles of 16; OpenVINO's
-convolution uses them better than its matrix product does, above all when the tiles are full. A row never looks at
-another one in a product, in an elementwise operator or in the normalisation of rows, so that rows are added once and
-stay until something mixes rows (attention); what they hold is never read.
+convolution uses them better than its matrix product does, above all when the tiles are full. Rows are independent in a
+product, in an elementwise operator and in a normalisation of rows, so padding is added once and stays until an operator
+mixes rows (attention); its content is never read.
 """
 
 from __future__ import annotations
@@ -15,44 +15,43 @@ import numpy as np
 
 from vlatool.graph.nodes import read_names, reads
 from vlatool.graph.onnx_graph import FLOAT
-from vlatool.quantize.int8._value_forms import Forms, Names
+from vlatool.quantize.int8._value_forms import FormNames, ValueForms
 
-FEWEST = 32
-"""Rows from which a product is written as a convolution; fewer are a matter of memory, not of arithmetic."""
-FUSED = frozenset({"Gelu", "Relu", "Sigmoid", "Tanh", "Mul", "QuantizeLinear", "DequantizeLinear"})
-"""Operators that OpenVINO computes within the convolution that they follow, or over its pixels as they lie."""
-BY_ROW = FUSED | {"Add", "Sub", "Div", "Pow", "Sqrt", "Reciprocal", "Neg", "Erf", "Clip", "Cast"}
-"""Operators that compute each element by itself."""
-SMALL = 1e-30
-"""A bias that changes no sum. With a bias OpenVINO scales an int8 convolution's sums within it; without one (zeros are
-removed) it does so after copying them as float32."""
+MIN_ROWS = 32
+"""Fewest rows of a product that becomes a convolution; with fewer rows it is bound by memory, not by arithmetic."""
+FUSED_OPS = frozenset({"Gelu", "Relu", "Sigmoid", "Tanh", "Mul", "QuantizeLinear", "DequantizeLinear"})
+"""Operators that OpenVINO fuses into the convolution before them, or computes in its pixel layout."""
+ROWWISE_OPS = FUSED_OPS | {"Add", "Sub", "Div", "Pow", "Sqrt", "Reciprocal", "Neg", "Erf", "Clip", "Cast"}
+"""Elementwise operators."""
+NEGLIGIBLE_BIAS = 1e-30
+"""A bias too small to change a sum. With a bias, OpenVINO scales the sums of an int8 convolution inside its kernel;
+without one (zeros are removed) it scales them after copying them as float32."""
 
 
 def use_convolutions(model: Any) -> int:
-    """Rewrite the products of a weight and at least ``FEWEST`` rows in place; return how many there were.
+    """Rewrite the products of a weight and at least ``MIN_ROWS`` rows in place; return their number.
 
-    A product keeps the name of its node, and takes the bias that is added next into itself. What depends on a symbolic
-    shape stays as it is.
+    A product keeps the name of its node and absorbs a following bias. Values of symbolic shape stay unchanged.
 
     Args:
         model: An ``onnx.ModelProto`` of opset 13 or later: float32, or with QDQ operators.
     """
-    return _Rewriter(model).rewrite()
+    return _ConvolutionRewriter(model).rewrite()
 
 
-class _Rewriter(Forms):
+class _ConvolutionRewriter(ValueForms):
     def __init__(self, model: Any) -> None:
         super().__init__(model)
-        self.merged: set[str] = set()
+        self.merged_biases: set[str] = set()
         self.count = 0
 
     def rewrite(self) -> int:
         """Rebuild the list of nodes."""
         stored = set(self.constants)
         for node in self.graph.node:
-            if node.output[0] in self.merged:
+            if node.output[0] in self.merged_biases:
                 continue
-            if not (self._product(node) or self._in_pixels(node) or self._in_padded(node)):
+            if not (self._as_convolution(node) or self._as_pixels(node) or self._as_padded(node)):
                 for name in reads(node):
                     self.rows(name)
                 self.nodes.append(node)
@@ -72,9 +71,9 @@ class _Rewriter(Forms):
 
     # ---- what is rewritten
 
-    def _product(self, node: Any) -> bool:
+    def _as_convolution(self, node: Any) -> bool:
         options = self.attributes(node)
-        if node.op_type not in ("MatMul", "Gemm") or self.height(node.input[0]) < FEWEST:
+        if node.op_type not in ("MatMul", "Gemm") or self.row_count(node.input[0]) < MIN_ROWS:
             return False
         if options.get("transA", 0) or options.get("alpha", 1.0) != 1.0 or options.get("beta", 1.0) != 1.0:
             return False
@@ -88,20 +87,20 @@ class _Rewriter(Forms):
         if not bias:
             value, bias = self._with_bias(value, channels)
         if not bias and node.input[1] not in self.constants:
-            bias = self.add(f"{value}/bias", np.full(channels, SMALL, np.float32))
+            bias = self.add(f"{value}/bias", np.full(channels, NEGLIGIBLE_BIAS, np.float32))
         image = f"{value}/pixels"
         self.append("Conv", [self.pixels(node.input[0]), weight, *([bias] if bias else [])], image, node.name)
-        self.forms[value] = Names("pixels", pixels=image)
+        self.forms[value] = FormNames("pixels", pixels=image)
         self.count += 1
         return True
 
     def _with_bias(self, value: str, channels: int) -> tuple[str, str]:
-        """Return what a product gives with the bias that is added next, and that bias; empty when there is none."""
+        """Return the output of a product after a following bias, and that bias; empty without a bias."""
         readers = self.readers[value]
         if len(readers) == 1 and readers[0].op_type == "Add" and value not in self.outputs:
             others = [name for name in readers[0].input if name != value]
             if len(others) == 1 and self._is_vector(others[0], channels):
-                self.merged.add(readers[0].output[0])
+                self.merged_biases.add(readers[0].output[0])
                 return readers[0].output[0], others[0]
         return value, ""
 
@@ -109,7 +108,7 @@ class _Rewriter(Forms):
         return self.is_weight(name) and list(self.constants[name].dims) == [channels]
 
     def _weight(self, name: str, *, output_first: bool) -> str:
-        """Return a weight (N, K, 1, 1) made of one (K, N), or (N, K); empty when the value is not a weight."""
+        """Return a weight (N, K, 1, 1) from one of (K, N) or (N, K); empty when the value is not a weight."""
         image = f"{name}/{'nk' if output_first else 'kn'}"
         if name in self.constants:
             return self._image_of(name, image, output_first) if self.is_weight(name, rank=2) else ""
@@ -133,51 +132,51 @@ class _Rewriter(Forms):
         values = self.array(name)
         return self.add(image, (values if output_first else values.T)[:, :, None, None])
 
-    def _in_pixels(self, node: Any) -> bool:
-        """Write an elementwise operator after a convolution as one of pixels."""
-        value, moving = node.output[0], [name for name in node.input if name and name not in self.constants]
-        if node.op_type not in FUSED or not any(self.native(name) == "pixels" for name in moving):
+    def _as_pixels(self, node: Any) -> bool:
+        """Apply an elementwise operator after a convolution to pixels."""
+        value, activations = node.output[0], [name for name in node.input if name and name not in self.constants]
+        if node.op_type not in FUSED_OPS or not any(self.native(name) == "pixels" for name in activations):
             return False
-        if self._mixed_next(node):
+        if self._feeds_row_mixing(node):
             return False
-        if any(self.shapes.get(name, "?") != self.shapes.get(value) for name in moving):
+        if any(self.shapes.get(name, "?") != self.shapes.get(value) for name in activations):
             return False
         if any(name in self.constants and math.prod(self.constants[name].dims) != 1 for name in node.input):
             return False
-        inputs = [self.pixels(name) if name in moving else self.number(name) for name in node.input]
+        inputs = [self.pixels(name) if name in activations else self.number(name) for name in node.input]
         self.copy(node, inputs, f"{value}/pixels")
-        self.forms[value] = Names("pixels", pixels=f"{value}/pixels")
+        self.forms[value] = FormNames("pixels", pixels=f"{value}/pixels")
         return True
 
-    def _in_padded(self, node: Any) -> bool:
-        """Let an operator that works on each row by itself work on more rows."""
-        value, high = node.output[0], self.height(node.output[0])
+    def _as_padded(self, node: Any) -> bool:
+        """Apply an operator with independent rows to the padded form."""
+        value, rows = node.output[0], self.row_count(node.output[0])
         inputs = [name for name in node.input if name]
-        if len(node.output) != 1 or not high or not any(self.native(name) in ("padded", "pixels") for name in inputs):
+        if len(node.output) != 1 or not rows or not any(self.native(name) in ("padded", "pixels") for name in inputs):
             return False
-        if self._mixed_next(node):
+        if self._feeds_row_mixing(node):
             return False
-        moving = [name for name in inputs if self.height(name) == high]
-        leading = {self.shapes[name][:-1] for name in (*moving, value)}
-        if len(leading) != 1 or not self._by_row(node, [name for name in inputs if name not in moving]):
+        activations = [name for name in inputs if self.row_count(name) == rows]
+        leading = {self.shapes[name][:-1] for name in (*activations, value)}
+        if len(leading) != 1 or not self._is_rowwise(node, [name for name in inputs if name not in activations]):
             return False
         padded = self.padded_name(value)
-        copy = self.copy(node, [self.padded(name) if name in moving else name for name in node.input], padded)
-        self._last_axis(copy)
-        self.forms[value] = Names("padded", rows=value if padded == value else "", padded=padded)
+        copy = self.copy(node, [self.padded(name) if name in activations else name for name in node.input], padded)
+        self._set_last_axis(copy)
+        self.forms[value] = FormNames("padded", rows=value if padded == value else "", padded=padded)
         return True
 
-    def _mixed_next(self, node: Any) -> bool:
-        """Say whether a quantization serves what mixes rows: then they are dropped before it, so that it stays near."""
+    def _feeds_row_mixing(self, node: Any) -> bool:
+        """Return whether a quantizer feeds an operator that mixes rows: padding is then dropped before it."""
         if node.op_type not in ("QuantizeLinear", "DequantizeLinear"):
             return False
         readers = self.readers[node.output[0]]
         if node.op_type == "QuantizeLinear":
             readers = [reader for dequantize in readers for reader in self.readers[dequantize.output[0]]]
-        return not any(reader.op_type in ("MatMul", "Gemm", *BY_ROW) for reader in readers)
+        return not any(reader.op_type in ("MatMul", "Gemm", *ROWWISE_OPS) for reader in readers)
 
-    def _by_row(self, node: Any, others: list[str]) -> bool:
-        """Say whether an operator computes each row by itself; ``others`` are inputs that are the same for all rows."""
+    def _is_rowwise(self, node: Any, others: list[str]) -> bool:
+        """Return whether an operator computes rows independently; ``others``: inputs shared by all rows."""
         last = (-1, len(self.shapes.get(node.input[0], ())) - 1)
         if node.op_type == "LayerNormalization":
             return self.attributes(node).get("axis", -1) in last and all(name in self.constants for name in others)
@@ -186,15 +185,15 @@ class _Rewriter(Forms):
             if len(node.input) > 1 and node.input[1] in self.constants:
                 axes = self.array(node.input[1]).tolist()
             return len(axes) == 1 and axes[0] in last and self.attributes(node).get("keepdims", 1) == 1
-        if node.op_type not in BY_ROW:
+        if node.op_type not in ROWWISE_OPS:
             return False
         shapes = [self.shapes.get(name, (0, 0)) for name in others]
         if node.op_type in ("QuantizeLinear", "DequantizeLinear"):
             return all(math.prod(shape) == 1 for shape in shapes)
         return all(len(shape) <= 3 and math.prod(shape[:-1]) == 1 for shape in shapes)
 
-    def _last_axis(self, node: Any) -> None:
-        """Name the last axis in a way that holds for any number of axes."""
+    def _set_last_axis(self, node: Any) -> None:
+        """Write the last axis as -1, which holds for any rank."""
         for item in node.attribute:
             if item.name == "axis":
                 item.i = -1

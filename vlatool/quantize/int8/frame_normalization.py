@@ -1,12 +1,12 @@
 """Fold the normalisation of a camera frame into the convolution that reads it.
 
-``(pixel - mean) / std`` in front of a convolution is the convolution with other weights and another bias. Over a whole
-frame those products and sums cost more than they look, and quantizing their result costs accuracy: the pixels
-themselves are uint8 already. One level, near the mean of all channels, stays subtracted: it is the zero point of the
-quantized frame. Without it each weight's rounding error would be multiplied by the mean of the frame.
+``(pixel - mean) / std`` in front of a convolution equals the convolution with other weights and another bias. Over a
+whole frame those products and sums are expensive, and quantizing their result costs accuracy: the pixels themselves are
+uint8 already. One level, near the mean of all channels, is still subtracted: it is the zero point of the quantized
+frame. Without it the rounding error of each weight would be multiplied by the mean of the frame.
 
-Where the convolution pads, the frame gets a border of pixels that are what zeros are after the normalisation: each
-channel's mean, rounded to a whole pixel as quantizing it would.
+Where the convolution pads, the frame gets a border of the pixels that the normalisation maps to zero: the mean of each
+channel, rounded to an integer as a quantizer would.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from vlatool.graph.onnx_graph import OnnxGraph
 
 Array = NDArray[Any]
 ARITHMETIC = {"Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide}
-UNEVEN = 4.0
-"""Largest ratio of two channels' scales: beyond it their weights would need different steps."""
+MAX_SCALE_RATIO = 4.0
+"""Largest ratio of the scales of two channels: beyond it their weights would need different steps."""
 
 
-def fold_frames(model: Any, convolutions: Collection[str]) -> dict[str, tuple[float, float]]:
-    """Fold normalisations in place, where a frame of uint8 reaches a convolution through nothing else.
+def fold_normalization(model: Any, convolutions: Collection[str]) -> dict[str, tuple[float, float]]:
+    """Fold normalisations in place, where nothing else lies between a uint8 frame and a convolution.
 
     Args:
         model: An ``onnx.ModelProto``.
         convolutions: Names of the nodes that may be changed.
 
     Returns:
-        Value that such a convolution reads -> its range, which is that of pixels: 255 steps of 1.
+        Input of such a convolution -> its range, which is that of pixels: 255 steps of 1.
     """
-    folder = _Folder(model)
+    folder = _NormalizationFolder(model)
     ranges: dict[str, tuple[float, float]] = {}
     for node in list(model.graph.node):
         zero = folder.fold(node) if node.op_type == "Conv" and node.name in convolutions else None
@@ -44,9 +44,9 @@ def fold_frames(model: Any, convolutions: Collection[str]) -> dict[str, tuple[fl
     return ranges
 
 
-class _Folder(OnnxGraph):
+class _NormalizationFolder(OnnxGraph):
     def fold(self, convolution: Any) -> int | None:
-        """Fold what is before a convolution; return the level that stays subtracted, None when it cannot be folded."""
+        """Fold the normalisation before a convolution; return the level still subtracted, None when impossible."""
         chain = self._chain(convolution)
         arithmetic = [node for node in chain if node.op_type in ARITHMETIC]
         pads = self._pads(convolution)
@@ -59,20 +59,20 @@ class _Folder(OnnxGraph):
         if len(scale) != weight.shape[1] or (any(pads) and not ((border >= 0) & (border <= 255)).all()):
             return None
         zero = int(np.clip(np.rint(np.mean(-shift / scale)), 0, 255))
-        self._rewrite(convolution, weight, scale, shift + scale * zero)
+        self._write_weights(convolution, weight, scale, shift + scale * zero)
         for node in arithmetic:
             self._bypass(node)
         pixels, centred = chain[0].output[0], f"{convolution.name}.frame"
         self.replace_reads(pixels, centred)
         level = self.add(f"{convolution.name}.pixels.level", [zero], np.float32)
-        place = list(self.graph.node).index(chain[0]) + 1
-        self.graph.node.insert(place, self.node("Sub", [pixels, level], [centred], f"{convolution.name}/frame"))
+        position = list(self.graph.node).index(chain[0]) + 1
+        self.graph.node.insert(position, self.node("Sub", [pixels, level], [centred], f"{convolution.name}/frame"))
         if any(pads):
-            self._surround(chain, pads, border, convolution)
+            self._add_border(chain, pads, border, convolution)
         return zero
 
     def _chain(self, convolution: Any) -> list[Any]:
-        """Return the nodes from a frame's Cast to a convolution; none when others read what is between."""
+        """Return the nodes from the Cast of a frame to a convolution; none when others read the values in between."""
         chain: list[Any] = []
         value, uint8 = convolution.input[0], self.onnx.TensorProto.UINT8
         while True:
@@ -90,14 +90,14 @@ class _Folder(OnnxGraph):
                 return []
 
     def _varying(self, node: Any) -> str:
-        """Return the operand that is not a constant; nothing when neither is, or a constant is divided."""
+        """Return the operand that is not a constant; empty when both vary, or a constant is divided."""
         left, right = node.input
         if right in self.constants:
             return str(left)
         return str(right) if left in self.constants and node.op_type in ("Add", "Mul") else ""
 
     def _pads(self, convolution: Any) -> list[int] | None:
-        """Return the padding of a convolution with constant weights of one group, two axes; None of any other."""
+        """Return the padding of a 2-D convolution with constant weights of one group; None for any other."""
         options = self.attributes(convolution)
         constant = all(name in self.constants for name in convolution.input[1:] if name)
         explicit = options.get("auto_pad", b"NOTSET") in (b"NOTSET", b"VALID")
@@ -106,11 +106,11 @@ class _Folder(OnnxGraph):
         return pads if plain and len(pads) == 4 and min(pads) >= 0 else None
 
     def _affine(self, chain: list[Any]) -> tuple[Array, Array] | None:
-        """Return scale and shift of each channel, float64 (C,), when the chain does the same to all its pixels."""
+        """Return scale and shift of each channel, float64 (C,), when the chain treats all its pixels alike."""
         shape = self.shapes.get(chain[0].input[0], ())
         if len(shape) != 4 or not all(shape) or chain[0].output[0] in self.outputs:
             return None
-        black, white = (self._through(chain[1:], np.full(shape, level, np.float64)) for level in (0.0, 1.0))
+        black, white = (self._apply(chain[1:], np.full(shape, level, np.float64)) for level in (0.0, 1.0))
         if black is None or white is None:
             return None
         per_channel = [np.moveaxis(frame, 1, 0).reshape(frame.shape[1], -1) for frame in (white - black, black)]
@@ -119,9 +119,9 @@ class _Folder(OnnxGraph):
         scale, shift = (pixels[:, 0] for pixels in per_channel)
         sizes = np.abs(scale)
         even = np.isfinite(sizes).all() and np.isfinite(shift).all() and sizes.min() > 0
-        return (scale, shift) if even and sizes.max() <= UNEVEN * sizes.min() else None
+        return (scale, shift) if even and sizes.max() <= MAX_SCALE_RATIO * sizes.min() else None
 
-    def _through(self, nodes: list[Any], values: Array) -> Array | None:
+    def _apply(self, nodes: list[Any], values: Array) -> Array | None:
         for node in nodes:
             if node.op_type == "Transpose":
                 values = values.transpose(self.attributes(node).get("perm"))
@@ -134,8 +134,8 @@ class _Folder(OnnxGraph):
                 return None
         return values
 
-    def _rewrite(self, convolution: Any, weight: Array, scale: Array, shift: Array) -> None:
-        """Give a convolution weights and bias of its own that read pixels."""
+    def _write_weights(self, convolution: Any, weight: Array, scale: Array, shift: Array) -> None:
+        """Give a convolution new weights and a new bias for pixels."""
         spread = (1, -1, *[1] * (weight.ndim - 2))
         bias = (weight * shift.reshape(spread)).sum(axis=tuple(range(1, weight.ndim)))
         if len(convolution.input) > 2 and convolution.input[2]:
@@ -145,20 +145,20 @@ class _Folder(OnnxGraph):
         convolution.input[2:] = [self.add(f"{name}.bias", bias, np.float32)]
 
     def _bypass(self, node: Any) -> None:
-        """Let the one reader of a node read what the node reads."""
+        """Connect the only reader of a node to the input of the node."""
         self.replace_reads(node.output[0], self._varying(node))
         self.graph.node.remove(node)
 
-    def _surround(self, chain: list[Any], pads: list[int], border: Array, convolution: Any) -> None:
-        """Join a frame with a border of pixels, and let the convolution pad no more.
+    def _add_border(self, chain: list[Any], pads: list[int], border: Array, convolution: Any) -> None:
+        """Add a border of pixels to a frame, instead of the padding of the convolution.
 
         Args:
-            chain: From the Cast to the convolution.
+            chain: Nodes from the Cast to the convolution.
             pads: Rows and columns before, rows and columns after.
             border: A pixel, (C,).
-            convolution: Its padding is taken away.
+            convolution: Node that loses its padding.
         """
-        axes = np.arange(4)  # which axis of the frame each axis of what the convolution reads is
+        axes = np.arange(4)  # axis of the frame for each axis of the convolution's input
         for node in (node for node in chain if node.op_type == "Transpose"):
             axes = axes[self.attributes(node).get("perm", [3, 2, 1, 0])]
         value, shape = chain[0].input[0], list(self.shapes[chain[0].input[0]])

@@ -1,7 +1,7 @@
-"""Reductions that drop their axes, written so that OpenVINO computes them right in an int8 graph.
+"""Reductions that drop their axes, rewritten so that OpenVINO computes them correctly in an int8 graph.
 
-OpenVINO (2026.4 on x86) gives wrong values, without a word, where a layer reads the quantized output of ReduceMean,
-ReduceSum or ReduceMax with ``keepdims=0``. With the axes kept and dropped by a Squeeze it computes what it should.
+OpenVINO (2026.4 on x86) silently returns wrong values where a layer reads the quantized output of ReduceMean, ReduceSum
+or ReduceMax with ``keepdims=0``. With kept axes and a Squeeze after them the values are right.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Any
 from vlatool.graph.onnx_graph import OnnxGraph
 
 
-def keep_axes(model: Any) -> int:
-    """Rewrite every ``Reduce*`` with ``keepdims=0`` as one that keeps its axes, and a Squeeze; return how many."""
+def keep_reduced_axes(model: Any) -> int:
+    """Rewrite every ``Reduce*`` with ``keepdims=0`` as one that keeps its axes, and a Squeeze; return their number."""
     graph, nodes, count = OnnxGraph(model), [], 0
     for node in model.graph.node:
         nodes.append(node)

@@ -1,4 +1,4 @@
-"""Put block-quantized weights into an ONNX graph, and list what has to be computed for them."""
+"""Put block-quantized weights into an ONNX graph, and list the computations for them."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from vlatool.quantize.streamed._block_quantization import Format
+from vlatool.quantize.streamed._block_quantization import BlockFormat
 from vlatool.weights.shards import FLOATS, StoredTensor
 
 if TYPE_CHECKING:
-    from vlatool.quantize.streamed._weightless_export import Skeleton
+    from vlatool.quantize.streamed._weightless_export import GraphTemplate
 
-DOMAIN = "com.microsoft"
-ALIGNED = 64
-INLINE = 1024
-"""Bytes up to which a constant stays in the graph."""
+ORT_DOMAIN = "com.microsoft"
+ALIGNMENT = 64
+MAX_INLINE_BYTES = 1024
+"""Largest constant that stays in the graph, in bytes."""
 PART_BYTES = 1 << 24
-"""Bytes of a record of a tensor that is not quantized."""
+"""Bytes of each record of a tensor that is not quantized."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Product:
 
 @dataclass(frozen=True)
 class Piece:
-    """A tensor of the new graph: its place within its record.
+    """A tensor of the new graph within its record.
 
     Args:
-        name: Of the initializer.
-        dtype: Of ``onnx_ir.DataType``, by name.
+        name: Name of the initializer.
+        dtype: Name of an ``onnx_ir.DataType``.
         shape: Sizes of the axes.
         offset: First byte within the record.
-        size: Bytes.
+        size: Size in bytes.
     """
 
     name: str
@@ -64,17 +64,17 @@ class Piece:
 
 @dataclass(frozen=True)
 class Task:
-    """What becomes of one stored tensor.
+    """Conversion of one stored tensor.
 
     Args:
-        source: Where its bytes are.
+        source: Location of its bytes.
         kind: ``blocks`` (MatMulNBits), ``qdq`` or ``copy``.
-        pieces: The tensors that it becomes.
+        pieces: Tensors of the result.
         label: Name of the layer, for reports.
         rows, columns: Inputs (K) and outputs (N) of the layer, when it is quantized.
         output_first: Whether the weight is stored as (N, K).
-        dtype: Of the copy: ``F32``, ``F16`` or the source's own.
-        scaled: Whether the weight is multiplied by a vector over its inputs first (AWQ); the vector is the last piece.
+        dtype: Type of the copy: ``F32``, ``F16`` or that of the source.
+        scaled: Whether the weight is first multiplied by a vector over its inputs (AWQ), which is then the last piece.
     """
 
     source: StoredTensor
@@ -93,54 +93,54 @@ class Task:
         return max(piece.offset + piece.size for piece in self.pieces)
 
 
-def products_of(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Product]:
-    """Yield the products of activations with a two-dimensional float constant, their second operand."""
+def find_products(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Product]:
+    """Yield the products of activations with a two-dimensional float constant as second operand."""
     for node in model.graph:
         if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
             continue
-        if not _takes_rows(node.inputs[0]):
+        if not _is_activation_matrix(node.inputs[0]):
             continue
         attributes = {name: attribute.value for name, attribute in node.attributes.items()}
         plain = attributes.get("alpha", 1.0) == attributes.get("beta", 1.0) == 1.0 and not attributes.get("transA")
-        operand, turned = node.inputs[1], bool(attributes.get("transB"))
-        if turns_constant(operand.producer()):
-            operand, turned = operand.producer().inputs[0], not turned
+        operand, transposed = node.inputs[1], bool(attributes.get("transB"))
+        if transposes_constant(operand.producer()):
+            operand, transposed = operand.producer().inputs[0], not transposed
         tensor = tensors.get(operand.name) if operand is not None and operand.is_initializer() else None
         if tensor is None or len(tensor.shape) != 2 or tensor.dtype not in FLOATS or not plain:
             continue
-        rows, columns = tensor.shape[::-1] if turned else tensor.shape
+        rows, columns = tensor.shape[::-1] if transposed else tensor.shape
         bias = node.inputs[2] if len(node.inputs) > 2 else None
-        yield Product(node, operand.name, rows, columns, turned, bias)
+        yield Product(node, operand.name, rows, columns, transposed, bias)
 
 
-def _takes_rows(operand: Any) -> bool:
-    """Whether an operand is activations of two axes or more; a product of two constants is computed once."""
+def _is_activation_matrix(operand: Any) -> bool:
+    """Return whether an operand is an activation of two axes or more; products of two constants are computed once."""
     return not operand.is_initializer() and (operand.shape is None or len(operand.shape) > 1)
 
 
-def turns_constant(node: Any) -> bool:
-    """Whether a node is the transposition of a matrix that is a constant."""
+def transposes_constant(node: Any) -> bool:
+    """Return whether a node transposes a constant matrix."""
     if node is None or node.op_type != "Transpose" or not node.inputs[0].is_initializer():
         return False
     axes = node.attributes.get("perm")
     return axes is None or list(axes.value) == [1, 0]
 
 
-def read_as_weight(use: Any, layers: Container[int]) -> bool:
-    """Whether one of the layers, or a transposition that nothing but their weights read, is what uses a constant.
+def is_weight_use(use: Any, layers: Container[int]) -> bool:
+    """Return whether a constant is used as the weight of one of the layers, directly or through its own transposition.
 
     Args:
         use: An ``onnx_ir`` usage.
-        layers: ``id`` of the products' nodes.
+        layers: ``id`` of the nodes of the products.
     """
     if id(use.node) in layers:
         return bool(use.idx == 1)
-    if not turns_constant(use.node) or use.node.outputs[0].is_graph_output():
+    if not transposes_constant(use.node) or use.node.outputs[0].is_graph_output():
         return False
     return all(id(reader.node) in layers and reader.idx == 1 for reader in use.node.outputs[0].uses())
 
 
-def weight_task(product: Product, source: StoredTensor, form: Format, layout: str, scaled: bool) -> Task:
+def weight_task(product: Product, source: StoredTensor, form: BlockFormat, layout: str, scaled: bool) -> Task:
     """Lay out codes, scales and zero points as ``com.microsoft.MatMulNBits`` takes them (``ort``), or (``qdq``) as
     ``DequantizeLinear`` with blocks over the first axis of (K, N) does.
     """
@@ -149,10 +149,10 @@ def weight_task(product: Product, source: StoredTensor, form: Format, layout: st
     kind: Literal["blocks", "qdq"] = "blocks" if layout == "ort" else "qdq"
     codes: tuple[int, ...]
     if kind == "blocks":
-        dtype, codes, zeros = "UINT8", (columns, count, form.bytes), (columns, -(-count * form.bits // 8))
+        dtype, codes, zeros = "UINT8", (columns, count, form.code_bytes), (columns, -(-count * form.bits // 8))
     else:
         dtype, codes, zeros = f"{'' if form.symmetric else 'U'}INT{form.bits}", (rows, columns), (count, columns)
-    pieces = _laid(
+    pieces = _lay_out(
         (f"{name}.q{form.bits}", dtype, codes),
         (f"{name}.scales", "FLOAT", (columns, count) if kind == "blocks" else (count, columns)),
         *([(f"{name}.zeros", dtype, zeros)] if stores_zeros(kind, form) else []),
@@ -161,72 +161,72 @@ def weight_task(product: Product, source: StoredTensor, form: Format, layout: st
     return Task(source, kind, pieces, product.node.name, rows, columns, product.output_first, scaled=scaled)
 
 
-def stores_zeros(kind: str, form: Format) -> bool:
-    """Return whether zero points are written: where they are chosen, and 0 for a DequantizeLinear of int8.
+def stores_zeros(kind: str, form: BlockFormat) -> bool:
+    """Return whether zero points are stored: asymmetric ones, and 0 for a DequantizeLinear of int8.
 
-    Where int8 products saturate, ONNX Runtime (1.32, with the option that makes them exact) gives such a node without a
-    zero point one that has no blocks, and then refuses to run it.
+    Where int8 products saturate, ONNX Runtime (1.32, with the option that makes them exact) adds a zero point without
+    blocks to such a node, and then refuses to run it.
     """
     return not form.symmetric or (kind == "qdq" and form.bits == 8)
 
 
 def copy_task(name: str, source: StoredTensor, half: bool) -> Task:
-    """Keep a tensor: float weights as float32, or float16 when ``half``; anything else as it is."""
+    """Return the task that copies a tensor: float weights as float32, or float16 when ``half``; others unchanged."""
     dtype = ("F16" if half else "F32") if source.dtype in FLOATS else source.dtype
     kinds = {"F32": "FLOAT", "F16": "FLOAT16", "F64": "DOUBLE", "BOOL": "BOOL"}
     letters = {"I": "INT", "U": "UINT"}
     kind = kinds.get(dtype) or f"{letters[dtype[0]]}{dtype[1:]}"
-    return Task(source, "copy", _laid((name, kind, source.shape)), name, dtype=dtype)
+    return Task(source, "copy", _lay_out((name, kind, source.shape)), name, dtype=dtype)
 
 
-def _laid(*tensors: tuple[str, str, tuple[int, ...]]) -> tuple[Piece, ...]:
-    """Place tensors one after the other."""
+def _lay_out(*tensors: tuple[str, str, tuple[int, ...]]) -> tuple[Piece, ...]:
+    """Lay out tensors one after the other."""
     bits = {"FLOAT": 32, "FLOAT16": 16, "DOUBLE": 64, "BOOL": 8, "INT4": 4, "UINT4": 4}
     pieces, offset = [], 0
     for name, dtype, shape in tensors:
         width = bits.get(dtype) or int(dtype.lstrip("UINT"))
         size = -(-math.prod(shape) * width // 8)
         pieces.append(Piece(name, dtype, shape, offset, size))
-        offset += -(-size // ALIGNED) * ALIGNED
+        offset += -(-size // ALIGNMENT) * ALIGNMENT
     return tuple(pieces)
 
 
-class Rewriter:
+class GraphRewriter:
     """Replaces nodes of one graph.
 
     Args:
-        skeleton: The graph; changed in place.
+        template: The graph; changed in place.
         file: External data, as the graph names it.
     """
 
-    def __init__(self, skeleton: Skeleton, file: str) -> None:
+    def __init__(self, template: GraphTemplate, file: str) -> None:
         import onnx_ir
 
         self._ir = onnx_ir
-        self.model = skeleton.model
-        self.graph = skeleton.model.graph
+        self.model = template.model
+        self.graph = template.model.graph
         self._file = file
         self._values: dict[int, Any] = {}
 
-    def place(self, task: Task, offset: int, folder: Path, weight: str) -> list[Any]:
-        """Make the initializers of a weight whose record starts at ``offset`` of the data file and return them.
+    def add_initializers(self, task: Task, offset: int, folder: Path, weight: str) -> list[Any]:
+        """Create the initializers of a weight whose record starts at ``offset`` of the data file and return them.
 
-        They are named after this graph's initializer, whatever the weight is called in a graph that shares it.
+        They are named after this graph's initializer, even where another graph shares the weight under another name.
         """
         values = []
         for piece in task.pieces:
-            place = offset + piece.offset
-            if place not in self._values:
-                name = self._free(f"{weight}.{piece.name.rpartition('.')[2]}")
+            position = offset + piece.offset
+            if position not in self._values:
+                name = self._unique_name(f"{weight}.{piece.name.rpartition('.')[2]}")
                 tensor = self._external(name, piece, offset, folder)
                 value = self._ir.Value(name=name, shape=tensor.shape, type=self._ir.TensorType(tensor.dtype))
                 value.const_value = tensor
-                self._values[place] = value
-            values.append(self._values[place])
+                self._values[position] = value
+            values.append(self._values[position])
         return values
 
-    def _free(self, name: str) -> str:
-        """Return that name, or one like it where a weight is stored twice: for each way in which it is read."""
+    def _unique_name(self, name: str) -> str:
+        """Return the name, with a number where a weight is stored in several layouts."""
         taken = {*self.graph.initializers, *(value.name for value in self._values.values())}
         names = itertools.chain([name], (f"{name}.{number}" for number in itertools.count(2)))
         return next(name for name in names if name not in taken)
@@ -237,8 +237,8 @@ class Rewriter:
             self._file, offset + piece.offset, piece.size, dtype, shape=shape, name=name, base_dir=str(folder)
         )
 
-    def keep(self, name: str, task: Task, offset: int, folder: Path) -> None:
-        """Point an initializer that stays to the data file; a table in float16 is cast back after its Gather."""
+    def keep_initializer(self, name: str, task: Task, offset: int, folder: Path) -> None:
+        """Point a kept initializer to the data file; a table in float16 is cast back after its Gather."""
         value, piece = self.graph.initializers[name], task.pieces[0]
         value.const_value = self._external(name, piece, offset, folder)
         if piece.dtype == "FLOAT16" and value.dtype != self._ir.DataType.FLOAT16:
@@ -255,14 +255,14 @@ class Rewriter:
         cast = self._ir.node("Cast", [wide], {"to": self._ir.DataType.FLOAT}, name=f"{node.name}.float")
         self._replace(node, [gather, cast])
 
-    def quantize(self, product: Product, task: Task, values: list[Any], form: Format, accuracy: int) -> None:
+    def quantize(self, product: Product, task: Task, values: list[Any], form: BlockFormat, accuracy: int) -> None:
         """Replace a product by ``MatMulNBits``, or feed it from a blocked ``DequantizeLinear`` (opset 21).
 
         Args:
-            product: What is replaced; a Gemm's bias becomes an Add.
-            task: Of its weight; where that was multiplied by a vector, the activations are divided by it first.
-            values: What ``place`` made of it.
-            form: Of the weight.
+            product: Product to replace; the bias of a Gemm becomes an Add.
+            task: Task of its weight; where that was scaled by a vector, the activations are divided by it first.
+            values: Initializers from ``add_initializers``.
+            form: Format of the weight.
             accuracy: ``accuracy_level`` of ``MatMulNBits``.
         """
         make, name, activation, nodes = self._ir.node, product.node.name, product.node.inputs[0], []
@@ -276,21 +276,21 @@ class Rewriter:
         else:
             options = {"K": product.rows, "N": product.columns, "bits": form.bits, "block_size": form.block}
             options["accuracy_level"] = accuracy
-            nodes.append(make("MatMulNBits", [activation, *values], options, domain=DOMAIN, name=name, version=1))
-            self.model.opset_imports[DOMAIN] = self.graph.opset_imports[DOMAIN] = 1
+            nodes.append(make("MatMulNBits", [activation, *values], options, domain=ORT_DOMAIN, name=name, version=1))
+            self.model.opset_imports[ORT_DOMAIN] = self.graph.opset_imports[ORT_DOMAIN] = 1
         if product.bias is not None:
             nodes.append(make("Add", [nodes[-1].outputs[0], product.bias], {}, name=f"{name}.bias"))
         self._replace(product.node, nodes)
 
     def _replace(self, node: Any, nodes: list[Any]) -> None:
-        """Put nodes in the place of one; the last gives the old name and shape."""
+        """Replace a node by several; the last one takes over name and shape of the output."""
         old = node.outputs[0]
         for number, inner in enumerate(nodes[:-1]):
             inner.outputs[0].name = inner.outputs[0].name or f"{old.name}.{number}"
         self._ir.convenience.replace_nodes_and_values(self.graph, node, [node], nodes, [old], nodes[-1].outputs)
 
     def finish(self) -> None:
-        """Remove transpositions and constants that nobody reads, and register the new constants."""
+        """Remove unused transpositions and constants, and register the new constants."""
         for node in reversed(list(self.graph)):
             if not any(value.uses() or value.is_graph_output() for value in node.outputs):
                 self.graph.remove(node, safe=True)
@@ -301,8 +301,8 @@ class Rewriter:
                 del self.graph.initializers[name]
 
 
-def only_gathered(value: Any) -> bool:
-    """Whether a constant is read by nothing but Gather, as the table of an embedding, in the graph that holds it."""
+def is_lookup_table(value: Any) -> bool:
+    """Return whether only Gather reads a constant, as the table of an embedding, in the graph that holds it."""
     uses = list(value.uses())
     if not uses or value.is_graph_output():
         return False

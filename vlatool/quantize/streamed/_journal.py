@@ -1,4 +1,4 @@
-"""Which records of a file are finished, so that a killed run is continued."""
+"""Journal of the finished records of a file, so that a killed run can be resumed."""
 
 from __future__ import annotations
 
@@ -14,56 +14,56 @@ from vlatool.quantize.streamed.records import Record
 from vlatool.weights.shards import Reader, StoredTensor, reading
 
 DATA, JOURNAL = "data", "journal"
-CHECKED_BYTES = 1 << 23
+READ_BYTES = 1 << 23
 
 
 class Journal:
-    """A line of JSON for each finished record, after one for the plan.
+    """A JSON line for the plan, then one for each finished record.
 
     A line holds the figures of its record and the SHA-256 of the data up to its end, so that a record counts only when
-    all before it are whole too.
+    all records before it are intact, too.
 
     Args:
-        place: The work directory.
-        plan: Identifies everything that the bytes depend on.
+        directory: Work directory.
+        plan: Identifier of everything that the bytes depend on.
     """
 
-    def __init__(self, place: Path, plan: str) -> None:
-        self._path, self._data = place / JOURNAL, place / DATA
+    def __init__(self, directory: Path, plan: str) -> None:
+        self._path, self._data = directory / JOURNAL, directory / DATA
         self._head = (json.dumps({"plan": plan}) + "\n").encode()
         self._stream: Any = None
 
     def resume(self, records: list[Record]) -> tuple[Any, list[dict[str, Any]]]:
-        """Return the running hash of the finished data and the figures of the finished records; cut off the rest."""
+        """Return the running hash of the finished data and the figures of the finished records; truncate the rest."""
         lines = self._path.read_bytes().splitlines(keepends=True) if self._path.is_file() else []
-        digest, offset, kept = hashlib.sha256(), 0, len(self._head)
+        digest, offset, valid_bytes = hashlib.sha256(), 0, len(self._head)
         notes: list[dict[str, Any]] = []
         if not lines or lines[0] != self._head or not self._data.is_file():
             self._path.write_bytes(self._head)
             lines = []
         with reading() as reader:
             for record, line in zip(records, lines[1:], strict=False):
-                entry, ahead = _parsed(line), digest.copy()
-                if entry is None or not _is_whole(reader, self._data, offset, record.size, ahead, entry["sha256"]):
+                entry, advanced = _parse_entry(line), digest.copy()
+                if entry is None or not _is_whole(reader, self._data, offset, record.size, advanced, entry["sha256"]):
                     break
-                digest = ahead
+                digest = advanced
                 offset += record.size
                 notes.append(entry["note"])
-                kept += len(line)
+                valid_bytes += len(line)
         self._data.touch()
         os.truncate(self._data, offset)
         self._stream = self._path.open("r+b")
-        self._stream.truncate(kept)
-        self._stream.seek(kept)
+        self._stream.truncate(valid_bytes)
+        self._stream.seek(valid_bytes)
         return digest, notes
 
     def add(self, note: dict[str, Any], sha256: str) -> None:
-        """Note a record whose data is written: a killed process keeps it, a power cut what was flushed."""
+        """Add a record whose data is written: it survives a killed process, and a power cut after ``flush``."""
         self._stream.write((json.dumps({"sha256": sha256, "note": note}) + "\n").encode())
         self._stream.flush()
 
     def flush(self) -> None:
-        """Bring data and journal to the disk, in this order."""
+        """Flush data and journal to the disk, in this order."""
         handle = os.open(self._data, os.O_RDONLY)
         try:
             os.fdatasync(handle)
@@ -77,8 +77,8 @@ class Journal:
             self._stream.close()
 
 
-def _parsed(line: bytes) -> dict[str, Any] | None:
-    """Return the entry of a line, None when it was cut off."""
+def _parse_entry(line: bytes) -> dict[str, Any] | None:
+    """Return the entry of a line, None when it is truncated."""
     try:
         entry = json.loads(line)
     except ValueError:
@@ -95,11 +95,11 @@ def _is_whole(reader: Reader, file: Path, offset: int, size: int, digest: Any, s
 
 
 def hash_part(reader: Reader, file: Path, offset: int, size: int, digest: Any) -> None:
-    """Update a hash with part of a file, as it is on the disk.
+    """Update a hash with part of a file, read from the disk.
 
     Raises:
-        SourceError: when the file ends before.
+        SourceError: when the file is shorter.
     """
     part = StoredTensor(file.name, file, offset, "U8", (size,))
-    for begin in range(0, size, CHECKED_BYTES):
-        digest.update(reader.read(part, begin, min(CHECKED_BYTES, size - begin)).data)
+    for begin in range(0, size, READ_BYTES):
+        digest.update(reader.read(part, begin, min(READ_BYTES, size - begin)).data)

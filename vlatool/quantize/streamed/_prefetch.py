@@ -1,4 +1,4 @@
-"""Compute records ahead of the one that is wanted, in several processes, and hand them on in order."""
+"""Compute records ahead in several processes, and yield them in order."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from typing import IO, Any, cast
 
 from vlatool import errors
 from vlatool.machine.processes import SINGLE, python_command
-from vlatool.quantize.streamed.records import Record, Tools, compute
+from vlatool.quantize.streamed.records import Record, Tools, compute_record
 from vlatool.quantize.streamed.tensor_jobs import Job
 
 
-class Ahead:
-    """Iterates over (record, figures) in order, each when it is in its place in the file.
+class Prefetcher:
+    """Iterator over (record, figures) in order, each after it was written to the file.
 
     Args:
         records: All records of the file.
-        start: The first that is wanted.
-        file: Where they are written.
-        processes: Processes that compute; with 0 each record is computed here when it is asked for.
+        start: Index of the first record to compute.
+        file: The file.
+        processes: Number of worker processes; with 0 each record is computed here on demand.
     """
 
     def __init__(self, records: list[Record], start: int, file: Path, processes: int) -> None:
@@ -38,7 +38,7 @@ class Ahead:
             self._idle.put(worker)
         self._threads = ThreadPoolExecutor(max(processes, 1), "record")
 
-    def __enter__(self) -> Ahead:
+    def __enter__(self) -> Prefetcher:
         return self
 
     def __exit__(self, *_exception: object) -> None:
@@ -46,22 +46,24 @@ class Ahead:
         for worker in self._workers:
             worker.stop()
         self._threads.shutdown(wait=True)
-        self._tools.read.close()
+        self._tools.reader.close()
 
     def __iter__(self) -> Iterator[tuple[Record, dict[str, Any]]]:
         pending: deque[tuple[Record, int, Future[dict[str, Any]] | None]] = deque()
-        waiting, offset, room = iter(self._records), self._offset, 2 * len(self._workers) + 1
+        records, offset, capacity = iter(self._records), self._offset, 2 * len(self._workers) + 1
         while True:
-            for record in waiting:
+            for record in records:
                 pending.append((record, offset, self._submit(record, offset)))
                 offset += record.size
-                if len(pending) >= room:
+                if len(pending) >= capacity:
                     break
             if not pending:
                 return
-            record, place, future = pending.popleft()
-            note = future.result() if future else compute(record.fill, record.size, self._file, place, self._tools)
-            yield record, note
+            record, record_offset, future = pending.popleft()
+            if future is None:
+                yield record, compute_record(record.fill, record.size, self._file, record_offset, self._tools)
+            else:
+                yield record, future.result()
 
     def _submit(self, record: Record, offset: int) -> Future[dict[str, Any]] | None:
         if not (self._workers and record.portable):
@@ -82,10 +84,10 @@ class Worker:
     def __init__(self) -> None:
         command, pipe = python_command("vlatool.quantize.streamed._worker"), subprocess.PIPE
         self._process = subprocess.Popen(command, env={**os.environ, **SINGLE}, stdin=pipe, stdout=pipe, text=True)
-        self._requests, self._answers = cast(IO[str], self._process.stdin), cast(IO[str], self._process.stdout)
+        self._requests, self._replies = cast(IO[str], self._process.stdin), cast(IO[str], self._process.stdout)
 
     def compute(self, record: Record, file: Path, offset: int) -> dict[str, Any]:
-        """Let the process compute and write a record; return its figures.
+        """Compute and write a record in the process; return its figures.
 
         Raises:
             OSError: when the disk is full.
@@ -96,26 +98,26 @@ class Worker:
         with contextlib.suppress(BrokenPipeError, ValueError):
             self._requests.write(json.dumps(request) + "\n")
             self._requests.flush()
-            line = self._answers.readline()
+            line = self._replies.readline()
         if not line:
             raise errors.GraphError(
                 f"The process that quantized '{record.name}' died (exit {self._process.poll()}).",
                 "it may have run out of memory; run the same command again, finished tensors are kept",
             )
-        answer: dict[str, Any] = json.loads(line)
-        if "note" in answer:
-            note: dict[str, Any] = answer["note"]
-            return note
-        if "errno" in answer:
-            raise OSError(answer["errno"], answer["message"], str(file))
-        if answer["error"] == "MemoryError":
-            raise MemoryError(answer["message"])
-        raise getattr(errors, answer["error"])(answer["message"], answer["fix"])
+        reply: dict[str, Any] = json.loads(line)
+        if "note" in reply:
+            figures: dict[str, Any] = reply["note"]
+            return figures
+        if "errno" in reply:
+            raise OSError(reply["errno"], reply["message"], str(file))
+        if reply["error"] == "MemoryError":
+            raise MemoryError(reply["message"])
+        raise getattr(errors, reply["error"])(reply["message"], reply["fix"])
 
     def stop(self) -> None:
-        """End the process; what it was computing is lost."""
+        """Kill the process and discard its work."""
         self._process.kill()
         self._process.wait()
-        for pipe in (self._requests, self._answers):
+        for pipe in (self._requests, self._replies):
             with contextlib.suppress(OSError):
                 pipe.close()

@@ -1,4 +1,4 @@
-"""The ONNX graphs of a policy whose weights stay in their shards: exported with weights that take no memory."""
+"""Export of a policy's ONNX graphs without loading the weights, which stay in their shards."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from vlatool.module.stored import StoredModules, policy_weights, stored_modules
 from vlatool.module.to_onnx import exported_by_torch, name_by_module, quiet_exporter, strip_notes
 from vlatool.weights.shards import FLOATS, StoredTensor, stored_array
 
-FOLDED = 1 << 16
-"""Elements up to which constants are computed ahead."""
+FOLD_LIMIT = 1 << 16
+"""Largest constants to fold, in elements."""
 
 
 @dataclass(frozen=True)
-class Skeleton:
-    """A graph and where its constants are.
+class GraphTemplate:
+    """A graph without the values of its large constants.
 
     Args:
         model: An ``onnx_ir.Model`` whose initializers have shapes and dtypes, and values only when they are small.
-        tensors: Initializer -> where its bytes are.
-        opset: Of the default domain.
+        tensors: Initializer -> location of its bytes.
+        opset: Opset of the default domain.
     """
 
     model: Any
@@ -36,14 +36,14 @@ class Skeleton:
     opset: int
 
 
-def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
-    """Export every graph of a source bundle without reading a weight: graph name -> skeleton.
+def export_templates(bundle: Bundle, opset: int) -> dict[str, GraphTemplate]:
+    """Export every graph of a source bundle without reading a weight: graph name -> template.
 
-    The factory is called once, with every parameter put on torch's meta device as soon as it is registered; buffers are
+    The factory is called once, with every parameter on torch's meta device as soon as it is registered; buffers are
     computed. The export then runs under ``FakeTensorMode``.
 
     Raises:
-        SourceError: when code has changed, the factory fails, or shards and modules do not fit together.
+        SourceError: when code has changed, the factory fails, or shards and modules do not match.
         GraphError: when torch cannot export a module.
     """
     for package in ("torch", "onnx", "onnxscript"):
@@ -58,7 +58,7 @@ def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
             exported[step.graph] = (exported_by_torch(module, feeds, step, opset, optimize=False).model, real)
 
     run_faked(bundle, modules, visit)
-    return {name: _skeleton(model, stored.places[name], real, opset, file) for name, (model, real) in exported.items()}
+    return {name: _template(model, stored.places[name], real, opset, file) for name, (model, real) in exported.items()}
 
 
 def _check_dtypes(stored: StoredModules) -> None:
@@ -72,8 +72,10 @@ def _check_dtypes(stored: StoredModules) -> None:
                 )
 
 
-def _skeleton(model: Any, weights: dict[str, StoredTensor], real: dict[str, Any], opset: int, file: Path) -> Skeleton:
-    """Give initializers their values or their place in a shard, then fold what is computed from small constants."""
+def _template(
+    model: Any, weights: dict[str, StoredTensor], real: dict[str, Any], opset: int, file: Path
+) -> GraphTemplate:
+    """Give initializers their values or their location in a shard, then fold small constants."""
     import onnx_ir
     import onnxscript.optimizer
 
@@ -86,11 +88,11 @@ def _skeleton(model: Any, weights: dict[str, StoredTensor], real: dict[str, Any]
             value.const_value = onnx_ir.tensor(real[name].detach().cpu().numpy(), name=name)
         elif type(value.const_value.raw).__name__ == "FakeTensor" if hasattr(value.const_value, "raw") else False:
             raise GraphError(
-                f"The value of the constant '{name}' is not known: it was made while the graph was exported.",
-                "make it in the module's __init__ and register it as a buffer",
+                f"The value of the constant '{name}' is unknown: it was created during the export of the graph.",
+                "create it in the module's __init__ and register it as a buffer",
             )
-    with quiet_exporter(), _silent("onnx_ir"):
-        onnxscript.optimizer.optimize_ir(model, input_size_limit=FOLDED, output_size_limit=FOLDED)
+    with quiet_exporter(), _silenced_logger("onnx_ir"):
+        onnxscript.optimizer.optimize_ir(model, input_size_limit=FOLD_LIMIT, output_size_limit=FOLD_LIMIT)
     name_by_module(model)
     strip_notes(model)
     kept = {}
@@ -99,12 +101,12 @@ def _skeleton(model: Any, weights: dict[str, StoredTensor], real: dict[str, Any]
             kept[name] = tensors[name]
         else:
             kept[name] = stored_array(name, value.const_value.numpy(), file)
-    return Skeleton(model, kept, opset)
+    return GraphTemplate(model, kept, opset)
 
 
 @contextlib.contextmanager
-def _silent(name: str) -> Iterator[None]:
-    """Keep a logger quiet: it warns about every initializer whose value stays in a shard."""
+def _silenced_logger(name: str) -> Iterator[None]:
+    """Silence a logger that warns about every initializer whose value stays in a shard."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import IO, Any
 
 from vlatool import errors
-from vlatool.quantize.streamed.records import Tools, compute
+from vlatool.quantize.streamed.records import Tools, compute_record
 from vlatool.quantize.streamed.tensor_jobs import Job
 
 
 def serve(requests: IO[str], replies: IO[str]) -> None:
-    """Answer until the requests end; a process whose parent was killed ends by that."""
+    """Answer until the requests end, which they also do when the parent is killed."""
     tools = Tools()
     with contextlib.suppress(BrokenPipeError):  # nobody waits for the answer any more
         for line in requests:
@@ -26,10 +26,10 @@ def serve(requests: IO[str], replies: IO[str]) -> None:
 
 
 def _answer(request: dict[str, Any], tools: Tools) -> dict[str, Any]:
-    """Return the figures, or what went wrong."""
+    """Return the figures, or a description of the error."""
     try:
         job = Job.from_json(request["job"])
-        return {"note": compute(job, request["size"], Path(request["file"]), request["offset"], tools)}
+        return {"note": compute_record(job, request["size"], Path(request["file"]), request["offset"], tools)}
     except errors.VlatoolError as error:
         return {"error": type(error).__name__, "message": error.message, "fix": error.fix}
     except OSError as error:

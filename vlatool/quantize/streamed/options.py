@@ -1,4 +1,4 @@
-"""What can be said of weights that are quantized in blocks."""
+"""Options of weight-only quantization."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Literal
 from pydantic import Field
 
 from vlatool.quantize._base import Quantization
-from vlatool.quantize.streamed._block_quantization import Format
+from vlatool.quantize.streamed._block_quantization import BlockFormat
 
 
 class WeightOptions(Quantization):
-    """Options of weight-only quantization, and what follows from them."""
+    """Options of weight-only quantization, and values derived from them."""
 
     bits: Literal[4, 8] = Field(4, description="bits of a weight: 4 or 8")
     block: Literal[32, 64, 128] = Field(32, description="weights that share a scale: 32, 64 or 128")
@@ -31,13 +31,13 @@ class WeightOptions(Quantization):
     )
 
     @property
-    def form(self) -> Format:
-        """The format of a quantized weight."""
-        return Format(self.bits, self.block, self.symmetric)
+    def block_format(self) -> BlockFormat:
+        """Format of a quantized weight."""
+        return BlockFormat(self.bits, self.block, self.symmetric)
 
     @property
     def choose(self) -> str:
-        """How scale and zero point of a block are found: a name in ``METHODS``."""
+        """Method that finds scale and zero point of a block: a name in ``METHODS``."""
         if self.method == "hqq":
             return "hqq"
         return "searched" if self.search and self.bits == 4 else "rtn"

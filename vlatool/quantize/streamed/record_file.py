@@ -1,8 +1,8 @@
-"""Write one large file record by record; a run that was killed is continued by the next one.
+"""Write one large file record by record; a killed run is resumed by the next one.
 
-The place of every record is known before the first is computed. Processes compute and write records ahead; in order,
-each is then read back and hashed, and a journal notes it with the SHA-256 of the data up to its end. The next run of
-the same plan checks the finished records and goes on after them, and gives the same bytes.
+The offset of every record is known in advance. Processes compute and write records ahead; in order, each is then read
+back and hashed, and a journal stores it with the SHA-256 of the data up to its end. The next run of the same plan
+checks the finished records and continues after them; the bytes are the same.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from vlatool.errors import OutputError
 from vlatool.machine.host import cache_directory
 from vlatool.quantize.streamed._journal import DATA, Journal, hash_part
-from vlatool.quantize.streamed._prefetch import Ahead
+from vlatool.quantize.streamed._prefetch import Prefetcher
 from vlatool.quantize.streamed.records import Record
 from vlatool.weights.shards import reading
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 COMMIT_BYTES = 1 << 28
 """Bytes after which data and journal are flushed to the disk."""
-FULL = {
+DISK_FULL_ERRORS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
     errno.EFBIG: "a file would be larger than the limit on file sizes",
@@ -32,15 +32,15 @@ FULL = {
 
 
 @dataclass(frozen=True)
-class Written:
+class RecordFile:
     """The finished file.
 
     Args:
-        path: Where it is, in the work directory.
-        sha256: Of the file, as hex.
-        bytes: Its size.
-        notes: What each record's ``fill`` returned.
-        resumed: Records that an earlier run had finished.
+        path: Path in the work directory.
+        sha256: SHA-256 of the file, as hex.
+        bytes: Size of the file.
+        notes: Figures that each record's ``fill`` returned.
+        resumed: Number of records that an earlier run had finished.
     """
 
     path: Path
@@ -51,33 +51,33 @@ class Written:
 
 
 def work_root() -> Path:
-    """Return where unfinished work is kept: ``streams`` in vlatool's cache directory."""
+    """Return the directory of unfinished work: ``streams`` in vlatool's cache directory."""
     return cache_directory() / "streams"
 
 
-def write_records(records: list[Record], plan: str, place: Path, processes: int, tell: Tell) -> Written:
-    """Write all records to ``place/data``, continuing what an earlier run of the same plan left.
+def write_records(records: list[Record], plan: str, directory: Path, processes: int, tell: Tell) -> RecordFile:
+    """Write all records to ``directory/data``, resuming an earlier run of the same plan.
 
     Args:
-        records: What to write, in order.
-        plan: Identifies everything that the bytes depend on; work of another plan is thrown away.
-        place: A locked work directory.
-        processes: Processes that compute; with 0 everything happens here, in order.
-        tell: Told each record and the share of the parameters that is done.
+        records: Records of the file, in order.
+        plan: Identifier of everything that the bytes depend on; work of another plan is discarded.
+        directory: A locked work directory.
+        processes: Number of worker processes; with 0 everything is computed here, in order.
+        tell: Receiver of each record's name and the share of the parameters that is done.
 
     Raises:
         OutputError: when the disk is full; finished records are kept.
         VlatoolError: what a record's ``fill`` raises.
     """
-    data, journal = place / DATA, Journal(place, plan)
+    data, journal = directory / DATA, Journal(directory, plan)
     digest, notes = journal.resume(records)
     resumed = len(notes)
     offset = sum(record.size for record in records[:resumed])
     total = sum(record.weights for record in records) or 1
     done, unflushed = sum(record.weights for record in records[:resumed]), 0
     try:
-        with reading() as reader, Ahead(records, resumed, data, processes) as ahead:
-            for record, note in ahead:
+        with reading() as reader, Prefetcher(records, resumed, data, processes) as prefetcher:
+            for record, note in prefetcher:
                 hash_part(reader, data, offset, record.size, digest)
                 journal.add(note, digest.hexdigest())
                 notes.append(note)
@@ -90,11 +90,11 @@ def write_records(records: list[Record], plan: str, place: Path, processes: int,
                     unflushed = 0
         journal.flush()
     except OSError as error:
-        if error.errno not in FULL:
+        if error.errno not in DISK_FULL_ERRORS:
             raise
         kept = f"{len(notes)} of {len(records)} parts are finished and kept"
         fix = "free some space (or set VLATOOL_CACHE to a larger disk) and run the same command again"
-        raise OutputError(f"Cannot write {place}: {FULL[error.errno]}; {kept}.", fix) from error
+        raise OutputError(f"Cannot write {directory}: {DISK_FULL_ERRORS[error.errno]}; {kept}.", fix) from error
     finally:
         journal.close()
-    return Written(data, digest.hexdigest(), offset, notes, resumed)
+    return RecordFile(data, digest.hexdigest(), offset, notes, resumed)

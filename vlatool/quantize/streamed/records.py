@@ -1,4 +1,4 @@
-"""A part of a large file: what computes it, with what, and how it gets to its place."""
+"""Parts of a large file: how they are computed and written."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from vlatool.quantize.streamed._block_quantization import Scratch
 from vlatool.weights.shards import PAGE, Reader, open_direct
 
 Array = NDArray[Any]
-DIRECT = getattr(os, "O_DIRECT", 0)
+O_DIRECT = getattr(os, "O_DIRECT", 0)
 
 
 @dataclass
 class Tools:
-    """What one process computes with; reused from record to record.
+    """Resources of one process, reused from record to record.
 
     Args:
-        read: Reader of the stored weights.
+        reader: Reader of the stored weights.
         scratch: Buffers of the arithmetic.
         buffer: Page-aligned memory for a record.
     """
 
-    read: Reader = field(default_factory=Reader)
+    reader: Reader = field(default_factory=Reader)
     scratch: Scratch = field(default_factory=Scratch)
     buffer: mmap.mmap | None = None
 
     def record(self, size: int) -> Array:
-        """Return (size,) uint8 zeros that may be written past the page cache."""
+        """Return (size,) uint8 zeros in memory fit for direct I/O."""
         if self.buffer is None or len(self.buffer) < size:
             self.buffer = mmap.mmap(-1, size)
         data = np.frombuffer(self.buffer, np.uint8, size)
@@ -45,7 +45,7 @@ class Tools:
 
 
 Fill = Callable[[Tools, Array], dict[str, Any]]
-"""Fills the zeroed bytes of a record, (size,) uint8, and returns its figures as JSON values."""
+"""Function that fills the zeroed bytes of a record, (size,) uint8, and returns its figures as JSON values."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class Record:
     """One part of the file.
 
     Args:
-        name: Of the tensor or layer, for progress and messages.
-        size: Bytes; a multiple of the page size, so that it is written past the page cache.
-        fill: Computes it; a ``Job`` when it is portable.
-        weights: Parameters that it covers, for the progress.
+        name: Name of the tensor or layer, for progress and messages.
+        size: Size in bytes; a multiple of the page size, for direct I/O.
+        fill: Function that computes it; a ``Job`` when it is portable.
+        weights: Number of parameters that it covers, for the progress.
         portable: Whether another process can compute it.
-        verb: What is done to it, for the progress.
+        verb: Past participle of the work, for the progress.
     """
 
     name: str
@@ -69,13 +69,13 @@ class Record:
     verb: str = "quantized"
 
 
-def padded(size: int) -> int:
+def page_aligned(size: int) -> int:
     """Return ``size`` rounded up to whole pages."""
     return -(-size // PAGE) * PAGE
 
 
-def compute(fill: Fill, size: int, file: Path, offset: int, tools: Tools) -> dict[str, Any]:
-    """Compute one record, write it to its place, and return its figures.
+def compute_record(fill: Fill, size: int, file: Path, offset: int, tools: Tools) -> dict[str, Any]:
+    """Compute one record, write it at its offset, and return its figures.
 
     Raises:
         OSError: when the disk is full.
@@ -92,7 +92,7 @@ def compute(fill: Fill, size: int, file: Path, offset: int, tools: Tools) -> dic
 
 
 def _write(handle: int, view: memoryview, offset: int) -> None:
-    """Write whole pages; through the page cache where the file system or a short write leaves no other way."""
+    """Write whole pages; through the page cache where the file system or a short write rules out direct I/O."""
     done = 0
     while done < len(view):
         try:
@@ -100,14 +100,14 @@ def _write(handle: int, view: memoryview, offset: int) -> None:
         except OSError as error:
             if error.errno != errno.EINVAL or not _is_direct(handle):
                 raise
-            _through_cache(handle)
+            _disable_direct_io(handle)
         if done % PAGE:
-            _through_cache(handle)
+            _disable_direct_io(handle)
 
 
 def _is_direct(handle: int) -> bool:
-    return bool(DIRECT and fcntl.fcntl(handle, fcntl.F_GETFL) & DIRECT)
+    return bool(O_DIRECT and fcntl.fcntl(handle, fcntl.F_GETFL) & O_DIRECT)
 
 
-def _through_cache(handle: int) -> None:
-    fcntl.fcntl(handle, fcntl.F_SETFL, fcntl.fcntl(handle, fcntl.F_GETFL) & ~DIRECT)
+def _disable_direct_io(handle: int) -> None:
+    fcntl.fcntl(handle, fcntl.F_SETFL, fcntl.fcntl(handle, fcntl.F_GETFL) & ~O_DIRECT)

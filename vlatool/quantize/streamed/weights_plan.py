@@ -1,4 +1,4 @@
-"""Which tensor goes where in the file of weights that all graphs of a bundle share."""
+"""Layout of the file of weights that all graphs of a bundle share."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, instead, nearest
 from vlatool.quantize.streamed._graph_rewrite import (
     PART_BYTES,
+    GraphRewriter,
     Product,
-    Rewriter,
     Task,
     copy_task,
-    only_gathered,
-    products_of,
-    read_as_weight,
+    find_products,
+    is_lookup_table,
+    is_weight_use,
     weight_task,
 )
-from vlatool.quantize.streamed._weightless_export import Skeleton
+from vlatool.quantize.streamed._weightless_export import GraphTemplate
 from vlatool.quantize.streamed.graph_templates import BLOCKED_OPSET
 from vlatool.quantize.streamed.options import WeightOptions
-from vlatool.quantize.streamed.records import padded
+from vlatool.quantize.streamed.records import page_aligned
 
 Entry = tuple[Any, Task, "Product | str"]
-"""What tells a tensor and its form from others, what becomes of it, and the product or initializer that it is for."""
+"""Key of a tensor in its form, its task, and the product or initializer that uses it."""
 
 
 @dataclass
 class GraphPlan:
-    """One graph and what becomes of its constants.
+    """One graph and the tasks of its constants.
 
     Args:
-        skeleton: The graph as it was.
-        products: Those that are quantized, each with the number of its task.
-        kept: Initializer -> the number of its task.
+        template: The original graph.
+        products: Quantized products, each with the index of its task.
+        kept: Copied initializer -> index of its task.
     """
 
-    skeleton: Skeleton
+    template: GraphTemplate
     products: list[tuple[Product, int]] = field(default_factory=list)
     kept: dict[str, int] = field(default_factory=dict)
 
@@ -56,7 +56,7 @@ class WeightsPlan:
     tasks: list[Task] = field(default_factory=list)
 
     def identity(self) -> list[Any]:
-        """Return what the bytes of the file depend on, as JSON values."""
+        """Return everything that the bytes of the file depend on, as JSON values."""
         return [
             [task.source.name, task.source.file.name, task.source.offset, task.kind, task.dtype]
             + [[piece.name, piece.dtype, list(piece.shape), piece.offset] for piece in task.pieces]
@@ -64,7 +64,7 @@ class WeightsPlan:
         ]
 
     def offsets(self) -> list[int]:
-        """Return the first byte of each task in the file, and its size."""
+        """Return the first byte of each task in the file, and the size of the file."""
         return [0, *accumulate(task_bytes(task) for task in self.tasks)]
 
     def save(self, out: Path) -> dict[str, int]:
@@ -74,14 +74,14 @@ class WeightsPlan:
         stage, offsets = self.stage, self.offsets()
         opsets = {}
         for name, graph in self.graphs.items():
-            rewriter = Rewriter(graph.skeleton, PurePosixPath(self.file).name)
+            rewriter = GraphRewriter(graph.template, PurePosixPath(self.file).name)
             folder = (out / self.file).parent
             for product, number in graph.products:
                 task = self.tasks[number]
-                values = rewriter.place(task, offsets[number], folder, product.weight)
-                rewriter.quantize(product, task, values, stage.form, stage.accuracy_level)
+                values = rewriter.add_initializers(task, offsets[number], folder, product.weight)
+                rewriter.quantize(product, task, values, stage.block_format, stage.accuracy_level)
             for initializer, number in graph.kept.items():
-                rewriter.keep(initializer, self.tasks[number], offsets[number], folder)
+                rewriter.keep_initializer(initializer, self.tasks[number], offsets[number], folder)
             rewriter.finish()
             opsets[name] = int(rewriter.model.graph.opset_imports[""])
             onnx_ir.save(rewriter.model, str(out / f"graphs/{name}.onnx"))
@@ -89,29 +89,32 @@ class WeightsPlan:
 
 
 def task_bytes(task: Task) -> int:
-    """Return the bytes that a task takes in the file."""
+    """Return the size of a task's result in the file."""
     if task.kind != "copy" or not task.source.count:
-        return padded(task.size)
+        return page_aligned(task.size)
     whole, rest = divmod(task.size, PART_BYTES)
-    return whole * PART_BYTES + padded(rest)
+    return whole * PART_BYTES + page_aligned(rest)
 
 
-def make_plan(skeletons: dict[str, Skeleton], stage: WeightOptions, bundle: Bundle, file: str) -> WeightsPlan:
-    """Decide for every constant of every graph; a tensor that two graphs share is stored once.
+def make_plan(templates: dict[str, GraphTemplate], stage: WeightOptions, bundle: Bundle, file: str) -> WeightsPlan:
+    """Plan the conversion of every constant of every graph; a tensor that graphs share is stored once.
 
     Raises:
         RecipeError: when a pattern matches no graph or no node, or the opset is too old for the layout.
     """
     plan = WeightsPlan(stage, file)
     known: dict[Any, int] = {}
-    chosen = _chosen(
-        {name: list(products_of(graph.model, graph.tensors)) for name, graph in skeletons.items()}, stage, bundle
+    selected = _selected_products(
+        {name: list(find_products(graph.model, graph.tensors)) for name, graph in templates.items()}, stage, bundle
     )
-    order = dict.fromkeys([step.graph for step in bundle.manifest.program] + list(skeletons))
-    for name, skeleton in ((name, skeletons[name]) for name in order if name in skeletons):
-        graph = plan.graphs[name] = GraphPlan(skeleton)
-        _raise_opset(name, skeleton, stage, bool(chosen[name]))
-        entries = [*_quantized(name, skeleton, chosen[name], stage), *_kept(name, skeleton, chosen[name], stage)]
+    order = dict.fromkeys([step.graph for step in bundle.manifest.program] + list(templates))
+    for name, template in ((name, templates[name]) for name in order if name in templates):
+        graph = plan.graphs[name] = GraphPlan(template)
+        _raise_opset(name, template, stage, bool(selected[name]))
+        entries = [
+            *_weight_entries(name, template, selected[name], stage),
+            *_constant_entries(name, template, selected[name], stage),
+        ]
         if stage.method not in ("gptq", "awq"):
             entries.sort(key=lambda entry: (str(entry[1].source.file), entry[1].source.offset))
         for key, task, product in entries:
@@ -125,34 +128,40 @@ def make_plan(skeletons: dict[str, Skeleton], stage: WeightOptions, bundle: Bund
     return plan
 
 
-def _quantized(graph: str, skeleton: Skeleton, products: list[Product], stage: WeightOptions) -> Iterator[Entry]:
-    """Yield what becomes of the weights of products."""
+def _weight_entries(
+    graph: str, template: GraphTemplate, products: list[Product], stage: WeightOptions
+) -> Iterator[Entry]:
+    """Yield the entries of the weights of products."""
     awq = stage.method == "awq"
     for product in products:
-        source = skeleton.tensors[product.weight]
-        task = weight_task(product, source, stage.form, stage.layout, awq)
-        yield (_place(graph, source), product.output_first, product.node.name if awq else ""), task, product
+        source = template.tensors[product.weight]
+        task = weight_task(product, source, stage.block_format, stage.layout, awq)
+        yield (_tensor_identity(graph, source), product.output_first, product.node.name if awq else ""), task, product
 
 
-def _kept(graph: str, skeleton: Skeleton, products: list[Product], stage: WeightOptions) -> Iterator[Entry]:
-    """Yield what becomes of the initializers that somebody reads beside the quantized products."""
+def _constant_entries(
+    graph: str, template: GraphTemplate, products: list[Product], stage: WeightOptions
+) -> Iterator[Entry]:
+    """Yield the entries of the initializers with readers other than the quantized products."""
     replaced = {id(product.node) for product in products}
-    for name, source in skeleton.tensors.items():
-        value = skeleton.model.graph.initializers[name]
-        if value.is_graph_output() or not all(read_as_weight(use, replaced) for use in value.uses()):
-            half = stage.embeddings == "float16" and len(source.shape) == 2 and only_gathered(value)
+    for name, source in template.tensors.items():
+        value = template.model.graph.initializers[name]
+        if value.is_graph_output() or not all(is_weight_use(use, replaced) for use in value.uses()):
+            half = stage.embeddings == "float16" and len(source.shape) == 2 and is_lookup_table(value)
             task = copy_task(name, source, half)
-            yield (_place(graph, source), task.dtype), task, name
+            yield (_tensor_identity(graph, source), task.dtype), task, name
 
 
-def _place(graph: str, source: Any) -> tuple[str, ...]:
-    """Identify a stored tensor; one in memory belongs to its graph."""
+def _tensor_identity(graph: str, source: Any) -> tuple[str, ...]:
+    """Return the identity of a stored tensor; one in memory belongs to its graph."""
     if source.array is not None:
         return (graph, source.name)
     return (str(source.file), str(source.offset), source.name)
 
 
-def _chosen(products: dict[str, list[Product]], stage: WeightOptions, bundle: Bundle) -> dict[str, list[Product]]:
+def _selected_products(
+    products: dict[str, list[Product]], stage: WeightOptions, bundle: Bundle
+) -> dict[str, list[Product]]:
     for pattern in stage.graphs:
         if not fnmatch.filter(products, pattern):
             raise RecipeError(
@@ -162,21 +171,21 @@ def _chosen(products: dict[str, list[Product]], stage: WeightOptions, bundle: Bu
         name for name in products if not stage.graphs or any(fnmatch.fnmatch(name, glob) for glob in stage.graphs)
     }
     names = [product.node.name for name in sorted(graphs) for product in products[name]]
-    kept = stage.selected(names, bundle, ("MatMul", "Gemm"))
+    selected = stage.select_nodes(names, bundle, ("MatMul", "Gemm"))
     return {
-        name: [product for product in members if name in graphs and product.node.name in kept]
+        name: [product for product in members if name in graphs and product.node.name in selected]
         for name, members in products.items()
     }
 
 
-def _raise_opset(name: str, skeleton: Skeleton, stage: WeightOptions, quantized: bool) -> None:
-    """Blocked DequantizeLinear needs opset 21; what opset 20 says of all other operators still holds there."""
+def _raise_opset(name: str, template: GraphTemplate, stage: WeightOptions, quantized: bool) -> None:
+    """Raise the opset to 21 for blocked DequantizeLinear; all other operators are the same as in opset 20."""
     if stage.layout != "qdq" or not quantized:
         return
-    imports = skeleton.model.graph.opset_imports
+    imports = template.model.graph.opset_imports
     if imports.get("", 0) >= BLOCKED_OPSET:
         return
-    old = any(node.op_type == "GroupNormalization" for node in skeleton.model.graph)
+    old = any(node.op_type == "GroupNormalization" for node in template.model.graph)
     if imports.get("", 0) < BLOCKED_OPSET - 1 or old:
         raise RecipeError(
             f"The graph '{name}' has opset {imports.get('', 0)}; the layout qdq needs {BLOCKED_OPSET}.",

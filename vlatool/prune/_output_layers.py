@@ -1,4 +1,4 @@
-"""Which layers give the action, whatever they are called."""
+"""The layers that compute the action, whatever their names."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 
-def last_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Collection[Any]) -> set[int]:
+def output_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Collection[Any]) -> set[int]:
     """Return ``id`` of the layers after which no other layer computes the action.
 
-    They are found by going back from the action through what autograd recorded; none where a policy gives its action
-    without gradients.
+    They are found in autograd's graph, backwards from the action; the set is empty where the action has no gradients.
 
     Args:
         modules: Graph name -> module.
-        source: For the program and an observation.
-        layers: With a ``weight``, such as Linear and convolution layers.
+        source: Bundle with the program and an observation.
+        layers: Layers with a ``weight``, such as Linear and convolution layers.
     """
     torch = require("torch", "build")
     program = BatchedProgram(source.manifest.program, modules)
@@ -44,21 +43,21 @@ def last_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Collec
 
 
 def _owners(action: Tensor, owners: Mapping[int, int]) -> Iterator[int]:
-    """Yield the owners of the weights that are reached first on the ways back from an action."""
-    seen, open_ = set(), [action.grad_fn] if action.grad_fn is not None else []
-    while open_:
-        node = open_.pop()
-        if node in seen:
+    """Yield the owners of the weights that are reached first on the paths back from an action."""
+    visited, pending = set(), [action.grad_fn] if action.grad_fn is not None else []
+    while pending:
+        node = pending.pop()
+        if node in visited:
             continue
-        seen.add(node)
-        before: list[Any] = [earlier for earlier, _ in node.next_functions if earlier is not None]
-        found = [owners[id(weight)] for each in before if id(weight := _weight(each)) in owners]
+        visited.add(node)
+        earlier_nodes: list[Any] = [earlier for earlier, _ in node.next_functions if earlier is not None]
+        found = [owners[id(weight)] for each in earlier_nodes if id(weight := _weight(each)) in owners]
         yield from found
-        open_ += [] if found else before
+        pending += [] if found else earlier_nodes
 
 
 def _weight(node: Any) -> Any:
-    """Return the weight that a node passes on, as it is or transposed; None where it computes something."""
+    """Return the weight that a node passes on, unchanged or transposed; None where it computes something."""
     while not hasattr(node, "variable"):
         before = [earlier for earlier, _ in node.next_functions if earlier is not None]
         if len(before) != 1:

@@ -1,4 +1,4 @@
-"""Units that can go, together with all weights that they are coupled to, and how important each is."""
+"""Groups of removable units with all weights that they are coupled to, and the importance of each unit."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from vlatool.module.carried import LEADING, passages
 from vlatool.module.cut import traced
 from vlatool.module.edits import Edit
 from vlatool.module.feeds import first_feeds
+from vlatool.prune._action_gradients import action_gradients
 from vlatool.prune._selection import Selection
-from vlatool.prune._slopes import slopes_of
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -30,17 +30,17 @@ Rank = Literal["gate", "magnitude", "random"]
 
 
 @dataclass
-class Group:
-    """Units that go together with all their weights: heads of an attention, neurons of an MLP, channels.
+class UnitGroup:
+    """Units that are removed together with all their weights: heads of an attention, neurons of an MLP, channels.
 
     Args:
         graph: Name of the graph.
-        leaf: The factor of ``vlatool.module.axes``.
+        leaf: Factor of ``vlatool.module.axes``.
         size: Number of units.
-        members: Axes of weights that they are a part of.
-        step: How many go at a time.
-        importance: Of each unit, in the order of their numbers.
-        keep: Numbers of those that stay.
+        members: Axes of weights that contain the units.
+        step: Number of units to remove at a time.
+        importance: Importance of each unit, by index.
+        keep: Indices of the units to keep.
     """
 
     graph: str
@@ -52,62 +52,62 @@ class Group:
     keep: list[int]
 
     @property
-    def stays(self) -> int:
-        """Number of units that are left."""
+    def remaining(self) -> int:
+        """Number of units that stay."""
         return len(self.keep)
 
-    def without(self, units: Sequence[int]) -> None:
+    def remove(self, units: Sequence[int]) -> None:
         """Remove units."""
         gone = set(units)
         self.keep = [unit for unit in self.keep if unit not in gone]
 
-    def put_back(self, units: Sequence[int]) -> None:
-        """Let units stay that were removed."""
+    def restore(self, units: Sequence[int]) -> None:
+        """Restore removed units."""
         self.keep = sorted([*self.keep, *units])
 
-    def cheapest(self, least: float) -> tuple[float, list[int]]:
-        """Return what the next units that would go are worth together, and which they are; none when all must stay.
+    def cheapest_units(self, min_share: float) -> tuple[float, list[int]]:
+        """Return the total importance of the least important units, and their indices; none when all must stay.
 
         Args:
-            least: Share of the units that stays.
+            min_share: Least share of the units that stays.
         """
-        count = self.stays % self.step or self.step
-        if self.stays - count < max(1, round(self.size * least)):
+        count = self.remaining % self.step or self.step
+        if self.remaining - count < max(1, round(self.size * min_share)):
             return 0.0, []
         order = sorted(self.keep, key=lambda unit: (self.importance[unit], unit))[:count]
         return float(sum(self.importance[unit] for unit in order)), order
 
     def edit(self, member: Member | None = None, keep: Sequence[int] | None = None) -> Edit:
-        """Return what is to be kept.
+        """Return the edit that keeps units.
 
         Args:
-            member: After whose weight and axis the edit names the units; the first one when None.
-            keep: Numbers of the units that stay; those of the group when None.
+            member: Member whose weight and axis name the units in the edit; the first one when None.
+            keep: Indices of the units to keep; those of the group when None.
         """
         member = member or self.members[0]
         return Edit(self.graph, member.weight, member.units, tuple(self.keep if keep is None else keep))
 
 
-def walks_of(modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Walk]:
+def trace_walks(modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Walk]:
     """Trace the modules of a policy; return graph name -> its axes.
 
     Raises:
-        SourceError: when torch.export cannot.
+        SourceError: when torch.export cannot trace a module.
     """
     return {graph: Walk(traced(modules[graph], feeds)) for graph, feeds in first_feeds(modules, source).items()}
 
 
-def groups_of(walks: Mapping[str, Walk], selection: Selection, multiple: int, name: str) -> list[Group]:
-    """Return all units that can go; none where operators keep all of them.
+def find_groups(walks: Mapping[str, Walk], selection: Selection, multiple: int, name: str) -> list[UnitGroup]:
+    """Return all groups of removable units; none where operators keep all of them.
 
     Args:
         walks: Graph name -> axes.
-        selection: Of weights.
-        multiple: Neurons and channels go so many at a time; heads one by one.
-        name: Of the policy.
+        selection: Selection of weights.
+        multiple: Number of neurons or channels to remove at a time; heads go one by one.
+        name: Name of the policy.
 
     Raises:
-        RecipeError: when a pattern matches no weight, or all that could go is left out.
+        RecipeError: when a pattern matches no weight, or everything removable is excluded.
     """
     groups = []
     names: list[str] = []
@@ -115,38 +115,38 @@ def groups_of(walks: Mapping[str, Walk], selection: Selection, multiple: int, na
         for leaf, members in walk.members().items():
             size = walk.factors.sizes[leaf]
             names += [member.weight for member in members]
-            if not _is_slowest(walk, members) or not selection.has(member.weight for member in members):
+            if not _is_slowest(walk, members) or not selection.selects(member.weight for member in members):
                 continue
             heads = not all(member.atom.is_fastest for member in members)
             step = 1 if heads or size <= multiple else multiple
-            groups.append(Group(graph, leaf, size, members, step, np.zeros(size), list(range(size))))
+            groups.append(UnitGroup(graph, leaf, size, members, step, np.zeros(size), list(range(size))))
     if names:
         selection.check(names, "weight that can be pruned")
     if names and not groups:
-        raise nothing(name)
+        raise nothing_to_prune(name)
     return groups
 
 
-def nothing(name: str) -> RecipeError:
-    """Return the error for a policy that can lose no unit."""
+def nothing_to_prune(name: str) -> RecipeError:
+    """Return the error for a policy without removable units."""
     return RecipeError(
-        f"{name} has no heads, neurons or channels that could go.",
+        f"{name} has no heads, neurons or channels that can be removed.",
         "look at --include and --exclude; whole blocks: vlatool prune depth",
     )
 
 
 def rank_units(
-    groups: Sequence[Group], rank: Rank, modules: Mapping[str, nn.Module], source: Bundle, samples: int
+    groups: Sequence[UnitGroup], rank: Rank, modules: Mapping[str, nn.Module], source: Bundle, samples: int
 ) -> None:
-    """Fill in the importance of all units.
+    """Set the importance of all units.
 
     Args:
-        groups: Of the modules.
-        rank: ``gate``: the expected square of what the action moves by when a unit is scaled; ``magnitude``: the norms
-            of what writes and what reads it; ``random``.
+        groups: Groups of the modules.
+        rank: ``gate``: the expected squared change of the action when a unit is scaled; ``magnitude``: the norms of
+            the weights that write and that read it; ``random``.
         modules: Graph name -> module.
-        source: For recorded observations.
-        samples: How many of them.
+        source: Bundle with recorded observations.
+        samples: Number of observations.
 
     Raises:
         SourceError: when the policy gives actions without gradients.
@@ -164,91 +164,93 @@ def rank_units(
     values = {(graph, name): value.requires_grad_() for graph, named in weights.items()
               for name, value in named.items() if value.is_floating_point()}  # fmt: skip
     try:
-        for slopes in slopes_of(_actions(modules, source, samples), values):
+        for slopes in action_gradients(_actions(modules, source, samples), values):
             for group in groups:
-                moved = np.zeros(group.size)
-                for member in _readers(group):
+                sensitivity = np.zeros(group.size)
+                for member in _reading_members(group):
                     if (key := (group.graph, member.weight)) in slopes:
-                        moved += _by_unit(values[key].detach() * slopes[key], member)
-                group.importance = group.importance + moved**2
+                        sensitivity += _sum_by_unit(values[key].detach() * slopes[key], member)
+                group.importance = group.importance + sensitivity**2
     finally:
         for value in values.values():
             value.requires_grad_(False)
 
 
-class Work:
-    """Counts multiply-accumulates of one inference.
+class MacCounter:
+    """Counter of the multiply-accumulates of one inference.
 
     Args:
         walks: Graph name -> walk.
-        runs: Graph name -> how often it runs.
-        groups: Whose units may go.
+        runs: Graph name -> number of runs.
+        groups: Groups of removable units.
     """
 
-    def __init__(self, walks: Mapping[str, Walk], runs: Mapping[str, int], groups: Sequence[Group]) -> None:
-        self._numbers = {(group.graph, group.leaf): number for number, group in enumerate(groups)}
+    def __init__(self, walks: Mapping[str, Walk], runs: Mapping[str, int], groups: Sequence[UnitGroup]) -> None:
+        self._group_indices = {(group.graph, group.leaf): number for number, group in enumerate(groups)}
         self._sizes = [group.size for group in groups]
         self._terms: list[tuple[int, list[int], frozenset[str]]] = []
-        self._of: list[list[int]] = [[] for _ in groups]
+        self._terms_of_group: list[list[int]] = [[] for _ in groups]
         for graph, walk in walks.items():
             for product in range(len(walk.products)):
                 for (leaves, keepers), macs in walk.terms(product).items():
                     self._add(graph, walk, leaves, keepers, runs[graph] * macs)
 
     def saved(self, number: int, size: int, sizes: Sequence[int]) -> int:
-        """Return what is saved when one group has so many units instead of those that it has.
+        """Return the multiply-accumulates saved by reducing one group.
 
         Args:
-            number: Of the group.
-            size: Its units afterwards.
-            sizes: Units of each group.
+            number: Index of the group.
+            size: Number of its units afterwards.
+            sizes: Number of units of each group.
         """
         less = {number: size}
-        terms = (self._terms[term][:2] for term in self._of[number])
+        terms = (self._terms[term][:2] for term in self._terms_of_group[number])
         return sum(
             fixed
             * (math.prod(sizes[each] for each in loses) - math.prod(less.get(each, sizes[each]) for each in loses))
             for fixed, loses in terms
         )
 
-    def without(self, number: int, size: int) -> int:
-        """Return what is saved when one group has so many units, and all others are whole."""
+    def saved_alone(self, number: int, size: int) -> int:
+        """Return the multiply-accumulates saved by reducing one group to ``size`` units, with all others whole."""
         return self.saved(number, size, self._sizes)
 
     def macs(self, sizes: Sequence[int]) -> int:
-        """Return the work with so many units of each group."""
-        return sum(self._each(sizes))
+        """Return the multiply-accumulates for these numbers of units."""
+        return sum(self._term_macs(sizes))
 
     def keepers(self, sizes: Sequence[int]) -> dict[str, float]:
-        """Return who keeps a whole width of layers -> share of the work in these layers, with so many units."""
-        each = self._each(sizes)
+        """Return operator that keeps a whole width of layers -> share of the work in these layers."""
+        each = self._term_macs(sizes)
         kept: Counter[str] = Counter()
         for macs, (_, _, keepers) in zip(each, self._terms, strict=True):
             kept.update(dict.fromkeys(sorted(keepers), macs))
         return {keeper: macs / max(sum(each), 1) for keeper, macs in kept.most_common()}
 
     def _add(self, graph: str, walk: Walk, leaves: Sequence[int], keepers: frozenset[str], macs: int) -> None:
-        loses = [self._numbers[graph, leaf] for leaf in leaves if (graph, leaf) in self._numbers]
-        fixed = macs * math.prod(walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in self._numbers)
+        loses = [self._group_indices[graph, leaf] for leaf in leaves if (graph, leaf) in self._group_indices]
+        fixed = macs * math.prod(
+            walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in self._group_indices
+        )
         for number in set(loses):
-            self._of[number].append(len(self._terms))
+            self._terms_of_group[number].append(len(self._terms))
         self._terms.append((fixed, loses, keepers))
 
-    def _each(self, sizes: Sequence[int]) -> list[int]:
+    def _term_macs(self, sizes: Sequence[int]) -> list[int]:
         return [fixed * math.prod(sizes[number] for number in loses) for fixed, loses, _ in self._terms]
 
 
 def _is_slowest(walk: Walk, members: Sequence[Member]) -> bool:
-    """Leave out what lies within another unit, such as the elements of a head."""
+    """Return whether units do not lie within other units, as the elements of a head do."""
     return all(walk.factors.is_frozen(slower) for member in members for slower in member.atom.slower)
 
 
-def _magnitude(group: Group, weights: Mapping[str, Any]) -> NDArray[Any]:
-    """Return the product of the L2 norms of what writes and what reads each unit."""
+def _magnitude(group: UnitGroup, weights: Mapping[str, Any]) -> NDArray[Any]:
+    """Return the product of the L2 norms of the weights that write and that read each unit."""
     product = np.ones(group.size)
     for reads in (False, True):
         squares = [
-            _by_unit(weights[member.weight].detach().abs() ** 2, member)
+            _sum_by_unit(weights[member.weight].detach().abs() ** 2, member)
             for member in group.members
             if member.reads == reads and member.weight in weights and weights[member.weight].dim() > 1
         ]
@@ -256,20 +258,20 @@ def _magnitude(group: Group, weights: Mapping[str, Any]) -> NDArray[Any]:
     return product
 
 
-def _readers(group: Group) -> list[Member]:
-    """Return the weights that read the units; those that write them where nothing reads them."""
+def _reading_members(group: UnitGroup) -> list[Member]:
+    """Return the members that read the units; those that write them where none reads them."""
     return [member for member in group.members if member.reads] or group.members
 
 
-def _by_unit(values: Tensor, member: Member) -> NDArray[Any]:
-    """Return sums of a weight's values for each unit of a member: (units,)."""
+def _sum_by_unit(values: Tensor, member: Member) -> NDArray[Any]:
+    """Return the sum of a weight's values over each unit of a member: (units,)."""
     each = values.double().movedim(member.axis, 0).reshape(len(member.numbers), -1).sum(1)
     within = member.numbers >= 0
     return np.bincount(member.numbers[within], each.numpy()[within])
 
 
 def _actions(modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> Iterator[Any]:
-    """Yield the raw action of each recorded observation, with what the policy keeps of those before it."""
+    """Yield the raw action of each recorded observation, with the state from earlier ones."""
     program = BatchedProgram(source.manifest.program, modules)
     noise = drawn(program.noise, 1, np.random.default_rng(SEED))
     for passage in passages(source, program, noise, samples, LEADING):
