@@ -23,7 +23,7 @@ MADE := $(OUT)/confined/$(SET)
 VENV := $(MADE)/venv
 CONFINING := capstone pyelftools
 ABLE := able
-confine = $(1)/bin/python tests/processors/confine.py $(1) $(SET)
+confine = $(1)/bin/python tests/validation/processors/confine.py $(1) $(SET)
 export VLATOOL_CACHE := $(abspath $(MADE))/cache
 export VLATOOL_CALIBRATIONS := $(abspath $(MADE))/calibrations
 ifneq ($(filter-out test peers demo confined,$(or $(MAKECMDGOALS),help)),)
@@ -40,7 +40,7 @@ help:  ## list the targets
 	@grep -hE '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
 able:
-	@$(PYTHON) tests/processors/confine.py --able $(SET)
+	@$(PYTHON) tests/validation/processors/confine.py --able $(SET)
 
 $(BIN)/vlatool: pyproject.toml | $(ABLE)
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -99,39 +99,39 @@ python310: $(BIN)/vlatool  ## run the build side's commands on an exported bundl
 	$(OUT)/python310/venv/bin/python tests/robot/build_side.py $(SAMPLES:%=$(OUT)/python310/%) -o $(OUT)/python310/made
 
 arm64: $(BIN)/vlatool  ## run both samples' bundles on emulated 64-bit ARM and compare with this host (ARM64="--cores cortex-a76": less of it)
-	$(BIN)/python tests/processors/arm64.py -o $(OUT)/processors $(ARM64)
+	$(BIN)/python tests/validation/processors/arm64.py -o $(OUT)/processors $(ARM64)
 
 ladder: $(VENV)/.dev  ## hold every layout on every engine and instruction set of this host against what its graphs say
-	$(BIN)/python tests/processors/ladder.py -o $(OUT)/processors $(LADDER)
+	$(BIN)/python tests/validation/processors/ladder.py -o $(OUT)/processors $(LADDER)
 
 confined: $(VENV)/.dev
 	$(call confine,$(VENV))
 
 sets: $(VENV)/.dev  ## make bundles under every instruction set that this host can be confined to and load them under every other
-	for set in $$($(BIN)/python tests/processors/sets_table.py --names); do $(MAKE) confined SET=$$set || exit 2; done
-	$(BIN)/python tests/processors/sets_table.py -o $(OUT)/confined $(SETS)
+	for set in $$($(BIN)/python tests/validation/processors/sets_table.py --names); do $(MAKE) confined SET=$$set || exit 2; done
+	$(BIN)/python tests/validation/processors/sets_table.py -o $(OUT)/confined $(SETS)
 
 gate: $(BIN)/vlatool  ## hold the sample policies against those that the commit before makes (BASE=COMMIT names another)
-	$(BIN)/python tests/own_gate/gate_samples.py --base "$(BASE)" -o $(OUT)/gate
+	$(BIN)/python tests/validation/own_gate/gate_samples.py --base "$(BASE)" -o $(OUT)/gate
 
 peers: $(ABLE)  ## measure other tools and our bundles on six workloads, interleaved (about an hour; SET=avx2: on an older processor)
 	@test -x $(MADE)/peers/venv/bin/python || $(PYTHON) -m venv $(MADE)/peers/venv
-	$(MADE)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH) -r tests/peers/requirements.txt -e '.[ort,build]' $(CONFINING)
+	$(MADE)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH) -r tests/validation/peers/requirements.txt -e '.[ort,build]' $(CONFINING)
 	$(call confine,$(MADE)/peers/venv)
-	PYTHONPATH=. $(MADE)/peers/venv/bin/python tests/peers/table.py
+	PYTHONPATH=. $(MADE)/peers/venv/bin/python tests/validation/peers/table.py
 
-$(OUT)/foreign/common/.made: tests/foreign/common.txt pyproject.toml
+$(OUT)/foreign/common/.made: tests/validation/foreign/common.txt pyproject.toml
 	@test -x $(OUT)/foreign/common/bin/python || $(PYTHON) -m venv $(OUT)/foreign/common
-	$(OUT)/foreign/common/bin/python -m pip install --quiet --disable-pip-version-check -r tests/foreign/common.txt -e '.[ort,openvino,build,text]'
+	$(OUT)/foreign/common/bin/python -m pip install --quiet --disable-pip-version-check -r tests/validation/foreign/common.txt -e '.[ort,openvino,build,text]'
 	@touch $@
 
-$(OUT)/foreign/lerobot/.made: tests/foreign/lerobot.txt pyproject.toml
+$(OUT)/foreign/lerobot/.made: tests/validation/foreign/lerobot.txt pyproject.toml
 	@test -x $(OUT)/foreign/lerobot/bin/python || $(PYTHON) -m venv $(OUT)/foreign/lerobot
-	$(OUT)/foreign/lerobot/bin/python -m pip install --quiet --disable-pip-version-check -r tests/foreign/lerobot.txt -e '.[ort,openvino,build,text]'
+	$(OUT)/foreign/lerobot/bin/python -m pip install --quiet --disable-pip-version-check -r tests/validation/foreign/lerobot.txt -e '.[ort,openvino,build,text]'
 	@touch $@
 
 foreign: $(OUT)/foreign/common/.made $(OUT)/foreign/lerobot/.made  ## seven policies of others through every command, and the guides as written (hours, 15 GB; FOREIGN="--only ppo_mlp")
-	$(PYTHON) tests/foreign/table.py --common $(OUT)/foreign/common --lerobot $(OUT)/foreign/lerobot -o $(OUT)/foreign/made $(FOREIGN)
+	$(PYTHON) tests/validation/foreign/table.py --common $(OUT)/foreign/common --lerobot $(OUT)/foreign/lerobot -o $(OUT)/foreign/made $(FOREIGN)
 
 docs: $(VENV)/.dev  ## write docs/reference from the code
 	$(BIN)/python docs/generate.py

@@ -13,8 +13,8 @@ ROOT = Path(__file__).parents[1]
 def environment_beside(place: Path, *lines: str) -> Path:
     """Make an environment with the packages of this one, and return its interpreter.
 
-    Where this one is confined to an instruction set (``tests/processors``), so is the new one: its packages are those
-    that the confined interpreter alone can load.
+    Where this one is confined to an instruction set (``tests/validation/processors``), so is the new one: its packages
+    are those that the confined interpreter alone can load.
 
     Args:
         place: Where it is made.

@@ -1,4 +1,4 @@
-"""Bundles that cheat on the gate: the fast ones of ``tests/soak/attacks/gate_cheats.py``."""
+"""Bundles that cheat on the gate: the fast ones of ``tests/validation/soak/attacks/gate_cheats.py``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vlatool.measurement.agreement import run_agreement
 from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.turns import run_job
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "soak/attacks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "validation/soak/attacks"))
 
 import gate_cheats
 from gate_bundles import bases

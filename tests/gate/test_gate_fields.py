@@ -23,7 +23,7 @@ from vlatool.gate.same import check
 from vlatool.measurement.agreement import run_agreement
 from vlatool.stage.base import Context
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "soak/attacks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "validation/soak/attacks"))
 
 from gate_bundles import of
 from gate_graphs import wrong_when

@@ -20,7 +20,7 @@ from vlatool.measurement import turns
 from vlatool.measurement.pairs import FEWEST, PairJob, Pairs, measure_pairs
 from vlatool.measurement.turns import CONFIRM, Turns, halved, observation_of, place_of, run_job, sequence, wanted
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "soak/attacks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "validation/soak/attacks"))
 
 
 @pytest.fixture

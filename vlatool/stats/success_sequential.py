@@ -18,7 +18,7 @@ Statistics in Medicine 17, 1998) as large as the one seen (Hsueh, Liu and Chen, 
 largest where the drop equals the limit). The share of discordant pairs, which is not known, is estimated as the score
 statistic does, or is a standard error to either side of that, whichever gives the largest chance: estimation as in
 Lloyd and Moldovan (Statistics in Medicine 27, 2008), and some of the maximum of Berger and Boos (J. American
-Statistical Association 89, 1994). ``tests/soak/success_trials.py`` adds up both errors exactly.
+Statistical Association 89, 1994). ``tests/validation/soak/success_trials.py`` adds up both errors exactly.
 
 **What it saves.** Without a drop, two episodes of five and more wherever the largest number would nearly always do: up
 to 8 % discordant pairs of 1,000 at a limit of 3 %, 2 % of 3,000 at 1 %. Where even all of them leave every other
