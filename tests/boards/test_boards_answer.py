@@ -27,8 +27,8 @@ from vlatool.boards.simulate import Change
 from vlatool.boards.torch_workload import torch_workload
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, DataError, OutputError, SourceError, UsageError
-from vlatool.graph.stored import LAYOUT, digest, read_workload
 from vlatool.graph.workload import workload
+from vlatool.graph.workload_file import LAYOUT_VERSION, digest, read_workload
 from vlatool.hardware.profile import load_profile, names
 from vlatool.latency_model.board import Candidate, outcomes
 from vlatool.latency_model.model import shipped
@@ -68,7 +68,7 @@ def test_a_damaged_count_is_made_again(float_bundle: Bundle, content: bytes) -> 
     wanted = counted(float_bundle, Context())
     kept()[0].write_bytes(content)
     assert counted(float_bundle, Context()) == wanted
-    assert json.loads(kept()[0].read_text())["layout"] == LAYOUT
+    assert json.loads(kept()[0].read_text())["layout"] == LAYOUT_VERSION
 
 
 def test_a_cache_that_cannot_be_written_costs_time_alone(float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +108,7 @@ def test_a_count_of_something_else_is_made_again(
     elif change == "spec":
         description.write_text(description.read_text().replace("control_hz: 10", "control_hz: 20"))
     elif change == "another version":
-        monkeypatch.setattr("vlatool.graph.stored.VERSION", "99")
+        monkeypatch.setattr("vlatool.graph.workload_file.VERSION", "99")
     bundle = opened(str(policy_dir), Context())
     assert counted(bundle, Context()) == torch_workload(bundle)
 

@@ -12,7 +12,7 @@ from _arithmetic import exact
 from _qdq_reference import IMAGE, OPS, STYLES, X, close, conv, graph, quantized, rounded, rounded_weight, run, weight
 
 from vlatool.errors import GraphError
-from vlatool.graph.layers import find_layers, hoisted, split_gemm
+from vlatool.graph.layers import find_layers, hoisted_values, split_gemms
 from vlatool.graph.nodes import name_nodes
 from vlatool.quantize.int8.reductions import keep_reduced_axes
 from vlatool.runtime.engines.openvino import OpenvinoSession
@@ -39,7 +39,7 @@ def test_values_are_quantized_before_what_only_moves_them(move: str, shape: str,
     style = STYLES["hoist"]
     low = 0.0 if source == "node" else -3.0
     model, layers = quantized(graph(text, **known), style, {"a": (low, 3.0)})
-    assert hoisted(graph(text, **known), layers, style) == {"m": "a"}
+    assert hoisted_values(graph(text, **known), layers, style) == {"m": "a"}
     order = [node.op_type for node in model.graph.node]
     moves = [order.index(kind) for kind in ("Reshape", "Transpose", "Split", "Unsqueeze") if kind in order]
     assert order.index("QuantizeLinear") < min(moves)
@@ -103,12 +103,12 @@ def test_gemm_becomes_matmul_and_keeps_its_name_and_values(transposed: int) -> N
     w, b = weight(6, 5), weight(5, seed=2)
     text = f"(float[4,6] x) => (float[4,5] y) {{ y = Gemm<transB={transposed}>(x, w, b) }}"
     model = graph(text, w=np.ascontiguousarray(w.T) if transposed else w, b=b)
-    assert split_gemm(model) == 1
+    assert split_gemms(model) == 1
     assert [(node.op_type, node.name) for node in model.graph.node] == [("MatMul", "Gemm_0"), ("Add", "Gemm_0/bias")]
     close(run(model, x=X)["y"], X @ w + b)
     for options in ("alpha=2.0", "transA=1"):
         kept = graph(f"(float[6,6] x) => (float[6,5] y) {{ y = Gemm<{options}>(x, w) }}", w=w)
-        assert split_gemm(kept) == 0
+        assert split_gemms(kept) == 0
 
 
 def test_nodes_get_names_of_their_own() -> None:

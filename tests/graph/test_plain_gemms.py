@@ -10,8 +10,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.export.onnx import ExportOnnx
+from vlatool.graph.gemm_factors import extract_gemm_factors
 from vlatool.graph.layers import find_layers
-from vlatool.graph.plain_gemms import plain_gemms
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
@@ -54,8 +54,8 @@ CASES = {
 def test_the_same_values_and_a_layer(case: str) -> None:
     model = gemm(**CASES[case])  # type: ignore[arg-type]
     changed = onnx_ir.from_proto(model)
-    assert plain_gemms(changed) == 1
-    assert plain_gemms(changed) == 0
+    assert extract_gemm_factors(changed) == 1
+    assert extract_gemm_factors(changed) == 0
     plain = onnx_ir.to_proto(changed)
     onnx.checker.check_model(plain, full_check=True)
     random = np.random.default_rng(1)

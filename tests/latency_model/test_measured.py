@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from vlatool.errors import DataError, ProfileError
-from vlatool.graph.workload import WORK, GraphWorkload, Workload, whole_work
+from vlatool.graph.workload import WORKLOAD_TABLE, GraphWorkload, Workload, summarize_workload
 from vlatool.hardware.profile import load_profile
 from vlatool.latency_model.measured import Measured, calibrations, elsewhere, measured_in, measured_questions, store
 from vlatool.report import Measurement, Report, Row
@@ -36,7 +36,7 @@ def report(tmp_path: Path) -> Callable[..., Path]:
     """A function that writes a benchmark's report with one row."""
 
     def write(ms: float = 9.5, origin: str = "measured", **table: Any) -> Path:
-        details = {WORK: [WORKED | table]} if table is not None and "absent" not in table else {}
+        details = {WORKLOAD_TABLE: [WORKED | table]} if table is not None and "absent" not in table else {}
         row = Row("int8", measurements=(Measurement("latency_p50", ms, "ms", origin, samples=20),), details=details)
         (tmp_path / "report.json").write_text(Report("benchmark", "t", rows=(row,)).to_json())
         return tmp_path
@@ -203,7 +203,7 @@ def test_what_is_kept_can_be_read_again(report: Callable[..., Path], change: dic
 def test_the_work_of_an_inference_is_the_sum_over_its_graphs(load: Load) -> None:
     prefix = load(gmacs=4.0, weights_m=20.0, traits=frozenset({"attention"})).graphs["main"]
     step = GraphWorkload({"int8": 10**9}, 5, weights=1000, activations=100, traits=frozenset({"dense"}))
-    found = whole_work(Workload({"a": prefix, "b": step, "unused": prefix}, {"a": 1, "b": 10}))
+    found = summarize_workload(Workload({"a": prefix, "b": step, "unused": prefix}, {"a": 1, "b": 10}))
     assert found == {
         "macs": 4e9 + 10e9, "weights": 20e6 + 10_000, "activations": 2.5e6 + 1000, "layers": 21 + 50,
         "traits": ["attention", "dense"], "precision": "int8",

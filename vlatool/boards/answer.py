@@ -16,8 +16,8 @@ from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.errors import DataError, OutputError, SourceError, UsageError, instead, nearest
 from vlatool.export.onnx import ExportOnnx
 from vlatool.files.written import note_file
-from vlatool.graph.stored import digest, read_workload, refuse_other, write_workload
 from vlatool.graph.workload import PRECISIONS, Workload, workload
+from vlatool.graph.workload_file import digest, read_workload, refuse_foreign_file, write_workload
 from vlatool.hardware.platforms import load_platform
 from vlatool.hardware.profile import Profile, load_profile, names
 from vlatool.latency_model.board import Candidate, engine_for, outcomes, quantized_as
@@ -168,7 +168,7 @@ def carry_count(source: str, context: Context) -> Path:
             "put the code beside policy.yaml, or leave --carry-count out: the count is in the cache",
         )
     file = origin_of(bundle).folder / CARRIED
-    refuse_other(file)
+    refuse_foreign_file(file)
     load = counted(bundle, context)
     try:
         write_workload(file, load, digest(bundle))

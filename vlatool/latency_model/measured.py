@@ -12,7 +12,7 @@ from typing import Any
 
 from vlatool.errors import DataError, ProfileError
 from vlatool.files.edited import whole_file
-from vlatool.graph.workload import PRECISIONS, TRAITS, WORK, Workload, whole_work
+from vlatool.graph.workload import PRECISIONS, TRAITS, WORKLOAD_TABLE, Workload, summarize_workload
 from vlatool.hardware.profile import Profile, load_profile, names
 from vlatool.latency_model.board import Candidate, place_of
 from vlatool.latency_model.features import Question, Work
@@ -80,7 +80,7 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
         latency = row.get("latency_p50")
         if latency is None or not latency.known:
             continue
-        tables = row.details.get(WORK) or [whole_work(load) if load else {}]
+        tables = row.details.get(WORKLOAD_TABLE) or [summarize_workload(load) if load else {}]
         described = tables[0]
         if not described:
             missing += 1

@@ -270,7 +270,7 @@ class Search:
         return len(ranked)
 
     def _sensitivities(self, stage: StaticInt8) -> list[LayerError]:
-        from vlatool.sensitivity.apart import sensitivities_apart
+        from vlatool.sensitivity.child_process import sensitivities_apart
 
         if self._layers is None:
             stage = stage.model_copy(update={"attention": False, "elementwise": False})

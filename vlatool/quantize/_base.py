@@ -20,9 +20,9 @@ from vlatool.bundle.unexported import no_graph
 from vlatool.data import calibration_recording, observations_for
 from vlatool.errors import BundleError, RecipeError, instead, nearest
 from vlatool.files.scratch import scratch_directory
-from vlatool.graph.files import foreign_errors, load, part_phases, read, save
+from vlatool.graph.files import foreign_errors, load, read, save, split_phases
 from vlatool.graph.layers import Layer, find_layers
-from vlatool.graph.nodes import FOLDED, matches
+from vlatool.graph.nodes import FOLDED_MODULE_KEY, matches
 from vlatool.graph.precision import FLOATS
 from vlatool.quantize.calibration.non_finite import finite_layers
 from vlatool.runtime.arithmetic import EXACT
@@ -118,7 +118,7 @@ class Quantization(Transform):
                 else:
                     save(load(original), target)
                 if compute == "bfloat16":
-                    program, phase_graphs = part_phases(program, name, target)
+                    program, phase_graphs = split_phases(program, name, target)
                     graphs.update({key: replace(part, opset=graph.opset) for key, part in phase_graphs.items()})
                 shares = counted_shares(target, context)
             if compute:
@@ -280,6 +280,6 @@ def _folded_modules(bundle: Bundle) -> dict[str, str]:
         with foreign_errors(name):
             for node in read(bundle.file(graph.file), weights=False).graph.node:
                 for note in node.metadata_props:
-                    if note.key == FOLDED:
+                    if note.key == FOLDED_MODULE_KEY:
                         modules[node.name] = f"{note.value}/{node.op_type}"
     return modules

@@ -10,7 +10,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
-from vlatool.graph.layers import Layer, check_weights, part_inner_gemms, split_gemm
+from vlatool.graph.layers import Layer, check_weights, copy_inner_gemm_weights, split_gemms
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.graph.qdq import quantize_weight
 from vlatool.machine.instruction_sets import saturates
@@ -64,8 +64,8 @@ class DynamicInt8(Quantization):
     def _quantize(self, model: Any, target: Path, layers: list[Layer]) -> None:
         quantization, names = build_tool("quantization"), {layer.name for layer in layers}
         check_weights(model, layers)
-        split_gemm(model)  # ONNX Runtime's own rewrite transposes a weight in place for each of its readers
-        part_inner_gemms(model)
+        split_gemms(model)  # ONNX Runtime's own rewrite transposes a weight in place for each of its readers
+        copy_inner_gemm_weights(model)
         excluded = [node.name for node in model.graph.node if node.op_type in OPS and node.name not in names]
         with silenced_quantizer() as scratch:
             quantization.quantize_dynamic(

@@ -16,10 +16,10 @@ from vlatool.graph.layers import (
     Style,
     calibrated_values,
     check_weights,
-    convolved,
+    convolution_inputs,
     find_layers,
-    hoisted,
-    split_gemm,
+    hoisted_values,
+    split_gemms,
 )
 from vlatool.graph.qdq import Range, insert_qdq
 from vlatool.machine.instruction_sets import saturates
@@ -179,11 +179,11 @@ class StaticInt8(CalibratedQuantization):
             context.said.extend(describe_float_layers(name, model))
             pixels: dict[str, Range] = {}
             if self.int8_layout.integer:
-                split_gemm(model)
+                split_gemms(model)
                 if self.style.activations == "uint8":
                     pixels = fold_normalization(model, {layer.name for layer in layers[name]})
             chosen = self._layers_after_split(model, layers[name])
-            unsigned = convolved(chosen, self.style, hoisted(model, chosen, self.style))
+            unsigned = convolution_inputs(chosen, self.style, hoisted_values(model, chosen, self.style))
             insert_qdq(model, chosen, {**self.ranges(statistics[name], unsigned), **pixels}, self.style)
             if self.int8_layout.integer:
                 hoist_quantizers(model)
@@ -221,7 +221,7 @@ class StaticInt8(CalibratedQuantization):
         for name, chosen in layers.items():
             model = read(bundle.file(bundle.manifest.graphs[name].file))
             check_weights(model, chosen)
-            values[name] = calibrated_values(chosen, self.style, hoisted(model, chosen, self.style))
+            values[name] = calibrated_values(chosen, self.style, hoisted_values(model, chosen, self.style))
         return layers, values
 
     def _layers_after_split(self, model: Any, layers: list[Layer]) -> list[Layer]:

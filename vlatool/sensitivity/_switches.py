@@ -14,7 +14,7 @@ from typing import Any
 
 from vlatool.errors import GraphError
 from vlatool.graph.files import load
-from vlatool.graph.layers import Layer, Style, calibrated_values, hoisted
+from vlatool.graph.layers import Layer, Style, calibrated_values, hoisted_values
 from vlatool.graph.onnx_graph import FLOAT, OnnxGraph
 from vlatool.graph.qdq import Range, insert_qdq
 
@@ -39,7 +39,7 @@ def add_switches(
     """
     chosen = list(layers)
     written = load(path)
-    moved = hoisted(written, chosen, style)
+    moved = hoisted_values(written, chosen, style)
     plain = replace(style, hoist=False)
     known: dict[str, Range] = {}
     for name in calibrated_values(chosen, plain, {}):

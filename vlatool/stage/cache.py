@@ -25,7 +25,7 @@ from vlatool.files.locks import alone
 from vlatool.files.work import LOCK
 from vlatool.files.writing import sweep
 from vlatool.files.written import LEDGER, hash_once, read_listing
-from vlatool.graph.stored import is_workload
+from vlatool.graph.workload_file import is_workload
 
 STREAMS, WORKLOADS = "streams", "workloads"
 NAMES = {

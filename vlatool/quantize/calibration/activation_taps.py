@@ -9,7 +9,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Encoded, Moment
 from vlatool.errors import DataError, GraphError, require
-from vlatool.graph.files import write_beside
+from vlatool.graph.files import write_linked
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.machine.risky import risky
 from vlatool.runtime.contract import off_the_robot
@@ -41,7 +41,7 @@ class ActivationTap:
         add_outputs(graph)
         self._description = f"the graph '{path.stem}' with additional outputs"
         with risky(engine_class(), f"opened {self._description}"):
-            self._session = engine_class()(write_beside(graph.model, path, copy), 1)
+            self._session = engine_class()(write_linked(graph.model, path, copy), 1)
 
     def observe(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
         """Observe inputs and outputs of one run."""

@@ -78,7 +78,7 @@ class Float8Writer(QdqWriter):
         """Add one scale, from the largest magnitude, and the zero point that sets the type; return their names."""
         return self.add_scale(name, scale_of(self.ranges[name][1]))
 
-    def weight_codes(self, layer: Layer, least: Array | None) -> tuple[str, Array, Array]:
+    def weight_codes(self, layer: Layer, min_scales: Array | None) -> tuple[str, Array, Array]:
         """Return the name of a quantized weight, its codes and its scales."""
         axis = layer.axis if self.style.per_channel else None
         name = layer.weight if axis is None else f"{layer.weight}.{axis}"

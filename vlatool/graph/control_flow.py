@@ -1,4 +1,4 @@
-"""The bodies of If, Loop and Scan beside the nodes around them, so that shapes are inferred in them, too."""
+"""Inlined bodies of If, Loop and Scan, so that shapes are inferred in them, too."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import require
-from vlatool.graph.nodes import free_name
+from vlatool.graph.nodes import unique_name
 from vlatool.graph.onnx_graph import static_shape
 
-CONTROL = ("If", "Loop", "Scan")
-LOWEST_SCAN = 9
-"""Opset from which Scan has no lengths of sequences, which decide how many turns it makes."""
-STACKED = 4096
-"""Turns up to which what a loop stacks gets a shape."""
+CONTROL_OPS = ("If", "Loop", "Scan")
+MIN_SCAN_OPSET = 9
+"""First opset whose Scan has no sequence lengths, which would determine the iterations."""
+MAX_STACKED = 4096
+"""Largest number of iterations for which stacked outputs of a loop get a shape."""
 
 
 @dataclass(frozen=True)
 class Branches:
-    """The bodies of an If, of which one runs."""
+    """The bodies of an If, one of which runs."""
 
     bodies: tuple[tuple[Item, ...], ...]
 
 
 @dataclass(frozen=True)
-class Turns:
+class LoopBody:
     """The body of a Loop or Scan.
 
     Args:
-        body: What one turn runs.
-        count: How many there are, where the file says it.
-        along: A value, and the axis of it whose length they are, in its place.
+        body: Items of one iteration.
+        count: Number of iterations, when it is a constant.
+        along: Value and axis whose length is the number of iterations, instead of ``count``.
     """
 
     body: tuple[Item, ...]
@@ -43,11 +43,11 @@ class Turns:
 
 
 Item = Any
-"""A ``NodeProto``, ``Branches`` or ``Turns``."""
+"""A ``NodeProto``, ``Branches`` or ``LoopBody``."""
 
 
-def named_everywhere(model: Any) -> Any:
-    """Return a model without local functions whose nodes inside others have names of their own, changed in place."""
+def with_unique_names(model: Any) -> Any:
+    """Return a model without local functions and with unique names for nodes of subgraphs, changed in place."""
     if model.functions:
         model = require("onnx.inliner", "build").inline_local_functions(model)
     taken = {node.name for node in model.graph.node}
@@ -61,71 +61,73 @@ def _name_inside(node: Any, taken: set[str]) -> None:
         for graph in (*([item.g] if item.HasField("g") else []), *item.graphs):
             for number, inner in enumerate(graph.node):
                 if not inner.name or inner.name in taken:
-                    inner.name = free_name(inner.name or f"{node.name or node.op_type}/{inner.op_type}", number, taken)
+                    inner.name = unique_name(
+                        inner.name or f"{node.name or node.op_type}/{inner.op_type}", number, taken
+                    )
                 taken.add(inner.name)
                 _name_inside(inner, taken)
 
 
 def flatten(graph: Any, opset: int, known: Mapping[str, Any]) -> list[Item]:
-    """Put one turn of every body in front of the node that has it, in place; that node is gone.
+    """Replace every control-flow node by one iteration of each of its bodies, in place.
 
-    Values inside get names of their own; a loop begins its first turn with what it is given.
+    Values inside get unique names; a loop starts with its initial values.
 
     Args:
-        graph: Of a model from ``named_everywhere``.
-        opset: Of the model.
-        known: Value -> ``ValueInfoProto``, as inferred before.
+        graph: Graph of a model from ``with_unique_names``.
+        opset: Opset of the model.
+        known: Value -> ``ValueInfoProto`` from an earlier inference.
 
     Returns:
-        The nodes of the graph, those inside as they are repeated.
+        The nodes of the graph, with bodies nested as they run.
     """
-    flat = _Flat(graph, opset, known)
-    items = flat.of(graph.node, {}, "")
+    flat = _Flattener(graph, opset, known)
+    items = flat.add_nodes(graph.node, {}, "")
     del graph.node[:]
     graph.node.extend(flat.nodes)
     return list(items)
 
 
 def all_nodes(items: list[Item]) -> Iterator[Any]:
-    """Yield all nodes of what ``flatten`` returned, those inside too, in order."""
+    """Yield all nodes of the result of ``flatten``, including bodies, in order."""
     for item in items:
         if isinstance(item, Branches):
             for body in item.bodies:
                 yield from all_nodes(list(body))
-        elif isinstance(item, Turns):
+        elif isinstance(item, LoopBody):
             yield from all_nodes(list(item.body))
         else:
             yield item
 
 
 @dataclass
-class _Flat:
+class _Flattener:
     graph: Any
     opset: int
     known: Mapping[str, Any]
     nodes: list[Any] = field(default_factory=list)
     count: int = 0
 
-    def of(self, nodes: Any, names: Mapping[str, str], prefix: str) -> tuple[Item, ...]:
-        """Add nodes under other names; return them as they are repeated."""
+    def add_nodes(self, nodes: Any, names: Mapping[str, str], prefix: str) -> tuple[Item, ...]:
+        """Add nodes under new names; return them with nested bodies."""
         inside = {**names}
         items: list[Item] = []
         for node in nodes:
             renamed = _renamed(node, inside, prefix)
             subgraphs = {item.name: item.g for item in node.attribute if item.HasField("g")}
-            is_control = not node.domain and node.op_type in CONTROL and subgraphs
-            if is_control and not (node.op_type == "Scan" and self.opset < LOWEST_SCAN):
+            is_control = not node.domain and node.op_type in CONTROL_OPS and subgraphs
+            if is_control and not (node.op_type == "Scan" and self.opset < MIN_SCAN_OPSET):
                 items.append(self._body(renamed, subgraphs, inside))
             else:
                 items.append(renamed)
                 self.nodes.append(renamed)
         return tuple(items)
 
-    def _body(self, node: Any, subgraphs: Mapping[str, Any], names: Mapping[str, str]) -> Branches | Turns:
+    def _body(self, node: Any, subgraphs: Mapping[str, Any], names: Mapping[str, str]) -> Branches | LoopBody:
         if node.op_type == "If":
-            bodies = [self._inside(body, names, []) for body in subgraphs.values()]
+            bodies = [self._add_body(body, names, []) for body in subgraphs.values()]
             for name, given in zip(node.output, bodies[0][1], strict=False):
-                self._give(name, given, None, 0)
+                self._connect_output(name, given, None, 0)
             return Branches(tuple(items for items, _ in bodies))
         return (
             self._loop(node, subgraphs["body"], names)
@@ -133,19 +135,19 @@ class _Flat:
             else self._scan(node, subgraphs["body"], names)
         )
 
-    def _loop(self, node: Any, body: Any, names: Mapping[str, str]) -> Turns:
+    def _loop(self, node: Any, body: Any, names: Mapping[str, str]) -> LoopBody:
         numpy = require("onnx.numpy_helper", "build")
         first, holds = self._name("turn"), self._name("condition")
         self.graph.initializer.append(numpy.from_array(np.array(0, np.int64), first))
         self.graph.initializer.append(numpy.from_array(np.array(True), holds))
         states = list(node.input[2:])
-        items, given = self._inside(body, names, [first, holds, *states])
-        turns = self._constant(node.input[0]) if node.input[0] else None
-        for place, (name, value) in enumerate(zip(node.output, given[1:], strict=False)):
-            self._give(name, value, None if place < len(states) else turns or 0, 0)
-        return Turns(items, turns)
+        items, given = self._add_body(body, names, [first, holds, *states])
+        count = self._constant(node.input[0]) if node.input[0] else None
+        for index, (name, value) in enumerate(zip(node.output, given[1:], strict=False)):
+            self._connect_output(name, value, None if index < len(states) else count or 0, 0)
+        return LoopBody(items, count)
 
-    def _scan(self, node: Any, body: Any, names: Mapping[str, str]) -> Turns:
+    def _scan(self, node: Any, body: Any, names: Mapping[str, str]) -> LoopBody:
         options = {item.name: item for item in node.attribute}
         count = int(options["num_scan_inputs"].i)
         states, scanned = list(node.input[:-count]), list(node.input[-count:])
@@ -155,20 +157,20 @@ class _Flat:
         zero = self._name("first")
         self.graph.initializer.append(require("onnx.numpy_helper", "build").from_array(np.array(0, np.int64), zero))
         slices = []
-        for place, name in enumerate(scanned):
+        for index, name in enumerate(scanned):
             slices.append(self._name("slice"))
-            self._add("Gather", [name, zero], slices[-1], axis=into[place] if into else 0)
-        items, given = self._inside(body, names, [*states, *slices])
+            self._add("Gather", [name, zero], slices[-1], axis=into[index] if into else 0)
+        items, given = self._add_body(body, names, [*states, *slices])
         axis = into[0] if into else 0
         length = static_shape(self.known[scanned[0]].type.tensor_type) if scanned[0] in self.known else None
-        for place, (name, value) in enumerate(zip(node.output, given, strict=False)):
-            stacked = place - len(states)
+        for index, (name, value) in enumerate(zip(node.output, given, strict=False)):
+            stacked = index - len(states)
             along = out[stacked] if out and stacked >= 0 else 0
-            self._give(name, value, None if stacked < 0 else (length[axis] if length else 0), along)
-        return Turns(items, along=(scanned[0], axis))
+            self._connect_output(name, value, None if stacked < 0 else (length[axis] if length else 0), along)
+        return LoopBody(items, along=(scanned[0], axis))
 
-    def _inside(self, body: Any, names: Mapping[str, str], fed: list[str]) -> tuple[tuple[Item, ...], list[str]]:
-        """Add the nodes of a body; return them, and the names of what it gives."""
+    def _add_body(self, body: Any, names: Mapping[str, str], fed: list[str]) -> tuple[tuple[Item, ...], list[str]]:
+        """Add the nodes of a body; return them, and the names of its outputs."""
         prefix = self._name("inside") + "/"
         inside = {**names, **dict(zip((value.name for value in body.input), fed, strict=False))}
         for tensor in body.initializer:
@@ -176,11 +178,11 @@ class _Flat:
             self.graph.initializer[-1].name = inside[tensor.name] = prefix + tensor.name
         for name in (name for node in body.node for name in node.output if name):
             inside[name] = prefix + name
-        items = self.of(body.node, inside, prefix)
+        items = self.add_nodes(body.node, inside, prefix)
         return items, [inside.get(value.name, value.name) for value in body.output]
 
-    def _give(self, name: str, value: str, stacked: int | None, axis: int) -> None:
-        """Let a value of a body be one of the node around it: as it is, or once for each of so many turns."""
+    def _connect_output(self, name: str, value: str, stacked: int | None, axis: int) -> None:
+        """Connect a value of a body to an output of its node: directly, or stacked over the iterations."""
         if not name:
             return
         before = self.known.get(name)
@@ -188,7 +190,7 @@ class _Flat:
             self.graph.value_info.append(before)
         elif stacked is None:
             self._add("Identity", [value], name)
-        elif 0 < stacked <= STACKED:
+        elif 0 < stacked <= MAX_STACKED:
             part = self._name("part")
             if self.opset < 13:
                 self._add("Unsqueeze", [value], part, axes=[axis])
@@ -207,7 +209,7 @@ class _Flat:
         return f"vlatool.{what}.{self.count}"
 
     def _constant(self, name: str) -> int | None:
-        """Return the number that a value holds, where the file says it."""
+        """Return the number in a constant; None for other values."""
         helper = require("onnx.numpy_helper", "build")
         tensor = next((tensor for tensor in self.graph.initializer if tensor.name == name), None)
         maker = next((node for node in self.nodes if name in node.output), None)
@@ -217,7 +219,7 @@ class _Flat:
 
 
 def _renamed(node: Any, names: Mapping[str, str], prefix: str) -> Any:
-    """Return a copy of a node that reads and gives values under their names in the flat graph."""
+    """Return a copy of a node with the names of the flat graph."""
     renamed = copy.deepcopy(node)
     renamed.input[:] = [names.get(name, name) for name in node.input]
     renamed.output[:] = [names.get(name, name) if prefix else name for name in node.output]

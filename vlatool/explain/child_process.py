@@ -1,4 +1,4 @@
-"""Explain a bundle in a child process: engines open it with profilers on, and run graphs that nobody has run yet."""
+"""Explain a bundle in a child process, since engines open it with profilers on and run graphs for the first time."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ PRELOAD = ("numpy", "onnx", "onnxruntime", __name__)
 Tell = Callable[[str, float | None], None]
 
 
-def explain_apart(bundle: Bundle, options: Options, context: Context) -> Report:
+def explain_in_child(bundle: Bundle, options: Options, context: Context) -> Report:
     """Return the report of ``explain``.
 
     Raises:
-        VlatoolError: what ``explain`` raises; GraphError when an engine ends the child.
+        VlatoolError: errors of ``explain``; GraphError when an engine crashes the child.
     """
-    job = {"bundle": str(bundle.path.absolute()), "options": _written(options)}
+    job = {"bundle": str(bundle.path.absolute()), "options": _options_to_json(options)}
     return Report.from_json(_call("report", job, context))
 
 
-def explanation_apart(bundle: Bundle, baseline: Bundle | None, context: Context, **limits: float) -> tuple[str, ...]:
-    """Return the sentences of ``explanation``, or one that says why there are none.
+def explanation_in_child(bundle: Bundle, baseline: Bundle | None, context: Context, **limits: float) -> tuple[str, ...]:
+    """Return the sentences of ``explanation``, or one with the reason why it failed.
 
     Args:
-        bundle: What is explained.
+        bundle: Bundle to explain.
         baseline: The float32 bundle that it was made from.
-        context: For progress.
-        limits: Of ``explanation``.
+        context: Receiver of progress.
+        limits: Limits for ``explanation``.
     """
     paths = [str(each.path.absolute()) if each is not None else "" for each in (bundle, baseline)]
     try:
@@ -46,9 +46,9 @@ def explanation_apart(bundle: Bundle, baseline: Bundle | None, context: Context,
 
 def report(job: Mapping[str, Any], tell: Tell) -> str:
     """Explain the bundle of a job in this process; return the report as JSON."""
-    given = job["options"]
-    paths = {name: Path(given[name]) if given[name] else None for name in ("baseline", "data")}
-    return explain(Bundle.open(Path(job["bundle"])), Options(**{**given, **paths}), Context(tell)).to_json()
+    options = job["options"]
+    paths = {name: Path(options[name]) if options[name] else None for name in ("baseline", "data")}
+    return explain(Bundle.open(Path(job["bundle"])), Options(**{**options, **paths}), Context(tell)).to_json()
 
 
 def sentences(job: Mapping[str, Any], tell: Tell) -> list[str]:
@@ -61,6 +61,6 @@ def _call(function: str, job: Mapping[str, Any], context: Context) -> Any:
     return children.call(f"{__name__}:{function}", job, context.tell, "explain", PRELOAD, own=True)
 
 
-def _written(options: Options) -> dict[str, Any]:
+def _options_to_json(options: Options) -> dict[str, Any]:
     paths = {name: str(path) if path else "" for name, path in (("baseline", options.baseline), ("data", options.data))}
     return {**to_json(options), **paths}

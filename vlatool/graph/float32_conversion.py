@@ -1,4 +1,4 @@
-"""A graph whose layers compute in another floating type, as one in float32: what engines and all stages begin with."""
+"""Conversion of graphs that compute in other floating types to float32, which all stages start from."""
 
 from __future__ import annotations
 
@@ -12,62 +12,62 @@ import numpy as np
 from vlatool.errors import require
 from vlatool.graph.files import save
 from vlatool.graph.macs import COMPUTE
-from vlatool.graph.nodes import free_name, nodes_inside, rename_reads
+from vlatool.graph.nodes import inner_nodes, rename_reads, unique_name
 from vlatool.graph.onnx_graph import FLOAT, OnnxGraph, type_name
 
 FLOAT16, FLOAT64, BFLOAT16 = 10, 11, 16
 """``TensorProto.DataType``."""
 ROUNDING = {"bfloat16": 0.05, "float16": 0.01}
-"""Relative L2 difference that may lie between a graph in such a type, which rounds each value, and it in float32."""
-TYPED = ("to", "dtype", "stash_type", "output_dtype", "softmax_precision")
-"""Attributes that hold such a type."""
+"""Largest relative L2 difference between a graph in such a type, which rounds each value, and the same in float32."""
+TYPE_ATTRIBUTES = ("to", "dtype", "stash_type", "output_dtype", "softmax_precision")
+"""Attributes that hold a ``TensorProto.DataType``."""
 
 
 def as_float32(model: Any) -> tuple[str, ...]:
-    """Let a graph compute in float32 where its layers compute in float16, bfloat16 or float64, in place.
+    """Convert a graph whose layers compute in float16, bfloat16 or float64 to float32, in place.
 
     Weights in float16 and bfloat16 keep their values exactly, those in float64 are rounded. Inputs and outputs keep
-    their types, but for bfloat16, which numpy lacks: these become float32. float64 or float16 beside layers in float32,
+    their types, except bfloat16, which numpy lacks: these become float32. float64 or float16 next to layers in float32,
     such as phases, stays.
 
     Args:
-        model: An ``onnx.ModelProto`` with its weights, whose local functions are inlined.
+        model: An ``onnx.ModelProto`` with its weights and with inlined local functions.
 
     Returns:
-        The types that are gone (``bfloat16``); none where nothing was changed.
+        The replaced types (``bfloat16``); empty without a change.
     """
-    codes = _computed_in(model) & {FLOAT16, FLOAT64} | ({BFLOAT16} if _holds(model.graph, BFLOAT16) else set())
+    codes = _compute_types(model) & {FLOAT16, FLOAT64} | ({BFLOAT16} if _uses_type(model.graph, BFLOAT16) else set())
     if not codes:
         return ()
     for value in (*model.graph.input, *model.graph.output):
         if value.type.tensor_type.elem_type == BFLOAT16:
             value.type.tensor_type.elem_type = FLOAT
-    ends = {value.name: value.type.tensor_type.elem_type for value in (*model.graph.input, *model.graph.output)}
+    interface = {value.name: value.type.tensor_type.elem_type for value in (*model.graph.input, *model.graph.output)}
     _retype(model.graph, codes, outermost=True)
-    _cast_ends(model.graph, {name: code for name, code in ends.items() if code in codes})
+    _cast_interface(model.graph, {name: code for name, code in interface.items() if code in codes})
     return tuple(sorted(map(type_name, codes)))
 
 
-def written_in_float32(path: Path) -> tuple[str, ...]:
-    """Rewrite a file whose layers compute in another type, as ``as_float32`` does; return the types that are gone."""
+def rewrite_as_float32(path: Path) -> tuple[str, ...]:
+    """Convert a file as ``as_float32`` does; return the replaced types."""
     onnx = require("onnx", "build")
     light = onnx.load(str(path), load_external_data=False)
-    if not (_computed_in(light) & {FLOAT16, FLOAT64} or _holds(light.graph, BFLOAT16)):
+    if not (_compute_types(light) & {FLOAT16, FLOAT64} or _uses_type(light.graph, BFLOAT16)):
         return ()
     model = onnx.load(str(path))
-    gone = as_float32(model)
+    replaced = as_float32(model)
     save(model, path)
-    return gone
+    return replaced
 
 
-def float32_text(gone: Iterable[str]) -> str:
-    """Say that a graph computes in float32 now."""
-    types = " and ".join(gone)
-    return f"layers compute in {types}; the graph is written in float32, in which all stages begin"
+def describe_conversion(replaced: Iterable[str]) -> str:
+    """Describe the conversion of a graph to float32."""
+    types = " and ".join(replaced)
+    return f"layers compute in {types}; the graph is converted to float32, which all stages start from"
 
 
-def _computed_in(model: Any) -> set[int]:
-    """Return the types of the second operands of compute layers, and of first ones."""
+def _compute_types(model: Any) -> set[int]:
+    """Return the types of both operands of compute layers."""
     graph = OnnxGraph(model)
     types = {name: tensor.data_type for name, tensor in graph.constants.items()}
     with contextlib.suppress(Exception):  # the seam: onnx infers nothing beside operators that it does not know
@@ -79,19 +79,19 @@ def _computed_in(model: Any) -> set[int]:
 def _all_nodes(graph: Any) -> Iterator[Any]:
     for node in graph.node:
         yield node
-        yield from nodes_inside(node)
+        yield from inner_nodes(node)
 
 
 def _graphs(graph: Any) -> Iterator[Any]:
-    """Yield a graph and those inside of it."""
+    """Yield a graph and its subgraphs."""
     yield graph
     for node in _all_nodes(graph):
         for item in node.attribute:
             yield from (*([item.g] if item.HasField("g") else []), *item.graphs)
 
 
-def _holds(graph: Any, code: int) -> bool:
-    """Return whether a value, a constant or an attribute of a graph has a type."""
+def _uses_type(graph: Any, code: int) -> bool:
+    """Return whether a value, a constant or an attribute of a graph has the type."""
     for inner in _graphs(graph):
         values = (*inner.input, *inner.output, *inner.value_info)
         if any(tensor.data_type == code for tensor in inner.initializer):
@@ -99,7 +99,7 @@ def _holds(graph: Any, code: int) -> bool:
         if any(value.type.tensor_type.elem_type == code for value in values):
             return True
     items = (item for node in _all_nodes(graph) for item in node.attribute)
-    return any((item.name in TYPED and item.i == code) or item.t.data_type == code for item in items)
+    return any((item.name in TYPE_ATTRIBUTES and item.i == code) or item.t.data_type == code for item in items)
 
 
 def _retype(graph: Any, codes: set[int], outermost: bool) -> None:
@@ -110,7 +110,7 @@ def _retype(graph: Any, codes: set[int], outermost: bool) -> None:
         _widen(tensor, codes)
     for node in graph.node:
         for item in node.attribute:
-            if item.name in TYPED and item.i in codes:
+            if item.name in TYPE_ATTRIBUTES and item.i in codes:
                 item.i = FLOAT
             for tensor in (*([item.t] if item.HasField("t") else []), *item.tensors):
                 _widen(tensor, codes)
@@ -125,25 +125,25 @@ def _widen(tensor: Any, codes: set[int]) -> None:
             tensor.CopyFrom(helper.from_array(helper.to_array(tensor).astype(np.float32), tensor.name))
 
 
-def _cast_ends(graph: Any, ends: dict[str, int]) -> None:
-    """Put a Cast behind inputs, and in front of outputs, that keep another type."""
+def _cast_interface(graph: Any, interface: dict[str, int]) -> None:
+    """Insert a Cast after inputs, and before outputs, that keep another type."""
     helper = require("onnx.helper", "build")
     taken = {tensor.name for tensor in graph.initializer} | {name for node in graph.node for name in node.output}
     before, after = [], []
-    for name in _named(graph.input, ends):
-        inner = free_name(f"{name}_float32", 0, taken)
+    for name in _names_among(graph.input, interface):
+        inner = unique_name(f"{name}_float32", 0, taken)
         rename_reads(graph, name, inner)
         before.append(helper.make_node("Cast", [name], [inner], f"{name}/Cast", to=FLOAT))
-    for name in _named(graph.output, ends):
-        inner = free_name(f"{name}_float32", 0, taken)
+    for name in _names_among(graph.output, interface):
+        inner = unique_name(f"{name}_float32", 0, taken)
         rename_reads(graph, name, inner)
         for node in graph.node:
             node.output[:] = [inner if given == name else given for given in node.output]
-        after.append(helper.make_node("Cast", [inner], [name], f"{name}/Cast", to=ends[name]))
+        after.append(helper.make_node("Cast", [inner], [name], f"{name}/Cast", to=interface[name]))
     nodes = [*before, *graph.node, *after]
     del graph.node[:]
     graph.node.extend(nodes)
 
 
-def _named(values: Iterable[Any], ends: dict[str, int]) -> list[str]:
-    return [value.name for value in values if value.name in ends]
+def _names_among(values: Iterable[Any], interface: dict[str, int]) -> list[str]:
+    return [value.name for value in values if value.name in interface]

@@ -1,4 +1,4 @@
-"""A workload as a file: in the cache, or beside a policy that carries it."""
+"""Workload files: in the cache, or next to a policy."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from vlatool.files.edited import whole_file
 from vlatool.graph.workload import GraphWorkload, Workload
 from vlatool.machine.version import VERSION
 
-LAYOUT = 4
-"""Version of the file."""
+LAYOUT_VERSION = 4
+"""Version of the file format."""
 COUNTS = ("layers", "weights", "read_again", "activations", "weight_bytes", "activation_bytes", "peak_bytes")
 
 
 def digest(bundle: Bundle) -> str:
-    """Return what a count of a source depends on, as SHA-256: code, weights, arguments, spec, program and parts.
+    """Return the SHA-256 of everything that a count of a source depends on: code, weights, arguments, spec and program.
 
-    vlatool's own samples are known by its version.
+    vlatool's own samples are identified by its version.
     """
     manifest = bundle.manifest.to_dict()
     depends = {key: manifest.get(key) for key in ("source", "spec", "program", "parts")}
@@ -32,18 +32,18 @@ def digest(bundle: Bundle) -> str:
 
 
 def read_workload(file: Path, of: str = "") -> Workload | None:
-    """Return the workload of a file; None when there is none, it is damaged, or it is of something else.
+    """Return the workload of a file; None when the file is missing, damaged or of another source.
 
     Args:
-        file: The file.
-        of: ``digest`` that it must have.
+        file: Path of the file.
+        of: Expected ``digest``.
     """
     data = _content(file)
     return from_values(data) if data.get("digest", "") == of else None
 
 
 def _content(file: Path) -> dict[str, Any]:
-    """Return what a file of JSON holds; nothing when it is missing, damaged or of something else."""
+    """Return the content of a JSON file; empty when it is missing, damaged or not an object."""
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -52,16 +52,16 @@ def _content(file: Path) -> dict[str, Any]:
 
 
 def is_workload(file: Path) -> bool:
-    """Say whether a file is one of this package's, of an earlier layout too, which nobody reads any more."""
+    """Return whether a file is a workload file, including earlier formats, which are no longer read."""
     data = _content(file)
     if not isinstance(data.get("layout"), int):
         return False
-    return from_values(data) is not None if data["layout"] >= LAYOUT else isinstance(data.get("graphs"), dict)
+    return from_values(data) is not None if data["layout"] >= LAYOUT_VERSION else isinstance(data.get("graphs"), dict)
 
 
 def from_values(data: Any) -> Workload | None:
-    """Return the workload of what ``to_values`` gave; None when it is something else."""
-    if not isinstance(data, dict) or data.get("layout") != LAYOUT:
+    """Return the workload from the result of ``to_values``; None for anything else."""
+    if not isinstance(data, dict) or data.get("layout") != LAYOUT_VERSION:
         return None
     graphs = {}
     try:
@@ -79,7 +79,7 @@ def from_values(data: Any) -> Workload | None:
         return None
 
 
-def refuse_other(file: Path) -> None:
+def refuse_foreign_file(file: Path) -> None:
     """Refuse a file that ``write_workload`` did not write.
 
     Raises:
@@ -92,7 +92,7 @@ def refuse_other(file: Path) -> None:
 
 
 def write_workload(file: Path, work: Workload, of: str = "") -> None:
-    """Write a workload as ``read_workload`` reads it.
+    """Write a workload for ``read_workload``.
 
     Raises:
         OSError: when the file cannot be written.
@@ -109,4 +109,4 @@ def to_values(work: Workload) -> dict[str, Any]:
     for name, graph in work.graphs.items():
         fields = dataclasses.asdict(graph)
         graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
-    return {"layout": LAYOUT, "graphs": graphs, "runs": dict(work.runs)}
+    return {"layout": LAYOUT_VERSION, "graphs": graphs, "runs": dict(work.runs)}

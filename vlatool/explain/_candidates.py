@@ -1,4 +1,4 @@
-"""What to do about it: candidates that are really made, and measured beside the bundle as it is."""
+"""Candidates for improvement, built and measured together with the current bundle."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
-from vlatool.explain._islands import Fallback
+from vlatool.explain._float_roundtrips import Fallback
 from vlatool.explain._operators import raw_actions, reference_engine
 from vlatool.measurement.interleaved import Contestant, run_interleaved
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -23,29 +23,29 @@ from vlatool.sensitivity.layers import LayerError
 from vlatool.stage.base import Context, Stage, Transform
 from vlatool.stage.run import run_transform
 
-MOST_LAYERS = (1, 2, 4)
-"""How many of the worst layers the candidates leave in float32."""
-SLOWER = 1.10
-"""A candidate may be so much slower than the bundle as it is and still be suggested for its accuracy."""
-BETTER = 0.9
-"""A candidate is suggested when it makes the error, or the latency, at most so much of what it is."""
-NEAR = 1.25
-"""Of those within so much of the least error the one that changes least is suggested."""
+EXCLUDED_LAYERS = (1, 2, 4)
+"""Numbers of the worst layers that the candidates keep in float32."""
+MAX_SLOWDOWN = 1.10
+"""Largest ratio of the latency of a candidate that is suggested for its accuracy."""
+MAX_REMAINING = 0.9
+"""Largest ratio of error, or latency, to that of the current bundle for a suggestion."""
+NEAR_BEST = 1.25
+"""Largest ratio to the least error within which the smallest change is preferred."""
 ITERATIONS = 40
 
 
 @dataclass
 class Candidate:
-    """One change of the quantization, made and measured.
+    """A changed quantization, built and measured.
 
     Args:
-        name: What is changed, in words.
-        stage: With the change.
-        layers: How many further layers stay in float32.
-        bundle: None until it was made.
+        name: Description of the change.
+        stage: Stage with the change.
+        layers: Number of additional layers in float32.
+        bundle: The new bundle; None until it is built.
         error: Relative L2 error of the raw action to float32, mean over the observations.
-        contestant: Holds its latencies.
-        failed: Why it could not be made.
+        contestant: Contestant with its latencies.
+        failed: Reason why it could not be built.
     """
 
     name: str
@@ -58,75 +58,77 @@ class Candidate:
 
     @property
     def ms(self) -> float:
-        """Median latency in ms, NaN when it was not measured."""
+        """Median latency in ms, NaN when not measured."""
         return float(np.median(self.contestant.samples)) if self.contestant else float("nan")
 
 
 @dataclass(frozen=True)
-class Contest:
+class Comparison:
     """Bundles measured in one run.
 
     Args:
-        now: The bundle as it is.
+        current: The bundle to explain.
         baseline: The float32 bundle; None when it was not found.
-        others: What was tried.
+        others: Candidates.
     """
 
-    now: Candidate
+    current: Candidate
     baseline: Candidate | None
     others: list[Candidate] = field(default_factory=list)
 
     @property
     def speed(self) -> float:
-        """Median latency of float32 over that of the bundle as it is; NaN without float32."""
-        return self.baseline.ms / self.now.ms if self.baseline is not None else float("nan")
+        """Median latency of float32 over that of the current bundle; NaN without float32."""
+        return self.baseline.ms / self.current.ms if self.baseline is not None else float("nan")
 
     @property
     def suggested(self) -> Candidate | None:
-        """Return the candidate that helps most for the least change; None when none does."""
-        fair = [candidate for candidate in self.others if candidate.error <= self.now.error * NEAR]
+        """The candidate with the largest improvement for the least change; None when none improves enough."""
+        fair = [candidate for candidate in self.others if candidate.error <= self.current.error * NEAR_BEST]
         exact = [
             candidate
             for candidate in fair
-            if candidate.error <= BETTER * self.now.error and candidate.ms <= SLOWER * self.now.ms
+            if candidate.error <= MAX_REMAINING * self.current.error and candidate.ms <= MAX_SLOWDOWN * self.current.ms
         ]
         if exact:
             least = min(candidate.error for candidate in exact)
             return min(
-                (candidate for candidate in exact if candidate.error <= NEAR * least),
+                (candidate for candidate in exact if candidate.error <= NEAR_BEST * least),
                 key=lambda candidate: candidate.layers,
             )
-        fast = [candidate for candidate in fair if candidate.ms <= BETTER * self.now.ms]
+        fast = [candidate for candidate in fair if candidate.ms <= MAX_REMAINING * self.current.ms]
         return min(fast, key=lambda candidate: candidate.ms) if fast else None
 
 
-def plans(stage: Stage | None, worst: Sequence[LayerError], fallen: Sequence[Fallback], engine: str) -> list[Candidate]:
+def plan_candidates(
+    stage: Stage | None, worst: Sequence[LayerError], fallbacks: Sequence[Fallback], engine: str
+) -> list[Candidate]:
     """Return the candidates for a stage: the worst layers in float32, other ranges, the layout for the engine."""
-    tried: list[Candidate] = []
+    candidates: list[Candidate] = []
     fixed, before = stage, ""
-    if isinstance(stage, StaticInt8) and fallen:
+    if isinstance(stage, StaticInt8) and fallbacks:
         integer = next((name for name, layout in engine_class(engine).layouts.items() if layout.integer), stage.layout)
         if stage.layout != integer:
             fixed, before = stage.model_copy(update={"layout": integer}), f"layout {integer}"
         elif stage.activations != "auto":
             fixed, before = stage.model_copy(update={"activations": "auto"}), "activations auto"
         if before:
-            tried.append(Candidate(before, fixed))
+            candidates.append(Candidate(before, fixed))
     if isinstance(fixed, StaticInt8 | DynamicInt8):
-        for count in MOST_LAYERS:
+        for count in EXCLUDED_LAYERS:
             if count < len(worst):
                 names = tuple(pattern(layer.name) for layer in worst[:count])
                 words = f"without {count} layer{'s' if count > 1 else ''}"
                 changed = fixed.model_copy(update={"exclude": (*fixed.exclude, *names)})
-                tried.append(Candidate(", ".join(filter(None, (before, words))), changed, count))
+                candidates.append(Candidate(", ".join(filter(None, (before, words))), changed, count))
     if isinstance(fixed, StaticInt8) and fixed.method == "minmax" and worst:
         words = ", ".join(filter(None, (before, "method mse")))
-        tried.append(Candidate(words, fixed.model_copy(update={"method": "mse"})))
-    return tried
+        candidates.append(Candidate(words, fixed.model_copy(update={"method": "mse"})))
+    return candidates
 
 
 def pattern(name: str) -> str:
-    """Return a glob that matches a node's name and nothing else."""
+    """Return a glob that matches only the given name."""
     return re.sub(r"([\[*?])", r"[\1]", name)
 
 
@@ -138,19 +140,19 @@ def measure(
     scratch: Path,
     threads: int,
     context: Context,
-) -> Contest:
-    """Make the candidates and measure error and interleaved latency of all.
+) -> Comparison:
+    """Build the candidates and measure error and interleaved latency of all.
 
     Args:
-        bundle: As it is.
-        baseline: float32.
-        tried: From ``plans``.
-        observations: Raw observations that the errors and latencies are taken on.
-        scratch: Where the candidates are made.
-        threads: Intra-op threads.
-        context: For progress.
+        bundle: The bundle to explain.
+        baseline: The float32 bundle.
+        tried: From ``plan_candidates``.
+        observations: Raw observations for errors and latencies.
+        scratch: Directory of the candidates.
+        threads: Number of intra-op threads.
+        context: Receiver of progress.
     """
-    now = Candidate("as it is", None, bundle=bundle)
+    current = Candidate("as it is", None, bundle=bundle)
     base = Candidate("float32", None, bundle=baseline) if baseline is not None else None
     for number, candidate in enumerate(tried):
         context.tell(f"making a candidate: {candidate.name}", None)
@@ -161,7 +163,7 @@ def measure(
         except VlatoolError as error:
             candidate.failed = error.message
     candidates = [
-        candidate for candidate in (base, now, *tried) if candidate is not None and candidate.bundle is not None
+        candidate for candidate in (base, current, *tried) if candidate is not None and candidate.bundle is not None
     ]
     reference: list[Any] = []
     for candidate in candidates:
@@ -180,4 +182,4 @@ def measure(
     run_interleaved(
         [candidate.contestant for candidate in candidates if candidate.contestant], ITERATIONS, 5, context.tell
     )
-    return Contest(now, base, [candidate for candidate in tried if candidate.bundle is not None])
+    return Comparison(current, base, [candidate for candidate in tried if candidate.bundle is not None])
