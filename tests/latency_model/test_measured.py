@@ -13,13 +13,20 @@ import pytest
 from vlatool.errors import DataError, ProfileError
 from vlatool.graph.workload import WORKLOAD_TABLE, GraphWorkload, Workload, summarize_workload
 from vlatool.hardware.profile import load_profile
-from vlatool.latency_model.measured import Measured, calibrations, elsewhere, measured_in, measured_questions, store
+from vlatool.latency_model.board_measurements import (
+    BoardMeasurement,
+    calibrations,
+    foreign_host,
+    measured_questions,
+    report_measurements,
+    store,
+)
 from vlatool.report import Measurement, Report, Row
 
 Load = Callable[..., Workload]
 PI = load_profile("raspberry-pi-5")
 WORKED = {"macs": 1e9, "weights": 1e7, "activations": 5e6, "layers": 50, "traits": ["attention"], "precision": "int8"}
-GOOD = Measured(
+GOOD = BoardMeasurement(
     "raspberry-pi-5", "default", "ort_cpu", "int8", {k: v for k, v in WORKED.items() if k != "precision"}, 9.5
 )
 
@@ -45,21 +52,21 @@ def report(tmp_path: Path) -> Callable[..., Path]:
 
 
 def test_a_report_tells_what_was_measured(report: Callable[..., Path]) -> None:
-    (found,) = measured_in(report(engine="ort_cpu"), PI, None)
+    (found,) = report_measurements(report(engine="ort_cpu"), PI, None)
     assert found == GOOD
     question = found.question()
-    assert (question.runtime, question.precision, question.place.device) == ("onnxruntime-cpu", "int8", PI.name)
+    assert (question.runtime, question.precision, question.compute_unit.device) == ("onnxruntime-cpu", "int8", PI.name)
     assert (question.work.macs, question.work.traits) == (1e9, {"attention"})
 
 
 def test_without_an_engine_it_is_the_preferred_one(report: Callable[..., Path]) -> None:
     orin = load_profile("jetson-orin-nano")
-    (found,) = measured_in(report(), orin, "15W")
+    (found,) = report_measurements(report(), orin, "15W")
     assert (found.mode, found.engine) == ("15W", "ort_tensorrt")
 
 
 def test_a_bundle_says_the_work_where_the_report_does_not(report: Callable[..., Path], load: Load) -> None:
-    (found,) = measured_in(report(absent=True), PI, None, load())
+    (found,) = report_measurements(report(absent=True), PI, None, load())
     assert found.work["macs"] == 1.8e9
     assert found.precision == "float32"
 
@@ -76,7 +83,7 @@ def test_a_bundle_says_the_work_where_the_report_does_not(report: Callable[..., 
 )
 def test_what_cannot_calibrate_says_why(report: Callable[..., Path], settings: dict[str, Any], why: str) -> None:
     with pytest.raises(DataError, match=why) as caught:
-        measured_in(report(**settings), PI, None)
+        report_measurements(report(**settings), PI, None)
     assert "--bundle" in caught.value.fix
 
 
@@ -88,12 +95,12 @@ def test_a_run_that_was_paced_or_emulated_calibrates_nothing(report: Callable[..
     file = report() / "report.json"
     file.write_text(replace(Report.from_json(file.read_text()), environment={"run": run}).to_json())
     with pytest.raises(DataError, match=why):
-        measured_in(file, PI, None)
+        report_measurements(file, PI, None)
 
 
 def test_an_unknown_mode_is_refused(report: Callable[..., Path]) -> None:
     with pytest.raises(ProfileError, match="no power mode '9W'"):
-        measured_in(report(), PI, "9W")
+        report_measurements(report(), PI, "9W")
 
 
 def test_measurements_are_kept_once_each_and_read_again(kept: Path) -> None:
@@ -165,7 +172,7 @@ def test_a_measurement_in_a_mode_that_is_gone_names_its_file(kept: Path) -> None
 def test_a_report_from_elsewhere_is_recognised(report: Callable[..., Path], made_on: dict[str, str], says: str) -> None:
     path = report() / "report.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"environment": made_on}))
-    assert elsewhere(path, PI) == says
+    assert foreign_host(path, PI) == says
 
 
 @pytest.mark.parametrize(
@@ -189,14 +196,14 @@ def test_a_table_of_work_that_lacks_a_number_is_refused(report: Callable[..., Pa
     path = report() / "report.json"
     path.write_text(path.read_text().replace('"macs"', '"mcas"'))
     with pytest.raises(DataError):
-        measured_in(path, PI, None)
+        report_measurements(path, PI, None)
 
 
 @pytest.mark.parametrize("change", [{"macs": 0.0, "layers": 0}, {"weights": 0.0}], ids=str)
 def test_what_is_kept_can_be_read_again(report: Callable[..., Path], change: dict[str, Any]) -> None:
     """A measurement that the reader refuses must not be kept: every later prediction would fail on it."""
     with contextlib.suppress(DataError):
-        store(measured_in(report(**change), PI, None))
+        store(report_measurements(report(**change), PI, None))
     assert isinstance(measured_questions(), list)
 
 

@@ -8,7 +8,14 @@ import pytest
 
 from vlatool.errors import DataError
 from vlatool.hardware.profile import load_profile
-from vlatool.latency_model.published import Point, family, known_devices, merged, published_as, read_points
+from vlatool.latency_model.published_latencies import (
+    Point,
+    known_devices,
+    merge_versions,
+    model_family,
+    published_devices,
+    read_points,
+)
 
 Rows = list[dict[str, str]]
 Written = Callable[[Rows], Path]
@@ -45,7 +52,7 @@ def test_every_row_becomes_a_question(points_file: Path, published: Rows) -> Non
         assert (point.group, point.kind, point.model) == (
             row["device"].lower(),
             row["device_class"],
-            family(row["model"]),
+            model_family(row["model"]),
         )
 
 
@@ -54,7 +61,11 @@ def test_a_row_says_the_work(one: Callable[..., Point]) -> None:
     assert question is not None
     work = question.work
     assert (work.macs, work.weights, work.activations, work.layers) == (1.8e9, 11.7e6, 2.5e6, 21)
-    assert (question.runtime, question.precision, question.place.device) == ("ncnn-cpu", "float32", "raspberry-pi-4")
+    assert (question.runtime, question.precision, question.compute_unit.device) == (
+        "ncnn-cpu",
+        "float32",
+        "raspberry-pi-4",
+    )
 
 
 @pytest.mark.parametrize(
@@ -167,7 +178,7 @@ def test_a_short_row_and_a_long_one_are_read(points_file: Path) -> None:
 
 def test_versions_of_one_runtime_become_their_mean(published: Rows, points_at: Written) -> None:
     same = [published[0] | {"value": value} for value in ("10", "40")]
-    found = merged(read_points(points_at([*same, published[1], published[2] | {"value": "0"}])))
+    found = merge_versions(read_points(points_at([*same, published[1], published[2] | {"value": "0"}])))
     assert len(found) == 2
     assert found[0].log_ms == pytest.approx(math.log(20))
 
@@ -187,9 +198,9 @@ def test_int8_of_ncnns_vulkan_is_computed_by_the_processor(one: Callable[..., Po
     whole, half = one(**options, precision="int8"), one(**options, precision="fp16")
     assert whole.question is not None
     assert half.question is not None
-    assert (whole.kind, whole.question.place.unit, whole.question.runtime) == ("cpu", "cpu", "ncnn-cpu")
-    assert whole.question.place.cores == 1
-    assert (half.kind, half.question.place.unit, half.question.runtime) == ("gpu", "gpu", "ncnn-vulkan")
+    assert (whole.kind, whole.question.compute_unit.unit, whole.question.runtime) == ("cpu", "cpu", "ncnn-cpu")
+    assert whole.question.compute_unit.cores == 1
+    assert (half.kind, half.question.compute_unit.unit, half.question.runtime) == ("gpu", "gpu", "ncnn-vulkan")
     laptop = one(**(options | {"device": "rtx-a3000-laptop"}), precision="int8")
     assert laptop.why == "nothing is known of the device 'rtx-a3000-laptop' (cpu)", "its GPU is not what computed"
 
@@ -198,11 +209,11 @@ def test_little_and_big_cores_are_different_cores(one: Callable[..., Point]) -> 
     found = [
         one(device="rk3588", runtime=f"ncnn-cpu 4T{more}").question for more in ("", " powersave=1", " powersave=2")
     ]
-    clocks = [question.place.clock_ghz for question in found if question]
+    clocks = [question.compute_unit.clock_ghz for question in found if question]
     assert clocks == [2.3, 1.8, 2.3]
-    peaks = [question.place.peaks["float32"] for question in found if question]
+    peaks = [question.compute_unit.peaks["float32"] for question in found if question]
     assert peaks[1] < peaks[0] < peaks[2], "half of all cores is a mean of both"
-    assert {question.place.device for question in found if question} == {"rk3588"}
+    assert {question.compute_unit.device for question in found if question} == {"rk3588"}
 
 
 @pytest.mark.parametrize(
@@ -250,7 +261,7 @@ def test_what_is_known_of_a_device_is_possible(device) -> None:
 
 
 @pytest.mark.parametrize(
-    ("pair", "device"), published_as().items(), ids=[f"{name}-{unit}" for name, unit in published_as()]
+    ("pair", "device"), published_devices().items(), ids=[f"{name}-{unit}" for name, unit in published_devices()]
 )
 def test_a_published_device_has_the_size_of_its_profile(pair: tuple[str, str], device: str) -> None:
     """The clock of a power mode may differ by half; units that are counted in another way may not."""

@@ -41,7 +41,7 @@ def layer_data(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("ratio", [0.25, 0.5, 0.7])
 def test_as_many_weights_as_asked_are_zero(method: type[SparsePruning], ratio: float):
     weight, rows = layer_data()
-    made = method(ratio=ratio).sparse(weight.clone(), rows.T @ rows / len(rows))
+    made = method(ratio=ratio).prune_weight(weight.clone(), rows.T @ rows / len(rows))
     assert float((made == 0).float().mean()) == pytest.approx(ratio, abs=0.02)
 
 
@@ -49,7 +49,7 @@ def test_as_many_weights_as_asked_are_zero(method: type[SparsePruning], ratio: f
 @pytest.mark.parametrize(("pattern", "of"), [("2:4", 4), ("4:8", 8)])
 def test_patterns_hold_among_neighbours(method: type[SparsePruning], pattern: str, of: int):
     weight, rows = layer_data()
-    made = method(pattern=pattern).sparse(weight.clone(), rows.T @ rows / len(rows))
+    made = method(pattern=pattern).prune_weight(weight.clone(), rows.T @ rows / len(rows))
     zeros = (made == 0).reshape(len(made), -1, of).sum(-1)
     assert set(zeros.unique().tolist()) == {of // 2}
 
@@ -58,7 +58,11 @@ def test_what_looks_at_the_inputs_loses_less_and_correcting_loses_least():
     weight, rows = layer_data()
     wanted = rows @ weight.double().T
     errors = [
-        float(torch.linalg.norm(rows @ method().sparse(weight.clone(), rows.T @ rows / len(rows)).double().T - wanted))
+        float(
+            torch.linalg.norm(
+                rows @ method().prune_weight(weight.clone(), rows.T @ rows / len(rows)).double().T - wanted
+            )
+        )
         for method in METHODS
     ]
     assert errors[2] < 0.8 * errors[1]
@@ -157,7 +161,7 @@ def test_layers_that_lost_units_are_the_same_layers(
 ):
     modules, whole = load_modules(narrower), select_layers(load_modules(source_bundle), source_bundle, (), ())
     found = select_layers(modules, narrower, (), ())
-    assert (set(found.prunable), set(found.dense)) == (set(whole.chosen), set(whole.dense))
+    assert (set(found.prunable), set(found.dense)) == (set(whole.prunable), set(whole.dense))
     before = {name: layer.weight.detach().clone() for name, layer in found.prunable.items()}
     method(samples=4).change(modules, narrower, Context())
     shares = [float((layer.weight == 0).float().mean()) for layer in found.prunable.values()]

@@ -13,7 +13,7 @@ from vlatool.errors import BundleError, DataError, GraphError, RecipeError
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import find_layers
 from vlatool.quantize.int8.smoothing_groups import find_groups
-from vlatool.quantize.int8.smoothing_scales import PeakUncertainty, best_alpha, int8_loss, smooth_scales, weight_peaks
+from vlatool.quantize.int8.smoothing_scales import PeakExcess, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.quantize.smooth_quant import SmoothQuant, _Writer
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage.build import build_stage
@@ -212,10 +212,10 @@ def test_ranges_that_differ_between_halves_hold_back():
     random = np.random.default_rng(0)
     peaks, w = np.exp(random.normal(size=64)), random.normal(size=(64, 16))
     bold, _ = best_alpha(peaks, [w])
-    careful, _ = best_alpha(peaks, [w], PeakUncertainty.between(peaks, peaks * 0.6, 4))
+    careful, _ = best_alpha(peaks, [w], PeakExcess.between(peaks, peaks * 0.6, 4))
     assert bold is not None
     assert careful is None or careful < bold
-    assert PeakUncertainty.between(np.zeros(2), np.zeros(2), 1) == PeakUncertainty(0.0, 1.0)
+    assert PeakExcess.between(np.zeros(2), np.zeros(2), 1) == PeakExcess(0.0, 1.0)
 
 
 @pytest.mark.parametrize("options", [{}, {"alpha": "auto"}, {"insert": True}], ids=str)
@@ -294,6 +294,6 @@ def test_what_it_needs(float_bundle, copied, tmp_path: Path):
 
 def test_a_changed_action_is_refused(quantized, monkeypatch):
     monkeypatch.setattr(_Writer, "_multiply", lambda *_: None)
-    monkeypatch.setattr("vlatool.quantize.smooth_quant.MAX_GOLDEN_CHANGE", -1.0)
+    monkeypatch.setattr("vlatool.quantize.smooth_quant.MAX_CHANGE", -1.0)
     with pytest.raises(GraphError, match="changed the golden action"):
         quantized(SmoothQuant(samples=8))

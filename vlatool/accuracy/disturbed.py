@@ -10,7 +10,7 @@ from vlatool.accuracy.moved import RATIO, START, STEPS
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import wilson
-from vlatool.stats.starts import independent
+from vlatool.stats.starts import independent_starts
 from vlatool.stats.success_sequential import exact_drop
 
 Played = Sequence[Outcome]
@@ -115,7 +115,7 @@ def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measur
         kind = name.removeprefix(DISTURBED)
         pairs = list(zip(row.raw[f"{name}{OF_BASELINE}"], row.raw[name], strict=True))
         lost, won = sum(before > after for before, after in pairs), sum(before < after for before, after in pairs)
-        size = independent(row.raw.get(START) or range(len(pairs)))
+        size = independent_starts(row.raw.get(START) or range(len(pairs)))
         drop, low, high = exact_drop(lost, won, len(pairs), confidence, size)
         drops[kind] = Measurement("disturbed_drop", drop, "1", samples=len(pairs), low=low, high=high,
                                   confidence=confidence, note=kind)  # fmt: skip

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.motion.measure import FEWEST, metrics, ratio_of
+from vlatool.motion.measure import MIN_PAIRS, metrics, ratio_of
 from vlatool.report import NO_INTERVAL, Measurement, Row
 from vlatool.stats.intervals import sign_test
-from vlatool.stats.starts import distinct, independent
+from vlatool.stats.starts import distinct_starts, independent_starts
 from vlatool.stats.success_sequential import exact_drop
 
 Array = NDArray[np.float64]
@@ -120,7 +120,7 @@ def _ratio(
     if np.isfinite(high) and not doubt:
         return Measurement(name, value, "x", samples=count, low=low, high=high, confidence=confidence, note=note)
     zeros = "too few pairs in which the baseline's is not 0"  # resamples have none of them, and no ratio
-    why = doubt or (f"{count} pairs, and it takes {FEWEST}" if count < FEWEST else zeros)
+    why = doubt or (f"{count} pairs, and it takes {MIN_PAIRS}" if count < MIN_PAIRS else zeros)
     first, _, rest = note.partition("; ")
     parts = (first, f"{NO_INTERVAL}{why}", *([rest] if rest else []))
     return Measurement(name, value, "x", samples=count, confidence=confidence, note="; ".join(parts))
@@ -150,8 +150,8 @@ class _Pairs:
             if (ratio := self._ratio_of(own, base, known, self._confidence)) is None:
                 continue
             note = f"of the means of {self._told(known)}{self._worst_of(own, base, known)}"
-            starts = distinct(self._starts[known].tolist())
-            why = f"{starts} distinct starts, and it takes {FEWEST}" if starts < min(FEWEST, known.sum()) else ""
+            starts = distinct_starts(self._starts[known].tolist())
+            why = f"{starts} distinct starts, and it takes {MIN_PAIRS}" if starts < min(MIN_PAIRS, known.sum()) else ""
             doubt = self.doubt(name) or why
             yield _ratio(f"{name}{RATIO}", ratio, int(known.sum()), note, self._confidence, doubt)
 
@@ -186,7 +186,7 @@ class _Pairs:
             own, base, known = self._values(name)
             if known.any() and not base[known].any():
                 starts = self._starts[known]
-                yield name, (distinct(starts[own[known] > 0].tolist()), distinct(starts.tolist()))
+                yield name, (distinct_starts(starts[own[known] > 0].tolist()), distinct_starts(starts.tolist()))
 
     def added(self) -> Iterator[Measurement]:
         """Yield the mean of each of these metrics that the variant has something of."""
@@ -247,12 +247,12 @@ class _Pairs:
         return sorted(records, key=lambda record: -record["drop"])[:LONGEST] if len(records) > 1 else []
 
     def _ratios_of(self, chosen: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return metric -> ratio among some episodes; nothing where both succeed in fewer than ``FEWEST`` of them."""
+        """Return metric -> ratio among some episodes; nothing where both succeed in fewer than ``MIN_PAIRS``."""
         ratios: dict[str, Any] = {}
         for name in self._metrics:
             own, base, known = self._values(name)
             known = known & chosen
-            enough = known.sum() >= FEWEST and (own[known].any() or base[known].any())
+            enough = known.sum() >= MIN_PAIRS and (own[known].any() or base[known].any())
             if enough and (ratio := self._ratio_of(own, base, known)):
                 ratios[f"{name.replace('_', ' ')}, x"] = round(ratio[0], 3)
         return ratios
@@ -262,14 +262,14 @@ class _Pairs:
         ratios = []
         for place, name in enumerate(self._names.get("task", ())):
             chosen = known & (self._places["task"] == place)
-            if chosen.sum() >= FEWEST and base[chosen].mean() > 0:
+            if chosen.sum() >= MIN_PAIRS and base[chosen].mean() > 0:
                 ratios.append((float(own[chosen].mean() / base[chosen].mean()), name))
         return f"; most in {max(ratios)[1]}: {max(ratios)[0]:.3g}x" if len(ratios) > 1 else ""
 
     def _drop(self, chosen: NDArray[np.bool_], confidence: float) -> tuple[tuple[float, float, float], int]:
         before, after = (won[chosen] for won in self._wins)
         lost, won = int((before & ~after).sum()), int((after & ~before).sum())
-        size = independent(self._starts[chosen].tolist())
+        size = independent_starts(self._starts[chosen].tolist())
         return exact_drop(lost, won, len(before), confidence, size), len(before)
 
     def _values(self, name: str) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -13,7 +13,7 @@ from vlatool.errors import DataError
 from vlatool.motion.measure import metrics
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import mcnemar_exact
-from vlatool.stats.starts import FEWEST, distinct, independent, too_few, wilson_of
+from vlatool.stats.starts import MIN_DISTINCT_STARTS, distinct_starts, has_too_few_starts, independent_starts, wilson_of
 from vlatool.stats.success_sequential import exact_drop
 
 ABSENT = "unmeasured"
@@ -93,7 +93,7 @@ def _numbered(starts: Sequence[Hashable]) -> list[float]:
 
 
 def _starts(starts: Sequence[Hashable]) -> str:
-    count, worth = distinct(starts), independent(starts)
+    count, worth = distinct_starts(starts), independent_starts(starts)
     return f"{count} distinct starts" + (f", worth {worth} episodes" if worth < len(starts) else "")
 
 
@@ -104,9 +104,10 @@ def few_starts(row: Row) -> str:
         row: Of ``success_row``.
     """
     starts = row.raw.get(START, [])
-    if not too_few(starts):
+    if not has_too_few_starts(starts):
         return ""
-    return f"{len(starts)} episodes of {distinct(starts)} distinct starts decide nothing (from {FEWEST})"
+    count = distinct_starts(starts)
+    return f"{len(starts)} episodes of {count} distinct starts decide nothing (from {MIN_DISTINCT_STARTS})"
 
 
 def repeated_starts(row: Row) -> tuple[str, ...]:
@@ -116,11 +117,12 @@ def repeated_starts(row: Row) -> tuple[str, ...]:
         row: Of ``success_row``.
     """
     starts = row.raw.get(START, [])
-    if distinct(starts) == len(starts):
+    count, size = distinct_starts(starts), independent_starts(starts)
+    if count == len(starts):
         return ()
     return (
-        f"the {len(starts)} episodes have {distinct(starts)} distinct first observations, so that they count as "
-        f"{independent(starts)}: let reset(seed=...) draw each episode anew, and show it in the first observation",
+        f"the {len(starts)} episodes have {count} distinct first observations, so that they count as "
+        f"{size}: let reset(seed=...) draw each episode anew, and show it in the first observation",
     )
 
 
@@ -157,7 +159,7 @@ def _table(column: str, outcomes: Sequence[Outcome], key: Callable[[Outcome], st
         low, high = wilson_of(wins, starts)
         steps = sum(outcome.steps for outcome in own) / len(own)
         cells = {column: value, "success": round(wins / len(own), 4), "low": round(low, 4), "high": round(high, 4)}
-        cells |= {"episodes": len(own), "distinct starts": distinct(starts), "mean steps": round(steps, 1)}
+        cells |= {"episodes": len(own), "distinct starts": distinct_starts(starts), "mean steps": round(steps, 1)}
         table.append(cells)
     return table
 
@@ -186,7 +188,7 @@ def compare_success(baseline: Row, row: Row) -> Row:
     lost = sum(before > after for before, after in pairs)
     won = sum(before < after for before, after in pairs)
     starts = baseline.raw[START]
-    size = independent(starts)
+    size = independent_starts(starts)
     drop, low, high = exact_drop(lost, won, len(pairs), size=size)
     p = mcnemar_exact(*(count * size // len(pairs) for count in (lost, won)))
     test = Measurement("mcnemar_p", p, "1", samples=len(pairs), note="exact, two-sided")

@@ -10,7 +10,7 @@ from vlatool.accuracy.paired import Outcome
 from vlatool.episodes.play import EpisodesJob, jobs_for
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
-from vlatool.stats.starts import distinct, independent, too_few
+from vlatool.stats.starts import distinct_starts, has_too_few_starts, independent_starts
 from vlatool.stats.success_sequential import GO_ON, Decision, plan
 
 Play = Callable[[list[EpisodesJob]], list[Outcome]]
@@ -46,8 +46,8 @@ def played_until(
         lost = sum(one.success and not two.success for one, two in pairs)
         won = sum(two.success and not one.success for one, two in pairs)
         starts = [outcome.begins for outcome in theirs]
-        decision = comparison.judge(lost, won, after, independent(starts))
-        if too_few(starts) and decision.verdict in ("pass", "fail"):
+        decision = comparison.judge(lost, won, after, independent_starts(starts))
+        if has_too_few_starts(starts) and decision.verdict in ("pass", "fail"):
             decision = replace(decision, verdict=GO_ON if after < comparison.most else "inconclusive")
         context.tell(f"{after} pairs: {told(decision)}", after / comparison.most)
         if decision.over:
@@ -69,7 +69,7 @@ def told(decision: Decision) -> str:
 def with_decision(row: Row, decision: Decision) -> Row:
     """Return the row with the interval of its drop that holds over all interim analyses."""
     note = f"paired: {decision.lost} lost, {decision.won} won of {decision.pairs} episodes, {decision.most} at most"
-    note += f"; {distinct(row.raw[START])} distinct starts"
+    note += f"; {distinct_starts(row.raw[START])} distinct starts"
     drop = Measurement("success_drop", decision.drop, "1", samples=decision.pairs, low=decision.low,
                        high=decision.high, note=note)  # fmt: skip
     return replace(row, measurements=tuple(drop if item.name == drop.name else item for item in row.measurements))

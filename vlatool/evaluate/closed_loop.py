@@ -37,7 +37,7 @@ from vlatool.module.factory import factory_file, split_factory
 from vlatool.report import Report, Row
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.cache import STREAMS
-from vlatool.stats.starts import distinct
+from vlatool.stats.starts import distinct_starts
 from vlatool.user_code import trust
 
 if TYPE_CHECKING:
@@ -230,7 +230,7 @@ class ClosedLoop(Measure):
         how = f" with {self.control} actions in the place of the policy's" if self.control else how
         text = f"{row.value('success'):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
-        decided = (sentence(decision, distinct(row.raw[START])),) if decision else ()
+        decided = (sentence(decision, distinct_starts(row.raw[START])),) if decision else ()
         summary = (*believed.sentences, *decided, text, *told(rows, self.board), *again.sentences)
         doubts = (*repeated_starts(row), *seen_in_training(bundles, jobs), *found_wrong(source))
         warnings = (*believed.warnings, *doubts, *again.warnings, *dict.fromkeys(context.notes))

@@ -100,10 +100,9 @@ def explain(bundle: Bundle, options: Options, context: Context) -> Report:
     findings = _find(bundle, options, context)
     with scratch_directory() as scratch:
         engine = bundle.manifest.engine or DEFAULT_ENGINE
-        suggests = options.suggest and findings.baseline is not None and findings.observations.recorded
-        candidates = (
-            plan_candidates(findings.origin.stage, findings.layers, findings.fallbacks, engine) if suggests else []
-        )
+        candidates = []
+        if options.suggest and findings.baseline is not None and findings.observations.recorded:
+            candidates = plan_candidates(findings.origin.stage, findings.layers, findings.fallbacks, engine)
         values = findings.observations.values
         comparison = measure(bundle, findings.baseline, candidates, values, scratch, options.threads, context)
         sentences = _sentences(findings, comparison.speed)

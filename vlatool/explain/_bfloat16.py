@@ -67,16 +67,15 @@ def measure_phases(
         nodes = tuple(node.name for node in periodic_nodes(load(bundle.file(graph.file))))
         state = Phases(name, kept, nodes)
         if nodes:
-            effects.append(_measure_with_cut(bundle, state, observations, context))
+            effects.append(_with_cut(bundle, state, observations, context))
         elif kept:
             whole = set(graph.precision) <= {"bfloat16", "float32"}  # else int8 errors would be mixed in
-            effects.append(
-                _measure_without_cut(bundle, baseline, state, observations, context) if baseline and whole else state
-            )
+            base = baseline if whole else None
+            effects.append(_without_cut(bundle, base, state, observations, context) if base else state)
     return effects
 
 
-def _measure_without_cut(
+def _without_cut(
     bundle: Bundle, baseline: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context
 ) -> Phases:
     """Run float32, the bundle with its cut, and the whole float32 graph in bfloat16."""
@@ -92,9 +91,7 @@ def _measure_without_cut(
     return replace(phase, error=_error(uncut, plain), cut=_error(cut, plain))
 
 
-def _measure_with_cut(
-    bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context
-) -> Phases:
+def _with_cut(bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context) -> Phases:
     """Run float32, the bundle itself, and the bundle with the cut."""
     context.tell(f"measuring the effect of bfloat16 on the phases of {phase.graph}", None)
     manifest = bundle.manifest

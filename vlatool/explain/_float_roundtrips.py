@@ -72,16 +72,11 @@ class QuantizedGraph(OnnxGraph):
     def pairs(self) -> tuple[int, int]:
         """Return the numbers of values that are quantized, and dequantized, at run time."""
         first = sum(node.op_type in QUANTIZERS for node in self.nodes)
-        return first, sum(self._dequantizes_activation(node) for node in self.nodes)
+        return first, sum(self._is_dequantizer(node) for node in self.nodes)
 
     def round_trips(self) -> list[RoundTrip]:
         """Return the round trips: int8 -> float -> int8 with only light operators in between."""
-        return [
-            round_trip
-            for node in self.nodes
-            if self._dequantizes_activation(node)
-            for round_trip in self._round_trips_from(node)
-        ]
+        return [trip for node in self.nodes if self._is_dequantizer(node) for trip in self._trips_from(node)]
 
     def asymmetric(self) -> list[str]:
         """Return the quantizers of activations with a zero point other than 0."""
@@ -92,7 +87,7 @@ class QuantizedGraph(OnnxGraph):
         tensor = self.constants[zero]
         return tensor.data_type in EIGHT_BIT_TYPES and not tensor.dims and bool(self.array(zero))
 
-    def _dequantizes_activation(self, node: Any) -> bool:
+    def _is_dequantizer(self, node: Any) -> bool:
         return node.op_type == "DequantizeLinear" and node.input[0] not in self.constants
 
     def _has_quantized_operands(self, node: Any) -> bool:
@@ -109,9 +104,9 @@ class QuantizedGraph(OnnxGraph):
             node = self.producers.get(node.input[0])
         return node
 
-    def _round_trips_from(self, start: Any) -> list[RoundTrip]:
+    def _trips_from(self, start: Any) -> list[RoundTrip]:
         """Follow a dequantized value to each QuantizeLinear that it reaches without a heavy layer in between."""
-        round_trips = []
+        trips = []
         pending: list[tuple[str, tuple[Any, ...]]] = [(start.output[0], ())]
         while pending:
             value, path = pending.pop()
@@ -119,33 +114,27 @@ class QuantizedGraph(OnnxGraph):
                 if reader.op_type in QUANTIZERS:
                     names = tuple(node.name for node in (start, *path, reader))
                     kinds = tuple(node.op_type for node in path)
-                    round_trips.append(RoundTrip(self.name, start.name, kinds, reader.name, names))
+                    trips.append(RoundTrip(self.name, start.name, kinds, reader.name, names))
                 elif reader.op_type not in (*COMPUTE_OPS, *INTEGER_OPS) and len(path) < MAX_BETWEEN:
                     pending.append((reader.output[0], (*path, reader)))
-        return round_trips
+        return trips
 
 
-def with_times(round_trips: Iterable[RoundTrip], operators: Sequence[Operator]) -> list[RoundTrip]:
+def with_times(trips: Iterable[RoundTrip], operators: Sequence[Operator]) -> list[RoundTrip]:
     """Return the round trips with the times of their nodes in the profile, the most expensive first."""
     spent: Counter[tuple[str, str]] = Counter()
     for operator in operators:
         spent[operator.graph, operator.name] += operator.ms  # type: ignore[assignment]
-    costs = [
-        replace(round_trip, ms=sum(spent[round_trip.graph, name] for name in round_trip.nodes))
-        for round_trip in round_trips
-    ]
-    return sorted(costs, key=lambda round_trip: -round_trip.ms)
+    costs = [replace(trip, ms=sum(spent[trip.graph, name] for name in trip.nodes)) for trip in trips]
+    return sorted(costs, key=lambda trip: -trip.ms)
 
 
 def fallbacks(graph: QuantizedGraph, operators: Sequence[Operator], engine: str) -> list[Fallback]:
     """Return the int8 layers of a file that the engine did not run as fast int8 kernels, the most expensive first."""
     own = [operator for operator in operators if operator.graph == graph.name]
-    fallbacks_found = [
-        *_float_fallbacks(graph, own),
-        *_weight_fallbacks(graph, own),
-        *_slow_kernel_fallbacks(graph, own, engine_class(engine)),
-    ]
-    return sorted(fallbacks_found, key=lambda fallback: -fallback.ms)
+    slow = _slow_fallbacks(graph, own, engine_class(engine))
+    found = [*_float_fallbacks(graph, own), *_weight_fallbacks(graph, own), *slow]
+    return sorted(found, key=lambda fallback: -fallback.ms)
 
 
 def _float_fallbacks(graph: QuantizedGraph, operators: Sequence[Operator]) -> Iterator[Fallback]:
@@ -162,9 +151,7 @@ def _float_fallbacks(graph: QuantizedGraph, operators: Sequence[Operator]) -> It
 
 def _weight_fallbacks(graph: QuantizedGraph, operators: Sequence[Operator]) -> Iterator[Fallback]:
     """Yield weights that are dequantized at every inference."""
-    quantized = [
-        node for node in graph.nodes if node.op_type == "DequantizeLinear" and not graph._dequantizes_activation(node)
-    ]
+    quantized = [node for node in graph.nodes if node.op_type == "DequantizeLinear" and not graph._is_dequantizer(node)]
     stored = {node.name: node.output[0] for node in quantized}
     for operator in operators:
         if operator.kind == "DequantizeLinear" and operator.name in stored:
@@ -173,9 +160,7 @@ def _weight_fallbacks(graph: QuantizedGraph, operators: Sequence[Operator]) -> I
             yield Fallback(graph.name, layer, "its int8 weight is dequantized to float at every inference", operator.ms)
 
 
-def _slow_kernel_fallbacks(
-    graph: QuantizedGraph, operators: Sequence[Operator], library: type[Engine]
-) -> Iterator[Fallback]:
+def _slow_fallbacks(graph: QuantizedGraph, operators: Sequence[Operator], library: type[Engine]) -> Iterator[Fallback]:
     """Yield int8 nodes that do not run as fast kernels according to the engine."""
     zero_points = len(graph.asymmetric())
     for operator in operators:

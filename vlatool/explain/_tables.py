@@ -21,7 +21,7 @@ from vlatool.sensitivity.layers import LayerError
 MAX_ROWS = 10
 MAX_ELEMENTS = 12
 """Largest number of elements in a table: of a longer action, those that the worst layer changes most."""
-MAX_OTHER_OPERATORS = 6
+MAX_OTHERS = 6
 """Largest number of operator types in a sentence, besides products."""
 INT8_SPEEDUP = 4.0
 """Float32 instructions that one int8 instruction of the same width replaces."""
@@ -88,30 +88,28 @@ def time_sentence(operators: Sequence[Operator]) -> str:
     return f"Of {total:.3g} ms inside operators: {', '.join(parts)}."
 
 
-def round_trips_table(round_trips: Sequence[RoundTrip]) -> list[dict[str, Any]]:
+def round_trips_table(trips: Sequence[RoundTrip]) -> list[dict[str, Any]]:
     """Return the ten most expensive round trips."""
     return [
         {
-            "from": round_trip.start.removesuffix("/dequantize"),
-            "in float": " ".join(round_trip.between) or "nothing",
-            "to": round_trip.end.removesuffix("/quantize"),
-            "ms": round(round_trip.ms, 4),
+            "from": trip.start.removesuffix("/dequantize"),
+            "in float": " ".join(trip.between) or "nothing",
+            "to": trip.end.removesuffix("/quantize"),
+            "ms": round(trip.ms, 4),
         }
-        for round_trip in round_trips[:MAX_ROWS]
+        for trip in trips[:MAX_ROWS]
     ]
 
 
-def round_trips_sentence(
-    round_trips: Sequence[RoundTrip], pairs: tuple[int, int], operators: Sequence[Operator]
-) -> str:
+def round_trips_sentence(trips: Sequence[RoundTrip], pairs: tuple[int, int], operators: Sequence[Operator]) -> str:
     """Return the sentence about round trips through float."""
     total = sum(part.ms for part in operators) or 1.0
     text = f"The file quantizes {pairs[0]} values and dequantizes {pairs[1]} at run time"
-    if not round_trips:
+    if not trips:
         return f"{text}; no value goes from int8 to float and back without a layer in between."
-    spent = sum(part.ms for part in round_trips)
-    direct = sum(not part.between for part in round_trips)
-    text += f"; {len(round_trips)} of them go int8 -> float -> int8 with only light operators in between"
+    spent = sum(part.ms for part in trips)
+    direct = sum(not part.between for part in trips)
+    text += f"; {len(trips)} of them go int8 -> float -> int8 with only light operators in between"
     text += f" ({direct} with none)" if direct else ""
     if not spent:
         return f"{text}. The profile shows none of them: the engine fused them, so they cost nothing."
@@ -201,9 +199,7 @@ def reach_sentence(operators: Sequence[Operator], macs: Mapping[str, int], reach
     others: Counter[str] = Counter()
     for operator in operators:
         others[operator.kind] += 0 if operator.product else operator.ms  # type: ignore[assignment]
-    listed = ", ".join(
-        f"{kind} {ms:.2g} ms" for kind, ms in others.most_common(MAX_OTHER_OPERATORS) if ms > 0.005 * total
-    )
+    listed = ", ".join(f"{kind} {ms:.2g} ms" for kind, ms in others.most_common(MAX_OTHERS) if ms > 0.005 * total)
     slower = f"its products take {products - share * total:.2g} ms more than that" if products > share * total else ""
     rest = f"everything else {total - products:.2g} ms{f': {listed}' if listed else ''}"
     text += f" The rest: {', '.join(filter(None, (slower, rest)))}."

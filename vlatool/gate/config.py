@@ -13,7 +13,7 @@ from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
 from vlatool.stats.percentiles import PERCENTILES
 from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES
-from vlatool.stats.signed_rank import fewest
+from vlatool.stats.signed_rank import min_differences
 
 OF_EPISODES = ("motion", "task_time", "worst_task", "disturbed")
 """Claims about the closed-loop episodes that the claim of accuracy names."""
@@ -46,7 +46,7 @@ class LatencyClaim(_Claim):
     @model_validator(mode="after")
     def _an_analysis_can_decide(self) -> LatencyClaim:
         after = self.interim_analyses
-        least = fewest(ALPHA / 2 / len(after)) if after else 1  # the median and the mean share it
+        least = min_differences(ALPHA / 2 / len(after)) if after else 1  # the median and the mean share it
         if not after or list(after) != sorted(set(after)) or after[0] < least:
             raise ValueError(f"interim_analyses must ascend and begin at {least} or later, or none of them can decide")
         return self

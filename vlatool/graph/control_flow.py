@@ -61,9 +61,8 @@ def _name_inside(node: Any, taken: set[str]) -> None:
         for graph in (*([item.g] if item.HasField("g") else []), *item.graphs):
             for number, inner in enumerate(graph.node):
                 if not inner.name or inner.name in taken:
-                    inner.name = unique_name(
-                        inner.name or f"{node.name or node.op_type}/{inner.op_type}", number, taken
-                    )
+                    base = inner.name or f"{node.name or node.op_type}/{inner.op_type}"
+                    inner.name = unique_name(base, number, taken)
                 taken.add(inner.name)
                 _name_inside(inner, taken)
 

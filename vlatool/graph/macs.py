@@ -12,7 +12,7 @@ INTEGER_OPS = {
     *("QGemm", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"),
 }
 """Operators that always compute in int8."""
-WEIGHT_INPUT = {"QLinearMatMul": 3, "QLinearConv": 3, "QGemm": 3}
+WEIGHT_AT = {"QLinearMatMul": 3, "QLinearConv": 3, "QGemm": 3}
 """Index of the second operand where it is not 1."""
 MATMULS = {"MatMul", "FusedMatMul", "MatMulInteger", "QLinearMatMul", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"}
 CONVOLUTIONS = {"Conv", "ConvInteger", "QLinearConv", "FusedConv"}
@@ -71,9 +71,7 @@ def node_macs(node: Any, tensors: Tensors) -> int | None:
     if kind in OPAQUE or (kind == "Attention" and node.domain):
         return None
     first, out = tensors.shape(node.input[0]), tensors.shape(node.output[0])
-    second = (
-        tensors.shape(node.input[WEIGHT_INPUT.get(kind, 1)]) if len(node.input) > WEIGHT_INPUT.get(kind, 1) else None
-    )
+    second = tensors.shape(node.input[WEIGHT_AT.get(kind, 1)]) if len(node.input) > WEIGHT_AT.get(kind, 1) else None
     if kind == "MatMulNBits":
         return None if out is None else math.prod(out) * int(tensors.attribute(node, "K", 0))
     if first is None or second is None:

@@ -176,10 +176,8 @@ class OnnxGraph:
     def sort(self) -> None:
         """Sort nodes topologically, otherwise in their current order."""
         nodes = list(self.graph.node)
-        producers = {name: index for index, node in enumerate(nodes) for name in node.output if name}
-        before = {
-            index: {producers[name] for name in reads(node) if name in producers} for index, node in enumerate(nodes)
-        }
+        origin = {name: index for index, node in enumerate(nodes) for name in node.output if name}
+        before = {index: {origin[name] for name in reads(node) if name in origin} for index, node in enumerate(nodes)}
         sorter = graphlib.TopologicalSorter(before)
         sorter.prepare()
         ready: list[int] = []

@@ -54,10 +54,8 @@ class QdqWriter(OnnxGraph):
         self.ranges, self.style = ranges, style
         chosen = self.layers.values()
         self.hoisted = hoisted_values(model, chosen, style)
-        self.convolution_inputs, self.signed = (
-            convolution_inputs(chosen, style, self.hoisted),
-            signed_values(chosen, style),
-        )
+        self.convolution_inputs = convolution_inputs(chosen, style, self.hoisted)
+        self.signed = signed_values(chosen, style)
         convolutions = {layer.output for layer in chosen if layer.kind == "Conv" and style.fused_convolutions}
         self.fused = convolutions - self.outputs
         self.nodes: list[Any] = []

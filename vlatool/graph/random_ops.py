@@ -101,10 +101,8 @@ def _random_nodes(model: Any) -> list[Any]:
     graph, off = model.graph, _false_constants(model.graph)
     inside = [inner for node in graph.node for inner in inner_nodes(node)]
     inside += [node for value in model.functions for node in _nodes(value.node)]
-    return [
-        *(node for node in graph.node if _is_random(node, off)),
-        *(node for node in inside if _is_random(node, set())),
-    ]
+    outer = [node for node in graph.node if _is_random(node, off)]
+    return outer + [node for node in inside if _is_random(node, set())]
 
 
 def _false_constants(graph: Any) -> set[str]:

@@ -22,16 +22,7 @@ SAME_SHAPE_AS = {
     "QGemm": "Gemm",
 }
 """Contributed operator -> standard one with the same output shape; ONNX infers shapes only of standard operators."""
-VALUE_PRESERVING_OPS = {
-    "DequantizeLinear",
-    "QuantizeLinear",
-    "Transpose",
-    "Reshape",
-    "Squeeze",
-    "Unsqueeze",
-    "Cast",
-    "Identity",
-}
+COPY_OPS = {"DequantizeLinear", "QuantizeLinear", "Transpose", "Reshape", "Squeeze", "Unsqueeze", "Cast", "Identity"}
 """Operators whose output holds the values of their first input, in another type or order."""
 
 
@@ -91,14 +82,14 @@ class Tensors:
         """Return whether a tensor is a weight, or derived only from weights (dequantized, transposed)."""
         while name not in self._stored:
             node = self._producers.get(name)
-            if node is None or node.op_type not in VALUE_PRESERVING_OPS:
+            if node is None or node.op_type not in COPY_OPS:
                 return node is not None and node.op_type == "Constant"
             name = node.input[0]
         return True
 
     def source_tensor(self, name: str) -> str:
         """Return the tensor whose values these are, before changes of type or order."""
-        while name not in self._stored and (node := self._producers.get(name)) and node.op_type in VALUE_PRESERVING_OPS:
+        while name not in self._stored and (node := self._producers.get(name)) and node.op_type in COPY_OPS:
             name = node.input[0]
         return name
 

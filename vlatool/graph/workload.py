@@ -16,7 +16,7 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, require
-from vlatool.graph.macs import COMPUTE, CONVOLUTIONS, INTEGER_OPS, WEIGHT_INPUT, node_macs, precision_of
+from vlatool.graph.macs import COMPUTE, CONVOLUTIONS, INTEGER_OPS, WEIGHT_AT, node_macs, precision_of
 from vlatool.graph.shapes import Tensors, open_graph
 
 MAX_DEPTHWISE_PRODUCTS = 121
@@ -193,9 +193,7 @@ def _operands(node: Any, tensors: Tensors) -> tuple[int, int]:
     """Return the elements of a layer's weight (0 for a product of activations) and the groups of a convolution."""
     if node.op_type == "MatMulNBits":
         return int(tensors.attribute(node, "K", 0)) * int(tensors.attribute(node, "N", 0)), 1
-    second = (
-        node.input[WEIGHT_INPUT.get(node.op_type, 1)] if len(node.input) > WEIGHT_INPUT.get(node.op_type, 1) else ""
-    )
+    second = node.input[WEIGHT_AT.get(node.op_type, 1)] if len(node.input) > WEIGHT_AT.get(node.op_type, 1) else ""
     shape = tensors.shape(second) or ()
     groups = int(tensors.attribute(node, "group", 1)) if node.op_type in CONVOLUTIONS else 1
     return (math.prod(shape) if tensors.is_constant(second) else 0), groups
@@ -203,7 +201,7 @@ def _operands(node: Any, tensors: Tensors) -> tuple[int, int]:
 
 def _weight_of(node: Any, tensors: Tensors) -> str:
     """Return the name of the stored tensor of a layer's weight."""
-    index = WEIGHT_INPUT.get(node.op_type, 1)
+    index = WEIGHT_AT.get(node.op_type, 1)
     return tensors.source_tensor(node.input[index]) if len(node.input) > index else ""
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from vlatool.errors import ProfileError, instead, nearest
 from vlatool.graph.workload import PRECISIONS, GraphWorkload, Workload, stored_precision
 from vlatool.hardware.profile import EngineFigures, Profile
-from vlatool.latency_model.features import Place, Question, Shares, Work, roofline_parts
-from vlatool.latency_model.model import LatencyModel, Predicted
-from vlatool.latency_model.published import published_as
+from vlatool.latency_model.features import ComputeUnit, Question, Shares, Work, roofline_parts
+from vlatool.latency_model.model import LatencyModel, Prediction
+from vlatool.latency_model.published_latencies import published_devices
 
 FLOAT32 = 4
 BUSY, BUSY_LOW, BUSY_HIGH = 0.65, 0.45, 0.95
@@ -69,7 +69,7 @@ class Phase:
 
     name: str
     runs: int
-    once: Predicted
+    once: Prediction
     question: Question
 
     @property
@@ -90,7 +90,7 @@ class Outcome:
 
     candidate: Candidate
     phases: tuple[Phase, ...]
-    latency: Predicted
+    latency: Prediction
     memory_mb: tuple[float, float, float]
     watts: tuple[float, float, float]
 
@@ -111,7 +111,7 @@ def candidates(profile: Profile, load: Workload, modes: Iterable[str] | None = N
 
     A bundle that is quantized already is taken as it is, by the engines that compute in its precision.
     """
-    stored = quantized_as(load)
+    stored = stored_quantization(load)
     integer = any(graph.integer_ops for graph in load.graphs.values())
 
     def precisions(figures: EngineFigures) -> tuple[str, ...]:
@@ -138,43 +138,44 @@ def engine_for(profile: Profile, load: Workload, own: str = "") -> str:
     Returns:
         Its name; empty where no engine of the board runs these graphs.
     """
-    able = dict.fromkeys(way.engine for way in candidates(profile, load, [profile.default_mode]))
-    return next((name for name in (own, profile.engine, *able) if name in able), "")
+    supported = dict.fromkeys(way.engine for way in candidates(profile, load, [profile.default_mode]))
+    return next((name for name in (own, profile.engine, *supported) if name in supported), "")
 
 
-def place_of(candidate: Candidate) -> Place:
+def compute_unit_of(candidate: Candidate) -> ComputeUnit:
     """Return what computes, at the clocks of the power mode."""
     profile, figures = candidate.profile, candidate.figures
     caps, part = profile.mode(candidate.mode), profile.units[figures.unit]
     unit = "igpu" if figures.runtime == "openvino-igpu" else figures.unit
     peaks = {dtype: profile.peak_tops(figures.unit, dtype, candidate.mode) or math.nan for dtype in part.peak_tops}
     own = part.bandwidth_gb_s.value if part.bandwidth_gb_s else math.inf
-    return Place(
-        published_as().get((profile.name, unit), profile.name), unit,
+    return ComputeUnit(
+        published_devices().get((profile.name, unit), profile.name), unit,
         caps.cores.get(figures.unit, part.cores.value), caps.clock_mhz.get(figures.unit, part.clock_mhz.value) / 1e3,
         peaks, min(own, caps.bandwidth_gb_s), candidate.mode, " ".join(part.isa),
     )  # fmt: skip
 
 
-def outcomes(asked: Sequence[Candidate], load: Workload, model: LatencyModel) -> list[Outcome]:
+def outcomes(requested: Sequence[Candidate], load: Workload, model: LatencyModel) -> list[Outcome]:
     """Predict every candidate; all questions go to the model at once."""
     questions: list[Question] = []
     spans: list[list[tuple[str, int]]] = []
-    for candidate in asked:
-        place = place_of(candidate)
+    for candidate in requested:
+        compute_unit = compute_unit_of(candidate)
         spans.append([(name, runs) for name, runs in load.runs.items() if load.graphs[name].layers])
         for name, _ in spans[-1]:
             graph = load.graphs[name]
             precision = candidate.precision or stored_precision(graph)
-            questions.append(Question(work_of(graph), place, candidate.figures.runtime, precision))
-    predictions = [_floored(*pair) for pair in zip(questions, model.predict(questions), strict=True)]
-    answers = iter(zip(questions, predictions, strict=True))
+            questions.append(Question(work_of(graph), compute_unit, candidate.figures.runtime, precision))
+    predictions = [_apply_roofline(*pair) for pair in zip(questions, model.predict(questions), strict=True)]
+    remaining = iter(zip(questions, predictions, strict=True))
     results = []
-    for candidate, span in zip(asked, spans, strict=True):
+    for candidate, span in zip(requested, spans, strict=True):
         phases = tuple(
-            Phase(name, runs, answer, question) for (name, runs), (question, answer) in zip(span, answers, strict=False)
+            Phase(name, runs, answer, question)
+            for (name, runs), (question, answer) in zip(span, remaining, strict=False)
         )
-        latency = _whole(candidate, load, phases)
+        latency = _total_latency(candidate, load, phases)
         results.append(Outcome(candidate, phases, latency, memory_mb(candidate, load), watts(candidate)))
     return results
 
@@ -184,7 +185,7 @@ def work_of(graph: GraphWorkload) -> Work:
     return Work(sum(graph.macs.values()), graph.reads, graph.activations, graph.layers, graph.traits)
 
 
-def quantized_as(load: Workload) -> str:
+def stored_quantization(load: Workload) -> str:
     """Return the precision of a bundle that is not float32 any more, empty for one that is."""
     if all(set(graph.macs) <= {"float32"} for graph in load.graphs.values()):
         return ""
@@ -192,7 +193,7 @@ def quantized_as(load: Workload) -> str:
     return stored_precision(load.graphs[name])
 
 
-def _floored(question: Question, answer: Predicted) -> Predicted:
+def _apply_roofline(question: Question, answer: Prediction) -> Prediction:
     """Lift a prediction to what the peaks allow: no board is faster than its operations and its memory."""
     if not answer.known:
         return answer
@@ -201,21 +202,21 @@ def _floored(question: Question, answer: Predicted) -> Predicted:
     return replace(answer, ms=max(answer.ms, least), low=max(answer.low, least), high=max(answer.high, least))
 
 
-def _whole(candidate: Candidate, load: Workload, phases: Sequence[Phase]) -> Predicted:
+def _total_latency(candidate: Candidate, load: Workload, phases: Sequence[Phase]) -> Prediction:
     """Add up the phases; their errors are of one board and one runtime, so the bounds add up too."""
     if load.unknown:
         count = len(load.unknown)
-        return Predicted(math.nan, why=f"{count} layers have no static shape, for example {load.unknown[0]}")
+        return Prediction(math.nan, why=f"{count} layers have no static shape, for example {load.unknown[0]}")
     if not phases:
-        return Predicted(math.nan, why="the graphs have no matrix product or convolution to count")
+        return Prediction(math.nan, why="the graphs have no matrix product or convolution to count")
     if not candidate.figures.runtime:
-        return Predicted(math.nan, why=f"no latency was published for {candidate.engine}")
+        return Prediction(math.nan, why=f"no latency was published for {candidate.engine}")
     unknown = next((phase.once for phase in phases if not phase.once.known), None)
     if unknown is not None:
         return unknown
     ms, low, high = (sum(phase.runs * getattr(phase.once, name) for phase in phases) for name in ("ms", "low", "high"))
     regimes = {phase.once.regime for phase in phases}
-    return Predicted(ms, low, high, "unseen" if "unseen" in regimes else min(regimes))
+    return Prediction(ms, low, high, "unseen" if "unseen" in regimes else min(regimes))
 
 
 def memory_mb(candidate: Candidate, load: Workload) -> tuple[float, float, float]:
@@ -264,7 +265,9 @@ def idle_watts(candidate: Candidate) -> float:
     return min(idle.value if idle else IDLE * limit, BUSY_LOW * limit)
 
 
-def at(load: Workload, scale: dict[str, tuple[float, float, float]], runs: dict[str, int] | None = None) -> Workload:
+def rescale(
+    load: Workload, scale: dict[str, tuple[float, float, float]], runs: dict[str, int] | None = None
+) -> Workload:
     """Return a workload with graphs changed: name -> factors of multiply-accumulates, weights and activations."""
     graphs = {}
     for name, graph in load.graphs.items():

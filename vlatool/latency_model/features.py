@@ -16,7 +16,7 @@ from vlatool.latency_model.gaussian_process import KEYS, Rows
 
 Array = NDArray[Any]
 
-ALIKE = {"bfloat16": "float16", "float8": "int8"}
+PROXIES = {"bfloat16": "float16", "float8": "int8"}
 """Precision -> the one whose published latencies speak for it."""
 CENTRE = np.array([0.6, 1.8, 2.0, 4.0])
 SPREAD = np.array([1.8, 0.6, 1.0, 0.6])
@@ -48,7 +48,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Place:
+class ComputeUnit:
     """What computes.
 
     Args:
@@ -75,7 +75,7 @@ class Place:
     def peak(self, precision: str) -> float:
         """Return the peak that a precision computes at: that of float16, or float32, for weights alone in few bits."""
         computed = {"w4": "float16", "w8": "float16"}.get(precision, precision)
-        chain = (computed, ALIKE.get(computed, computed), "float16" if computed in ALIKE else "float32", "float32")
+        chain = (computed, PROXIES.get(computed, computed), "float16" if computed in PROXIES else "float32", "float32")
         return next((self.peaks[name] for name in chain if name in self.peaks), max(self.peaks.values()))
 
 
@@ -89,7 +89,7 @@ class Question:
     """
 
     work: Work
-    place: Place
+    compute_unit: ComputeUnit
     runtime: str
     precision: str
 
@@ -114,26 +114,26 @@ def roofline_ms(question: Question, shares: Shares) -> float:
 
 def roofline_parts(question: Question, shares: Shares) -> dict[str, float]:
     """Return ``compute``, ``memory`` and ``overhead`` in ms (Williams, Waterman, Patterson, CACM 2009)."""
-    work, place = question.work, question.place
+    work, compute_unit = question.work, question.compute_unit
     weight, activation = PRECISIONS[question.precision]
     moved = work.weights * weight / shares.weights + work.activations * activation / shares.activations
     return {
-        "compute": 2e3 * work.macs / (place.peak(question.precision) * 1e12 * shares.compute),
-        "memory": 1e3 * moved / (place.bandwidth_gb_s * 1e9),
-        "overhead": work.layers / place.clock_ghz * LAYER_MS * shares.layers,
+        "compute": 2e3 * work.macs / (compute_unit.peak(question.precision) * 1e12 * shares.compute),
+        "memory": 1e3 * moved / (compute_unit.bandwidth_gb_s * 1e9),
+        "overhead": work.layers / compute_unit.clock_ghz * LAYER_MS * shares.layers,
     }
 
 
 def rows_of(questions: Iterable[Question], shares: Shares) -> Rows:
     """Return the rows of the process for some questions."""
-    asked = list(questions)
-    keys = [_keys(question) for question in asked]
+    listed = list(questions)
+    keys = [_keys(question) for question in listed]
     return Rows(
         {name: np.array([row[name] for row in keys], np.int64) for name in KEYS},
-        np.array([_model(question.work) for question in asked]).reshape(-1, 4),
-        np.array([[trait in question.work.traits for trait in TRAITS] for question in asked], float).reshape(-1, 5),
-        np.array([_device(question) for question in asked]).reshape(-1, 4),
-        np.log([roofline_ms(question, shares) for question in asked]),
+        np.array([_model(question.work) for question in listed]).reshape(-1, 4),
+        np.array([[trait in question.work.traits for trait in TRAITS] for question in listed], float).reshape(-1, 5),
+        np.array([_device(question) for question in listed]).reshape(-1, 4),
+        np.log([roofline_ms(question, shares) for question in listed]),
     )
 
 
@@ -145,22 +145,22 @@ def _model(work: Work) -> Array:
 
 
 def _device(question: Question) -> Array:
-    place = question.place
-    values = (place.peak(question.precision), place.bandwidth_gb_s, place.clock_ghz, place.cores)
+    unit = question.compute_unit
+    values = (unit.peak(question.precision), unit.bandwidth_gb_s, unit.clock_ghz, unit.cores)
     return np.asarray((np.log(values) - DEVICE_CENTRE) / DEVICE_SPREAD)
 
 
 def _keys(question: Question) -> dict[str, int]:
-    place, runtime = question.place, question.runtime
-    precision = ALIKE.get(question.precision, question.precision)
+    compute_unit, runtime = question.compute_unit, question.runtime
+    precision = PROXIES.get(question.precision, question.precision)
     work = question.work
     own = f"own {work.macs} {work.weights} {work.activations} {work.layers} {sorted(work.traits)}"
     name = f"{work.name} {work.macs:.3g}" if work.name else own
-    unit = f"{place.device}/{place.unit}"
-    core = f"{place.unit}/{' '.join(sorted(place.isa.split()))}" if place.isa else unit
+    unit = f"{compute_unit.device}/{compute_unit.unit}"
+    core = f"{compute_unit.unit}/{' '.join(sorted(compute_unit.isa.split()))}" if compute_unit.isa else unit
     names = (
-        place.unit, core, unit, runtime, f"{runtime} {precision}", f"{core} {runtime} {precision}", f"{unit} {runtime}",
-        f"{unit} {runtime} {precision}", f"{unit} {runtime} {precision} {place.setting}", name,
-        f"{name} {runtime} {precision}",
+        compute_unit.unit, core, unit, runtime, f"{runtime} {precision}", f"{core} {runtime} {precision}",
+        f"{unit} {runtime}", f"{unit} {runtime} {precision}", f"{unit} {runtime} {precision} {compute_unit.setting}",
+        name, f"{name} {runtime} {precision}",
     )  # fmt: skip
     return {key: zlib.crc32(text.encode()) for key, text in zip(KEYS, names, strict=True)}

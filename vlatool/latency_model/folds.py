@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from vlatool.latency_model.features import Question
 from vlatool.latency_model.gaussian_process import Rows, Scales, kernel
-from vlatool.latency_model.published import Point, merged
+from vlatool.latency_model.published_latencies import Point, merge_versions
 
 Array = NDArray[Any]
 UNITS = ("cpu", "gpu", "igpu", "npu")
-LONGEST = 32
+MAX_MODELS = 32
 """Models that calibrate a held-out device, one after the other, at most."""
 
 
@@ -45,11 +45,11 @@ class Sample:
     published: Array
 
     @staticmethod
-    def of(points: Sequence[Point]) -> Sample:
+    def from_points(points: Sequence[Point]) -> Sample:
         """Take the points that can be asked about, one row for each question."""
         asked = [point for point in points if point.question is not None]
-        known = merged(asked)
-        row = {point.question: place for place, point in enumerate(known)}
+        known = merge_versions(asked)
+        row = {point.question: index for index, point in enumerate(known)}
         figures = np.array([row[point.question] for point in asked], np.int64)
         published = np.array([point.log_ms for point in asked])
         models, devices = (_codes([getattr(point, name) for point in known]) for name in ("model", "group"))
@@ -81,65 +81,66 @@ class Folds:
         self._weights = self._inverse @ self._residual
         self._sample = sample
 
-    def without(self, groups: Array) -> tuple[Array, Array]:
+    def leave_out(self, groups: Array) -> tuple[Array, Array]:
         """Return error of log(ms) (predicted less measured) and its predicted standard deviation, row by row."""
         error, deviation = np.zeros(len(groups)), np.zeros(len(groups))
-        for index, mean, covariance in self._each(groups):
+        for index, mean, covariance in self._left_out_groups(groups):
             error[index], deviation[index] = mean - self._residual[index], np.sqrt(np.diag(covariance))
         return error, deviation
 
-    def calibrated(self, groups: Array, most: int = LONGEST) -> tuple[Array, Array, Array, Array]:
+    def leave_out_calibrated(self, groups: Array, limit: int = MAX_MODELS) -> tuple[Array, Array, Array, Array]:
         """Leave each device out, tell the process of one of its models, and predict the others; for many of its models.
 
         Args:
             groups: Devices.
-            most: Models of each that are told, one after the other.
+            limit: Models of each that are told, one after the other.
 
         Returns:
             Errors, standard deviations, the rows that they belong to, and which telling each is of.
         """
         errors: list[Array] = []
         deviations: list[Array] = []
-        places: list[Array] = []
-        for index, mean, covariance in self._each(groups):
+        rows: list[Array] = []
+        for index, mean, covariance in self._left_out_groups(groups):
             models = np.unique(self._sample.models[index])
-            for model in models[:: max(1, -(-len(models) // most))]:
-                seen = self._sample.models[index] == model
-                if not seen.all():
-                    error, deviation = self._given(seen, index, mean, covariance)
+            for model in models[:: max(1, -(-len(models) // limit))]:
+                observed = self._sample.models[index] == model
+                if not observed.all():
+                    error, deviation = self._errors_given(observed, index, mean, covariance)
                     errors.append(error)
                     deviations.append(deviation)
-                    places.append(index[~seen])
+                    rows.append(index[~observed])
         if not errors:  # every device has one model alone
             return np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)
-        draws = np.repeat(np.arange(len(places)), [len(part) for part in places])
-        return np.concatenate(errors), np.concatenate(deviations), np.concatenate(places), draws
+        draws = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
+        return np.concatenate(errors), np.concatenate(deviations), np.concatenate(rows), draws
 
-    def once(self, groups: Array, random: np.random.Generator) -> tuple[Array, Array, Array]:
+    def leave_out_once(self, groups: Array, random: np.random.Generator) -> tuple[Array, Array, Array]:
         """Leave each device out, tell the process of one of its models, drawn at random, and predict the others.
 
         Returns:
             Error and standard deviation of each row, and which rows were told.
         """
         error, deviation = np.zeros(len(groups)), np.ones(len(groups))
-        taught = np.zeros(len(groups), bool)
-        for index, mean, covariance in self._each(groups):
+        calibrating = np.zeros(len(groups), bool)
+        for index, mean, covariance in self._left_out_groups(groups):
             models = np.unique(self._sample.models[index])
-            seen = self._sample.models[index] == models[random.integers(len(models))]
-            taught[index[seen]] = True
-            if not seen.all():
-                error[index[~seen]], deviation[index[~seen]] = self._given(seen, index, mean, covariance)
-        return error, deviation, taught
+            observed = self._sample.models[index] == models[random.integers(len(models))]
+            calibrating[index[observed]] = True
+            if not observed.all():
+                others = index[~observed]
+                error[others], deviation[others] = self._errors_given(observed, index, mean, covariance)
+        return error, deviation, calibrating
 
-    def _given(self, seen: Array, index: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    def _errors_given(self, observed: Array, index: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Return error and standard deviation of a group's other rows, once the process is told those that are seen."""
-        residual, rest = self._residual[index], ~seen
-        across = covariance[np.ix_(rest, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
-        error = mean[rest] + across @ (residual[seen] - mean[seen]) - residual[rest]
-        spread = np.diag(covariance)[rest] - np.einsum("ij,ij->i", across, covariance[np.ix_(rest, seen)])
+        residual, rest = self._residual[index], ~observed
+        across = covariance[np.ix_(rest, observed)] @ np.linalg.inv(covariance[np.ix_(observed, observed)])
+        error = mean[rest] + across @ (residual[observed] - mean[observed]) - residual[rest]
+        spread = np.diag(covariance)[rest] - np.einsum("ij,ij->i", across, covariance[np.ix_(rest, observed)])
         return error, np.sqrt(np.maximum(spread, 1e-9))
 
-    def _each(self, groups: Array) -> Iterator[tuple[Array, Array, Array]]:
+    def _left_out_groups(self, groups: Array) -> Iterator[tuple[Array, Array, Array]]:
         for code in np.unique(groups):
             index = np.flatnonzero(groups == code)
             covariance = np.linalg.inv(self._inverse[np.ix_(index, index)])

@@ -51,7 +51,7 @@ class Rows:
         return Rows(keys, self.model[index], self.traits[index], self.device[index], self.prior[index])
 
     @staticmethod
-    def joined(first: Rows, second: Rows) -> Rows:
+    def concatenate(first: Rows, second: Rows) -> Rows:
         """Return the rows of both."""
         keys = {name: np.concatenate([first.keys[name], second.keys[name]]) for name in KEYS}
         rest = (np.concatenate([getattr(first, name), getattr(second, name)]) for name in PARTS)
@@ -109,28 +109,28 @@ def kernel(first: Rows, second: Rows, scales: Scales) -> Array:
     for begin in range(0, len(first), BLOCK):
         part = slice(begin, begin + BLOCK)
         keys = {name: values[part] for name, values in first.keys.items()}
-        smooth, near = _alike(_squares(models[0][part], models[1]))
-        places = _squares(first.device[part], second.device)
-        covariance[part] = _covariance(keys, second.keys, smooth, near, places, scales)
+        smooth, near = _similarities(_squares(models[0][part], models[1]))
+        devices = _squares(first.device[part], second.device)
+        covariance[part] = _covariance(keys, second.keys, smooth, near, devices, scales)
     return covariance
 
 
-def _alike(squares: Array) -> tuple[Array, Array]:
+def _similarities(squares: Array) -> tuple[Array, Array]:
     """Return how alike models are, with a long tail and with a short one."""
     return 1 / (1 + squares / 2), np.exp(-squares / 2)
 
 
 def _covariance(
-    first: Mapping[str, Array], second: Mapping[str, Array], smooth: Array, near: Array, places: Array, scales: Scales
+    first: Mapping[str, Array], second: Mapping[str, Array], smooth: Array, near: Array, devices: Array, scales: Scales
 ) -> Array:
     def same(name: str) -> Array:
         return np.asarray(first[name][:, None] == second[name][None])
 
     covariance = scales.constant**2 + scales.all_m**2 * smooth
     covariance += same("runtime") * scales.runtime**2
-    twins = np.exp(places / (-2 * scales.length_kind**2))
+    twins = np.exp(devices / (-2 * scales.length_kind**2))
     covariance += same("kind") * (scales.kind**2 + scales.kind_m**2 * smooth + scales.kind_d**2 * twins)
-    alike = np.exp(places / (-2 * scales.length_device**2))
+    alike = np.exp(devices / (-2 * scales.length_device**2))
     covariance += same("unit") * (scales.unit_d**2 * alike + scales.unit_m**2 * smooth)
     covariance += same("core") * scales.core**2
     covariance += same("made") * (scales.made**2 + scales.made_m**2 * smooth)

@@ -13,13 +13,13 @@ import numpy as np
 
 from vlatool.errors import DataError, UsageError
 from vlatool.latency_model.fit import fit
-from vlatool.latency_model.model import LatencyModel, Predicted
-from vlatool.latency_model.published import Point, merged, read_points
-from vlatool.latency_model.score import DRAWS, FOLDS, summary, told_as
+from vlatool.latency_model.model import LatencyModel, Prediction
+from vlatool.latency_model.published_latencies import Point, merge_versions, read_points
+from vlatool.latency_model.score import DRAWS, FOLDS, describe_split, summarize
 from vlatool.machine.processes import single_threads
 from vlatool.user_code.children import spread
 
-Answered = list[tuple[Point, Predicted]]
+PredictedPoints = list[tuple[Point, Prediction]]
 
 
 def refit_points(
@@ -51,13 +51,13 @@ def refit_points(
             "pass --held-out models or --held-out devices",
         )
     points = read_points(path)
-    folds = dealt([point for point in points if point.question], held_out, seed)
+    folds = deal_folds([point for point in points if point.question], held_out, seed)
     if len(folds) < 2:
         raise DataError(
             f"{path} has fewer than two {held_out}: nothing is left to fit on.",
             f"add rows of further {held_out}, or hold out something else",
         )
-    answered: dict[str, Answered] = {kind: [] for kind in KINDS[held_out]}
+    answered: dict[str, PredictedPoints] = {kind: [] for kind in KINDS[held_out]}
     how = {"points": str(path.absolute()), "held_out": held_out, "seed": seed, "seconds": seconds}
     jobs = [{**how, "held": sorted(held)} for held in folds]
     processes = len(os.sched_getaffinity(0))
@@ -65,27 +65,27 @@ def refit_points(
     with single_threads(), contextlib.closing(parts):
         for done, part in enumerate(parts, 1):
             for kind, rows in part.items():
-                answered[kind] += [(points[number], Predicted(**values)) for number, values in rows]
+                answered[kind] += [(points[number], Prediction(**values)) for number, values in rows]
             tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
     unasked = [point for point in points if not point.question]
     summaries = {}
     for kind, pairs in answered.items():
         predictions = [prediction for _, prediction in pairs]
-        about = f"{told_as(kind, seed)}; all fitted anew without it, {seconds:g} s each"
-        summaries[kind] = summary([point for point, _ in pairs] + unasked, predictions, about)
+        about = f"{describe_split(kind, seed)}; all fitted anew without it, {seconds:g} s each"
+        summaries[kind] = summarize([point for point, _ in pairs] + unasked, predictions, about)
     return summaries
 
 
 KINDS = {"models": ("models",), "devices": ("devices", "calibrated")}
 
 
-def dealt(points: Sequence[Point], held_out: str, seed: int) -> list[frozenset[str]]:
+def deal_folds(points: Sequence[Point], held_out: str, seed: int) -> list[frozenset[str]]:
     """Return the names of the models, or of the boards, that are left out together."""
     if held_out != "models":
         return [frozenset({name}) for name in sorted({point.group for point in points})]
     names = sorted({point.model for point in points})
     order = np.random.default_rng(seed).permutation(len(names))
-    parts = [frozenset(names[place] for place in order[number::FOLDS]) for number in range(FOLDS)]
+    parts = [frozenset(names[index] for index in order[number::FOLDS]) for number in range(FOLDS)]
     return [part for part in parts if part]
 
 
@@ -99,7 +99,7 @@ def fold(job: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> 
 
 def one_fold(
     points: Sequence[Point], held: frozenset[str], held_out: str, seed: int, seconds: float
-) -> dict[str, Answered]:
+) -> dict[str, PredictedPoints]:
     """Return what a model that was fitted without some models or boards says of them."""
 
     def out(point: Point) -> bool:
@@ -107,21 +107,21 @@ def one_fold(
 
     mine = [point for point in points if out(point) and point.question]
     model = fit([point for point in points if not out(point)], None, seconds, seed, lambda _: None)
-    answered = {held_out: answers(model, mine)}
+    answered = {held_out: predict_points(model, mine)}
     if held_out == "devices":
         random = np.random.default_rng(seed)
         names = sorted({point.model for point in mine})
         answered["calibrated"] = []
         for _ in range(DRAWS):
             known = names[random.integers(len(names))]
-            measured = merged(point for point in mine if point.model == known)
-            taught = model.conditioned(
+            measured = merge_versions(point for point in mine if point.model == known)
+            conditioned = model.conditioned(
                 [(point.question, float(np.exp(point.log_ms))) for point in measured if point.question]
             )
-            answered["calibrated"] += answers(taught, [point for point in mine if point.model != known])
+            answered["calibrated"] += predict_points(conditioned, [point for point in mine if point.model != known])
     return answered
 
 
-def answers(model: LatencyModel, points: Sequence[Point]) -> Answered:
+def predict_points(model: LatencyModel, points: Sequence[Point]) -> PredictedPoints:
     """Return what a model says of some points."""
     return list(zip(points, model.predict([point.question for point in points if point.question]), strict=True))

@@ -15,7 +15,7 @@ from vlatool.measurement.interleaved import latency_measurements, percentile_mea
 from vlatool.measurement.measured import Measured, PolicyRun
 from vlatool.measurement.paced import overloaded, paced_measurements
 from vlatool.report import Measurement
-from vlatool.telemetry import DEGREE, THROTTLE, Absent, Recorded
+from vlatool.telemetry import DEGREE, THROTTLE, Absent, Summary
 
 ENERGY_S = 10.0
 """Seconds below which the energy of a run says little (MLPerf Tiny: runs of 10 s)."""
@@ -174,7 +174,7 @@ def _start_parts(starts: Sequence[ColdStart]) -> list[dict[str, Any]]:
     ]
 
 
-def _telemetry(telemetry: Recorded) -> dict[str, list[dict[str, Any]]]:
+def _telemetry(telemetry: Summary) -> dict[str, list[dict[str, Any]]]:
     gauges = [
         {"reading": name, "unit": gauge.unit, "min": round(gauge.min, 4), "mean": round(gauge.mean, 4),
          "max": round(gauge.max, 4)}

@@ -12,7 +12,7 @@ SEED = 0
 PROBES = 4
 """Number of random directions for each action."""
 NO_GRADIENT_FIX = (
-    "let make() return the module that was trained; or take a rank that needs none: --rank error, --rank magnitude"
+    "let make() return the trained module; or use a rank without gradients: --rank error, --rank magnitude"
 )
 Key = TypeVar("Key")
 

@@ -12,7 +12,7 @@ from vlatool.module.axes import Member
 from vlatool.module.edits import BLOCKS, Edit
 from vlatool.prune._block_ranking import BlockRanking
 from vlatool.prune._latency_meter import LatencyMeter
-from vlatool.prune._unit_groups import MacCounter, UnitGroup
+from vlatool.prune._unit_groups import Macs, UnitGroup
 
 MIN_RELATIVE_COST = 0.1
 """Least cost of a multiply-accumulate relative to the median: a measurement may find it free, or even a gain."""
@@ -129,7 +129,7 @@ def role_of(group: UnitGroup) -> str:
 
 
 def measure_costs(
-    groups: Sequence[UnitGroup], stacks: Sequence[Stack], work: MacCounter, clock: LatencyMeter
+    groups: Sequence[UnitGroup], stacks: Sequence[Stack], work: Macs, clock: LatencyMeter
 ) -> tuple[float, Mapping[str, float]]:
     """Measure the policy without half of the units of each role, and without one block of each stack.
 
@@ -147,9 +147,8 @@ def measure_costs(
         for role in roles
     ]
     costs = {role: (whole - ms) / macs for role, ms, macs in zip(roles, times, saved, strict=False) if macs}
-    floor = MIN_RELATIVE_COST * float(
-        np.median([price for price in costs.values() if price > 0] or [whole / max(saved)])
-    )
+    median = float(np.median([cost for cost in costs.values() if cost > 0] or [whole / max(saved)]))
+    floor = MIN_RELATIVE_COST * median
     return whole, {role: max(costs.get(role, floor), floor) for role in roles}
 
 

@@ -50,8 +50,7 @@ class LatencyMeter:
     def times(self, edit_lists: Sequence[Sequence[Edit]]) -> tuple[float, list[float]]:
         """Return the milliseconds of the unpruned policy, and of each list of edits, from one interleaved run.
 
-        They are medians of the unpruned policy's calls times ratios of lower percentiles, which other programs disturb
-        less.
+        They are medians of the unpruned policy's calls times ratios of lower percentiles, which are less disturbed.
         """
         paths = [self._unpruned, *self._export_each(edit_lists)]
         job = LatencyJob(tuple(map(str, paths)), self._engine, self._threads, MIN_CALLS, MIN_SECONDS, check=False)

@@ -73,9 +73,8 @@ def input_rows(named_arguments: Mapping[str, Any], *, is_linear: bool) -> Tensor
     pads = _per_axis(pads, len(size))
     if len(size) == 1:  # an image of one row
         inputs, size, pads, steps, holes = inputs[..., None, :], (1, *size), (0, *pads), (1, *steps), (1, *holes)
-    return _columns(
-        inputs if inputs.dim() == 4 else inputs[None], named_arguments.get("groups", 1), (size, holes, pads, steps)
-    )
+    images = inputs if inputs.dim() == 4 else inputs[None]
+    return _columns(images, named_arguments.get("groups", 1), (size, holes, pads, steps))
 
 
 def _columns(inputs: Tensor, groups: int, window: tuple[Any, ...]) -> Tensor:

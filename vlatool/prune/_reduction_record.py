@@ -8,7 +8,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import FallsShort
 from vlatool.module.axes import Walk
-from vlatool.prune._unit_groups import MacCounter
+from vlatool.prune._unit_groups import Macs
 from vlatool.stage.controls import PRUNED
 
 MIN_REACHED = 0.9
@@ -19,28 +19,26 @@ MIN_NAMED_SHARE = 0.005
 """Least share of the work of a keeper in a message."""
 
 
-def reduction_record(
-    requested: float, work: MacCounter, whole: Sequence[int], remaining: Sequence[int], walks: Iterable[Walk]
-) -> Any:
+def reduction_record(goal: float, work: Macs, whole: Sequence[int], kept: Sequence[int], walks: Iterable[Walk]) -> Any:
     """Return the record of a pruning.
 
     Args:
-        requested: Share of the multiply-accumulates to remove.
+        goal: Share of the multiply-accumulates to remove.
         work: Counter of multiply-accumulates.
         whole: Units of each group before pruning.
-        remaining: Units of each group that stay.
+        kept: Units of each group that stay.
         walks: Walks of the graphs.
 
     Returns:
-        ``requested`` and ``reached`` (shares), ``macs`` (before, after), ``keeps`` (operator, or inputs and outputs ->
+        ``goal`` and ``reached`` (shares), ``macs`` (before, after), ``keeps`` (operator, or inputs and outputs ->
         share of the remaining work, in layers of which it keeps a whole width) and ``without_rule``, the operators
         whose effect on axes vlatool does not know.
     """
-    before, after = work.macs(whole), work.macs(remaining)
-    keeps = {keeper: round(share, 4) for keeper, share in work.keepers(remaining).items() if share >= MIN_NAMED_SHARE}
+    before, after = work.macs(whole), work.macs(kept)
+    keeps = {keeper: round(share, 4) for keeper, share in work.keepers(kept).items() if share >= MIN_NAMED_SHARE}
     unknown = sorted(set().union(*(walk.unknown for walk in walks)))
     reached = 1 - after / before if before else 0.0
-    return {"asked": requested, "reached": round(reached, 4), "macs": [before, after], "keeps": keeps,
+    return {"asked": goal, "reached": round(reached, 4), "macs": [before, after], "keeps": keeps,
             "without_rule": unknown}  # fmt: skip
 
 

@@ -65,9 +65,8 @@ class SparsePruning(ModuleStage):
         for number, (name, layer) in enumerate(layers.items()):
             context.tell(f"pruning {name}", number / len(layers))
             flat = layer.weight.detach().reshape(len(layer.weight), -1)
-            layer.weight.data = (
-                self.prune_weight(flat, moments.get(name)).reshape(layer.weight.shape).to(layer.weight.dtype)
-            )
+            pruned = self.prune_weight(flat, moments.get(name))
+            layer.weight.data = pruned.reshape(layer.weight.shape).to(layer.weight.dtype)
         return Changed()
 
     def prune_weight(self, weight: Tensor, moments: Tensor | None) -> Tensor:

@@ -123,11 +123,11 @@ def find_groups(walks: Mapping[str, Walk], selection: Selection, multiple: int, 
     if names:
         selection.check(names, "weight that can be pruned")
     if names and not groups:
-        raise nothing_to_prune(name)
+        raise no_units(name)
     return groups
 
 
-def nothing_to_prune(name: str) -> RecipeError:
+def no_units(name: str) -> RecipeError:
     """Return the error for a policy without removable units."""
     return RecipeError(
         f"{name} has no heads, neurons or channels that can be removed.",
@@ -176,7 +176,7 @@ def rank_units(
             value.requires_grad_(False)
 
 
-class MacCounter:
+class Macs:
     """Counter of the multiply-accumulates of one inference.
 
     Args:
@@ -228,10 +228,9 @@ class MacCounter:
         return {keeper: macs / max(sum(each), 1) for keeper, macs in kept.most_common()}
 
     def _add(self, graph: str, walk: Walk, leaves: Sequence[int], keepers: frozenset[str], macs: int) -> None:
-        loses = [self._group_indices[graph, leaf] for leaf in leaves if (graph, leaf) in self._group_indices]
-        fixed = macs * math.prod(
-            walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in self._group_indices
-        )
+        known = self._group_indices
+        loses = [known[graph, leaf] for leaf in leaves if (graph, leaf) in known]
+        fixed = macs * math.prod(walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in known)
         for number in set(loses):
             self._terms_of_group[number].append(len(self._terms))
         self._terms.append((fixed, loses, keepers))

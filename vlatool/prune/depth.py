@@ -81,9 +81,8 @@ class Depth(ModuleStage):
             RecipeError: when there is no stack of blocks to prune, a pattern matches none, or ``keep`` does not fit.
         """
         sizes = self._selected_stacks(self._sizes(modules), source)
-        remaining = (
-            _explicit_blocks(sizes, self.keep) if self.keep else self._remaining_blocks(sizes, modules, source, context)
-        )
+        explicit = _explicit_blocks(sizes, self.keep) if self.keep else {}
+        remaining = explicit or self._remaining_blocks(sizes, modules, source, context)
         context.said.extend(
             f"kept {len(kept)} of {sizes[graph, name]} blocks of {name or 'the module itself'}: "
             f"{', '.join(map(str, kept))}"
@@ -119,15 +118,12 @@ class Depth(ModuleStage):
         return size - self.blocks if self.blocks is not None else min(size - 1, math.floor(size * self.ratio + 1e-9))
 
     def _removal_order(
-        self,
-        ranking: BlockRanking,
-        remaining: Mapping[StackId, list[int]],
-        removals: Mapping[StackId, int],
-        context: Context,
-    ) -> Iterator[tuple[StackId, int]]:
+        self, ranking: BlockRanking, remaining: Mapping[StackId, list[int]], counts: Mapping[StackId, int],
+        context: Context
+    ) -> Iterator[tuple[StackId, int]]:  # fmt: skip
         """Yield the next block to remove; the caller removes it from ``remaining``."""
         rank = {"error": ranking.errors, "cosine": ranking.cosine, "gate": ranking.gate}[self.rank]
-        pending, total, removed = dict(removals), sum(removals.values()), set[BlockId]()
+        pending, total, removed = dict(counts), sum(counts.values()), set[BlockId]()
         scores: dict[BlockId, float] = {}
         for done in range(total):
             blocks = [(*stack, block) for stack, count in pending.items() if count for block in remaining[stack]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -13,9 +14,9 @@ from pydantic import Field, model_validator
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import DataError, RecipeError
 from vlatool.files.scratch import scratch_directory
-from vlatool.hardware.profile import Profile, load_profile, names, profile_file
+from vlatool.hardware.profile import Profile, load_profile, profile_file, profile_names
 from vlatool.latency_model.board import Candidate
-from vlatool.latency_model.measured import calibrations
+from vlatool.latency_model.board_measurements import calibrations
 from vlatool.machine.host import fingerprint, matches
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import Edit, edits_from
@@ -35,15 +36,7 @@ from vlatool.prune._latency_costs import (
 from vlatool.prune._latency_meter import LatencyMeter, LatencyPredictor
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune._trials import Trials
-from vlatool.prune._unit_groups import (
-    MacCounter,
-    Rank,
-    UnitGroup,
-    find_groups,
-    nothing_to_prune,
-    rank_units,
-    trace_walks,
-)
+from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, no_units, rank_units, trace_walks
 from vlatool.prune.depth import PROTECTED
 from vlatool.stage.base import Context
 
@@ -97,7 +90,7 @@ class LatencyPruning(ModuleStage):
             return self
         if matches(profile.model_strings, fingerprint()):
             return self
-        if profile.name not in names() or load_profile(profile.name) != profile:
+        if profile.name not in profile_names() or load_profile(profile.name) != profile:
             raise RecipeError(
                 f"The bundle records for which board it was pruned, and {profile.name} is not a known profile.",
                 "name its file: --board FILE, or add its folder to VLATOOL_PROFILES",
@@ -154,12 +147,12 @@ class LatencyPruning(ModuleStage):
         walks = trace_walks(modules, source)
         groups = find_groups(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         if not groups:
-            raise nothing_to_prune(source.manifest.name)
+            raise no_units(source.manifest.name)
         context.tell(f"ranking the units of {len(groups)} groups", None)
         context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
-        work = MacCounter(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
+        work = Macs(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
         with scratch_directory() as scratch:
             meter = self._meter(source, scratch, context)
             edits = self._meet_target(groups, blocks, work, meter, context)
@@ -204,12 +197,7 @@ class LatencyPruning(ModuleStage):
         return all(selection.selects((prefix_of(name) + weight,)) for name in lists.values() for weight in weights)
 
     def _meet_target(
-        self,
-        groups: Sequence[UnitGroup],
-        blocks: Sequence[Stack],
-        work: MacCounter,
-        meter: LatencyMeter,
-        context: Context,
+        self, groups: Sequence[UnitGroup], blocks: Sequence[Stack], work: Macs, meter: LatencyMeter, context: Context
     ) -> tuple[Edit, ...]:
         """Return edits that meet the target, selecting again until they do."""
         context.tell(f"measuring {len({role_of(group) for group in groups})} kinds of layers", None)
@@ -220,9 +208,8 @@ class LatencyPruning(ModuleStage):
         wanted = 1.0
         for number in range(MAX_ROUNDS):
             goal = TARGET_SHARE * self.target_ms / trials.undisturbed_ms * whole
-            edits = trials.next_choice(
-                lambda share: selector.select_until(whole, share, self.target_ms), wanted * goal, whole
-            )
+            select = functools.partial(selector.select_until, whole, asked=self.target_ms)
+            edits = trials.next_choice(select, wanted * goal, whole)
             if self._is_met(trials.measure(edits)):  # confirm with a second run
                 trials.measure(edits)
             ms = trials.record_result(edits, wanted)
@@ -280,7 +267,7 @@ class _Selector:
         self,
         groups: Sequence[UnitGroup],
         stacks: Sequence[Stack],
-        work: MacCounter,
+        work: Macs,
         prices: Mapping[str, float],
         least: float,
     ) -> None:
@@ -325,10 +312,8 @@ class _Selector:
             if first_kept_member(group, self._stacks) is None:
                 continue
             importance, removed = group.cheapest_units(self._least)
-            ms = (
-                self._prices[number] * self._work.saved_alone(number, group.remaining - len(removed))
-                - self._saved[number]
-            )
+            macs = self._work.saved_alone(number, group.remaining - len(removed))
+            ms = self._prices[number] * macs - self._saved[number]
             if removed and ms > 0:
                 yield _Candidate(importance / ms, ms, number, tuple(removed))
 

@@ -57,9 +57,7 @@ class Steps(ModuleStage):
 
     def _program(self, steps: Sequence[ProgramStep]) -> tuple[ProgramStep, ...]:
         if all(step.repeat == 1 for step in steps):
-            raise RecipeError(
-                "The policy has no denoising steps: its program does not repeat a graph.", "use another method"
-            )
+            raise RecipeError("The policy has no denoising steps: its program repeats no graph.", "use another method")
         return tuple(with_fewer_steps(step, self.to) if step.repeat > 1 else step for step in steps)
 
 
@@ -94,9 +92,8 @@ def with_fewer_steps(step: ProgramStep, count: int) -> ProgramStep:
         name: [step.schedule[name][0] + spacing * larger * turn for turn in range(count)]
         for name, spacing in times.items()
     }
-    return replace(
-        step, repeat=count, schedule={name: _as_stored(step, name, schedule[name]) for name in step.schedule}
-    )
+    stored = {name: _as_stored(step, name, schedule[name]) for name in step.schedule}
+    return replace(step, repeat=count, schedule=stored)
 
 
 def _as_stored(step: ProgramStep, name: str, numbers: list[float]) -> list[float]:

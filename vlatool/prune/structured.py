@@ -13,7 +13,7 @@ from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._reduction_record import MIN_REACHED, describe_reduction, reduction_record, refuse_shortfall
 from vlatool.prune._selection import Selection
-from vlatool.prune._unit_groups import MacCounter, Rank, UnitGroup, find_groups, rank_units, trace_walks
+from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, rank_units, trace_walks
 from vlatool.stage.base import Context
 from vlatool.stage.controls import PRUNED
 
@@ -66,7 +66,7 @@ class Structured(ModuleStage):
             runs: Graph name -> number of runs in an inference.
             context: Receiver of progress.
         """
-        work = MacCounter(walks, runs, groups)
+        work = Macs(walks, runs, groups)
         self._remove(groups, work, context)
         whole, remaining = [group.size for group in groups], [group.remaining for group in groups]
         record = reduction_record(self.ratio, work, whole, remaining, walks.values())
@@ -82,7 +82,7 @@ class Structured(ModuleStage):
         """
         refuse_shortfall(bundle)
 
-    def _remove(self, groups: Sequence[UnitGroup], work: MacCounter, context: Context) -> None:
+    def _remove(self, groups: Sequence[UnitGroup], work: Macs, context: Context) -> None:
         """Remove units, in the order of importance for the work that they save, while there are any."""
         sizes = [group.size for group in groups]
         whole = left = work.macs(sizes)
@@ -101,9 +101,6 @@ class Structured(ModuleStage):
             groups[number].remove(last)
             sizes[number] = groups[number].remaining
             before, left = left, work.macs(sizes)
-        if (
-            last
-            and whole - left > (2 - MIN_REACHED) * self.ratio * whole
-            and whole - before >= MIN_REACHED * self.ratio * whole
-        ):
+        wanted = self.ratio * whole
+        if last and whole - left > (2 - MIN_REACHED) * wanted and whole - before >= MIN_REACHED * wanted:
             groups[number].restore(last)  # the last step was too large, and the result before it is close enough

@@ -75,7 +75,7 @@ class CalibratedQuantization(Quantization):
 
     def statistics(
         self, bundle: Bundle, values: ValueNames, samples: SampleSet, context: Context,
-        exempt: Mapping[str, Collection[str]] | None = None,
+        exempt: Mapping[str, Collection[str]] | None = None
     ) -> dict[str, dict[str, Statistics]]:  # fmt: skip
         """Run the calibration samples, and observations saved by a training; return graph -> value -> statistics.
 

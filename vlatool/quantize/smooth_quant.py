@@ -21,7 +21,7 @@ from vlatool.quantize.calibration.activation_statistics import calibrate
 from vlatool.quantize.calibration.ranges import Statistics
 from vlatool.quantize.calibration.samples import recorded_moments
 from vlatool.quantize.int8.smoothing_groups import ConstantEdit, SmoothingGroup, find_groups
-from vlatool.quantize.int8.smoothing_scales import PeakUncertainty, best_alpha, int8_loss, smooth_scales, weight_peaks
+from vlatool.quantize.int8.smoothing_scales import PeakExcess, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.runtime.golden import load_golden
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of
@@ -30,7 +30,7 @@ Array = NDArray[Any]
 
 OPS = ("MatMul", "Gemm")
 REPORT = "reports/smooth_quant.json"
-MAX_GOLDEN_CHANGE = 1e-4
+MAX_CHANGE = 1e-4
 """Largest relative L2 difference of the golden action from the source's: no more than float32 rounding."""
 
 
@@ -127,7 +127,7 @@ class SmoothQuant(CalibratedQuantization):
             samples: Number of calibration samples.
         """
         peaks = np.maximum.reduce(halves)
-        uncertainty = PeakUncertainty.between(halves[0], halves[-1], samples)
+        excess = PeakExcess.between(halves[0], halves[-1], samples)
         median = float(np.median(peaks))
         ratio = float(peaks.max()) / median if median else 0.0
         note = {"value": group.value, "layers": [layer.name for layer in group.layers], "outliers": round(ratio, 3)}
@@ -139,14 +139,14 @@ class SmoothQuant(CalibratedQuantization):
         weights = [writer.weight(layer.weight, layer.axis) for layer in group.layers]
         alpha: float | None
         if self.alpha == "auto":
-            alpha, scales = best_alpha(peaks, weights, uncertainty)
+            alpha, scales = best_alpha(peaks, weights, excess)
         else:
             alpha = float(self.alpha)
             scales = smooth_scales(peaks, weight_peaks(weights), alpha)
         if alpha is None:
             return {**note, "how": "left", "why": "no alpha lowers the estimated error"}
-        plain = int8_loss(peaks, weights, np.ones_like(scales), uncertainty)
-        gain = int8_loss(peaks, weights, scales, uncertainty) / plain if plain else 1.0
+        plain = int8_loss(peaks, weights, np.ones_like(scales), excess)
+        gain = int8_loss(peaks, weights, scales, excess) / plain if plain else 1.0
         writer.apply(group, scales)
         how = "folded" if group.edits else "inserted"
         return {**note, "how": how, "why": "", "alpha": alpha, "estimated_loss": float(f"{gain:.4g}")}
@@ -222,10 +222,8 @@ def _check_same(source: Bundle, smoothed: Bundle) -> None:
     if before is None or after is None or not _equal(before[:2], after[:2]):
         return
     error = relative_error(after[2], before[2])
-    if not error <= MAX_GOLDEN_CHANGE:
-        raise GraphError(
-            f"Smoothing changed the golden action by {error:.3g}; allowed: {MAX_GOLDEN_CHANGE:g}.", "report this"
-        )
+    if not error <= MAX_CHANGE:
+        raise GraphError(f"Smoothing changed the golden action by {error:.3g}; allowed: {MAX_CHANGE:g}.", "report this")
 
 
 def _equal(first: Iterable[dict[str, Any]], second: Iterable[dict[str, Any]]) -> bool:

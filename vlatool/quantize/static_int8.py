@@ -123,7 +123,7 @@ class StaticInt8(CalibratedQuantization):
         second = layout.integer and kind == "uint8"
         return Style(
             kind, self.per_channel, self.reduce_range, layout.fuses_convolutions, hoist=layout.symmetric,
-            signed_second=second, unsigned_convolutions=layout.symmetric,
+            signed_second=second, unsigned_convolutions=layout.symmetric
         )  # fmt: skip
 
     def on(self, profile: Profile) -> Self:

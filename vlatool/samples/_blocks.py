@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-BLOCKED = -1e4  # additive mask value that exists in float16 too
+MASK_VALUE = -1e4  # additive mask value that exists in float16 too
 
 
 def split_heads(tokens: Tensor, heads: int) -> Tensor:
@@ -43,7 +43,7 @@ def _repeat_heads(tensor: Tensor, groups: int) -> Tensor:
 
 def additive(visible: Tensor, dtype: torch.dtype) -> Tensor:
     """Bool mask (True: may be seen) -> additive mask of ``dtype``."""
-    return visible.logical_not().to(dtype) * BLOCKED
+    return visible.logical_not().to(dtype) * MASK_VALUE
 
 
 def sinusoid(time: Tensor, width: int, shortest: float = 4e-3, longest: float = 4.0) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from vlatool.samples._blocks import BLOCKED, GatedFeedforward, attend, split_heads
+from vlatool.samples._blocks import MASK_VALUE, GatedFeedforward, attend, split_heads
 from vlatool.samples._build import Constants
 
 Angles = tuple[Tensor, Tensor]
@@ -98,7 +98,7 @@ class Causal(Constants):
 
     def reset_constants(self) -> None:
         """Block everything above the diagonal."""
-        self.mask.copy_(torch.full(self.mask.shape, BLOCKED).triu(1))
+        self.mask.copy_(torch.full(self.mask.shape, MASK_VALUE).triu(1))
 
     def forward(self) -> Tensor:
         """() -> (length, length)."""

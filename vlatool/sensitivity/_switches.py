@@ -18,7 +18,7 @@ from vlatool.graph.layers import Layer, Style, calibrated_values, hoisted_values
 from vlatool.graph.onnx_graph import FLOAT, OnnxGraph
 from vlatool.graph.qdq import Range, insert_qdq
 
-FLAG = "int8."
+FLAG_PREFIX = "int8."
 """Prefix of the name of the input that switches a layer."""
 
 
@@ -37,20 +37,20 @@ def add_switches(
     Raises:
         GraphError: when a range is missing, or a weight holds NaN or infinity.
     """
-    chosen = list(layers)
-    written = load(path)
-    moved = hoisted_values(written, chosen, style)
+    selected = list(layers)
+    quantized = load(path)
+    hoisted = hoisted_values(quantized, selected, style)
     plain = replace(style, hoist=False)
     known: dict[str, Range] = {}
-    for name in calibrated_values(chosen, plain, {}):
-        source = moved.get(name, name)
+    for name in calibrated_values(selected, plain, {}):
+        source = hoisted.get(name, name)
         if ranges is not None and source not in ranges:
             raise GraphError(f"The value '{source}' of {path.name} has no range.", "calibrate with the same stage")
         known[name] = (0.0, 1.0) if ranges is None else ranges[source]
-    insert_qdq(written, chosen, known, plain)
-    pairs = _Pairs(written, dynamic=ranges is None)
+    insert_qdq(quantized, selected, known, plain)
+    pairs = _Pairs(quantized, dynamic=ranges is None)
     model = load(path)
-    return model, _Writer(model, {layer.name: layer for layer in chosen}, pairs, plain).write()
+    return model, _Writer(model, {layer.name: layer for layer in selected}, pairs, plain).write()
 
 
 class _Pairs(OnnxGraph):
@@ -62,7 +62,7 @@ class _Pairs(OnnxGraph):
         self.nodes = {node.name: node for node in model.graph.node}
         self.used: dict[str, Any] = {}
 
-    def of_input(self, layer: str, index: int, source: str, suffix: str) -> tuple[list[Any], str]:
+    def input_pair(self, layer: str, index: int, source: str, suffix: str) -> tuple[list[Any], str]:
         """Return the nodes before an input of a layer, and the name they give; none when it is read as it is.
 
         Args:
@@ -82,7 +82,7 @@ class _Pairs(OnnxGraph):
         copy = self._copy(last, list(last.input), f"{last.output[0]}{suffix}")
         return [copy], copy.output[0]
 
-    def of_output(self, name: str, suffix: str) -> tuple[list[Any], str]:
+    def output_pair(self, name: str, suffix: str) -> tuple[list[Any], str]:
         """Return the pair that quantizes what a convolution gives, and the name it gives."""
         first = next(node for node in self.readers[name] if node.op_type == "QuantizeLinear")
         return self._pair(first, self.readers[first.output[0]][0], name, suffix)
@@ -114,7 +114,7 @@ class _Writer(OnnxGraph):
         self.layers, self.pairs = layers, pairs
         self.nodes: list[Any] = []
         self.rerouted: dict[str, str] = {}
-        self.flags = {name: f"{FLAG}{number}" for number, name in enumerate(layers)}
+        self.flags = {name: f"{FLAG_PREFIX}{number}" for number, name in enumerate(layers)}
         convolutions = [layer for layer in layers.values() if layer.kind == "Conv" and style.fused_convolutions]
         self.fused = {layer.output: layer for layer in convolutions if layer.output not in self.outputs}
 
@@ -122,30 +122,30 @@ class _Writer(OnnxGraph):
         """Rebuild the list of nodes; return layer name -> flag."""
         for node in self.graph.node:
             node.input[:] = [self.rerouted.get(name, name) for name in node.input]
-            self.nodes.append(self._switched(node) if node.name in self.layers else node)
+            self.nodes.append(self._as_if(node) if node.name in self.layers else node)
             if node.output[0] in self.fused:
-                self._output(self.fused[node.output[0]])
+                self._switch_output(self.fused[node.output[0]])
         self.replace_nodes(self.nodes)
         self.graph.initializer.extend(self.pairs.used.values())
         info, boolean = self.onnx.helper.make_tensor_value_info, self.onnx.TensorProto.BOOL
         self.graph.input.extend(info(flag, boolean, []) for flag in self.flags.values())
         return dict(self.flags)
 
-    def _switched(self, node: Any) -> Any:
+    def _as_if(self, node: Any) -> Any:
         """Return the layer as an ``If``."""
         flag = self.flags[node.name]
         before: list[Any] = []
         inputs = list(node.input)
         for index, name in enumerate(node.input):
-            nodes, value = self.pairs.of_input(node.name, index, name, f"@{flag}.{index}")
+            nodes, value = self.pairs.input_pair(node.name, index, name, f"@{flag}.{index}")
             before += nodes
             inputs[index] = value or name
         return self._if(flag, node, inputs, before)
 
-    def _output(self, layer: Layer) -> None:
+    def _switch_output(self, layer: Layer) -> None:
         """Let all later readers of a convolution's output read what its flag makes of it."""
         flag, target = self.flags[layer.name], f"{layer.output}@switched"
-        before, value = self.pairs.of_output(layer.output, f"@{flag}.out")
+        before, value = self.pairs.output_pair(layer.output, f"@{flag}.out")
         node = self.node("Identity", [layer.output], [target], f"{layer.name}@out")
         self.nodes.append(self._if(flag, node, [value], before))
         self.rerouted[layer.output] = target

@@ -18,7 +18,7 @@ from vlatool.user_code import children
 PRELOAD = ("numpy", "onnx", "onnxruntime", __name__)
 
 
-def sensitivities_apart(
+def sensitivities_in_child(
     bundle: Bundle, stage: StaticInt8, recorded: int, samples: int, context: Context, seconds: float
 ) -> list[LayerError]:
     """Return what ``sensitivities`` gives.
@@ -38,15 +38,15 @@ def sensitivities_apart(
         "bundle": str(bundle.path.absolute()), "options": stage.given(), "recorded": recorded, "samples": samples,
         "seconds": seconds,
     }  # fmt: skip
-    found = children.call(f"{__name__}:run", job, context.tell, "measuring the layers", PRELOAD, own=True)
-    return [LayerError(**layer) for layer in json.loads(found)]
+    reply = children.call(f"{__name__}:run", job, context.tell, "measuring the layers", PRELOAD, own=True)
+    return [LayerError(**layer) for layer in json.loads(reply)]
 
 
 def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:
     """Measure the layers of a job in this process; return them as JSON, in which numbers may be infinite or none."""
     bundle = Bundle.open(Path(job["bundle"]), verify=False)
-    observations, most = recorded_observations(bundle, job["recorded"]), job["samples"]
-    chosen = observations[:: max(1, len(observations) // most)][:most]
+    observations, limit = recorded_observations(bundle, job["recorded"]), job["samples"]
+    selected = observations[:: max(1, len(observations) // limit)][:limit]
     stage = StaticInt8(**job["options"])
-    layers = sensitivities(bundle, stage, None, chosen, Context(tell), seconds=job["seconds"])
+    layers = sensitivities(bundle, stage, None, selected, Context(tell), seconds=job["seconds"])
     return json.dumps([asdict(layer) for layer in layers])

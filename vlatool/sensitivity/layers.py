@@ -31,7 +31,7 @@ from vlatool.sensitivity._switches import add_switches
 from vlatool.stage.base import Context, SampleSet
 
 Array = NDArray[Any]
-Place = tuple[str, str]
+LayerId = tuple[str, str]
 """Graph name and layer name."""
 
 
@@ -91,7 +91,7 @@ def sensitivities(
     """
     known = ranges_of(bundle, stage, context) if ranges is None else ranges
     with Switchboard(bundle, stage, known) as board:
-        return board.errors([(place,) for place in board.shares], observations, context, seconds=seconds)
+        return board.errors([(layer_id,) for layer_id in board.shares], observations, context, seconds=seconds)
 
 
 def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, dict[str, Range]]:
@@ -106,25 +106,25 @@ def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, 
     return {graph: stage.ranges(values) for graph, values in statistics.items()}
 
 
-class _Tape:
+class _OutputTape:
     """What the graphs gave in the float run of an observation, up to the first graph that is now another one."""
 
     def __init__(self) -> None:
         self.recorded: list[Mapping[str, Array]] = []
         self.recording = True
-        self.place = 0
+        self.position = 0
         self.changed = False
 
     def start(self, *, recording: bool) -> None:
-        self.recording, self.place, self.changed = recording, 0, recording
+        self.recording, self.position, self.changed = recording, 0, recording
         if recording:
             self.recorded.clear()
 
 
-class _Switchable:
+class _SwitchableSession:
     """A session of a graph with switches; while nothing before it has changed, it gives what it gave before."""
 
-    def __init__(self, session: Any, flags: Mapping[str, str], tape: _Tape) -> None:
+    def __init__(self, session: Any, flags: Mapping[str, str], tape: _OutputTape) -> None:
         self._session, self._flags, self._tape = session, flags, tape
         self._off = dict.fromkeys(flags.values(), np.array(False))
         self._set = self._off
@@ -140,8 +140,8 @@ class _Switchable:
         tape = self._tape
         tape.changed = tape.changed or self._active
         if not tape.changed:
-            tape.place += 1
-            return tape.recorded[tape.place - 1]
+            tape.position += 1
+            return tape.recorded[tape.position - 1]
         with risky(type(self._session), "ran a graph with switches"):
             outputs: Mapping[str, Any] = self._session.run({**feeds, **self._set})
         if tape.recording:
@@ -168,10 +168,10 @@ class Switchboard:
     ) -> None:
         self._opened = contextlib.ExitStack()
         folder = self._opened.enter_context(scratch_directory())
-        self._tape = _Tape()
-        self._sessions: dict[str, _Switchable] = {}
-        self._kept: Mapping[str, Array] = {}
-        self.shares: dict[Place, float] = {}
+        self._tape = _OutputTape()
+        self._sessions: dict[str, _SwitchableSession] = {}
+        self._state: Mapping[str, Array] = {}
+        self.shares: dict[LayerId, float] = {}
         with foreign_errors("main"):
             layers, _ = stage.plan(bundle)
         for name, graph in bundle.manifest.graphs.items():
@@ -184,7 +184,7 @@ class Switchboard:
                     path = folder / f"{name}.onnx"
                     save(model, path)
             with risky(of_branches(), f"opened the graph '{name}' with switches"):
-                self._sessions[name] = _Switchable(of_branches()(path, threads), flags, self._tape)
+                self._sessions[name] = _SwitchableSession(of_branches()(path, threads), flags, self._tape)
         self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), DEFAULT_ENGINE)
 
     def __enter__(self) -> Switchboard:
@@ -197,36 +197,36 @@ class Switchboard:
         """Run in float32, and keep what the graphs gave for the ``run`` calls that follow."""
         return self._infer((), observation, recording=True)
 
-    def run(self, places: Iterable[Place], observation: Mapping[str, Any]) -> Action:
+    def run(self, layers: Iterable[LayerId], observation: Mapping[str, Any]) -> Action:
         """Run the observation of the last ``reference`` with those layers in int8."""
-        return self._infer(places, observation, recording=False)
+        return self._infer(layers, observation, recording=False)
 
-    def _infer(self, places: Iterable[Place], observation: Mapping[str, Any], *, recording: bool) -> Action:
-        chosen = list(places)
+    def _infer(self, layers: Iterable[LayerId], observation: Mapping[str, Any], *, recording: bool) -> Action:
+        selected = list(layers)
         for name, session in self._sessions.items():
-            session.switch([layer for graph, layer in chosen if graph == name])
+            session.switch([layer for graph, layer in selected if graph == name])
         self._tape.start(recording=recording)
         self.policy.reset()
-        if self._kept:
-            self.policy.program.kept = dict(self._kept)
+        if self._state:
+            self.policy.program.kept = dict(self._state)
         return self.policy.infer(observation)
 
-    def _led_to(self, observations: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+    def _with_state(self, observations: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
         """Yield observations; until the next one, each run is given what the policy keeps before it."""
         if not (self.policy.program.keeps and isinstance(observations, Observations)):
             yield from observations
             return
         for moment in observations.along():
-            self._kept = {} if moment.begins else self._kept
+            self._state = {} if moment.begins else self._state
             if moment.counts:
                 yield moment.observation
             self.reference(moment.observation)
-            self._kept = self.policy.program.kept
-        self._kept = {}
+            self._state = self.policy.program.kept
+        self._state = {}
 
     def errors(
         self,
-        groups: Sequence[Sequence[Place]],
+        groups: Sequence[Sequence[LayerId]],
         observations: Sequence[Mapping[str, Any]],
         context: Context,
         *,
@@ -246,7 +246,7 @@ class Switchboard:
         spec = self.policy.spec.action
         rows: list[list[tuple[Array, ...]]] = [[] for _ in groups]
         start = time.monotonic()
-        for number, observation in enumerate(self._led_to(observations)):
+        for number, observation in enumerate(self._with_state(observations)):
             if number and (time.monotonic() - start) * (number + 1) / number > seconds:
                 break
             reference = self.reference(observation)
@@ -257,13 +257,13 @@ class Switchboard:
         layers = [self._error(group, row) for group, row in zip(groups, rows, strict=True)]
         return sorted(layers, key=lambda layer: -layer.error) if ordered else layers
 
-    def _error(self, group: Sequence[Place], rows: list[tuple[Array, ...]]) -> LayerError:
+    def _error(self, group: Sequence[LayerId], rows: list[tuple[Array, ...]]) -> LayerError:
         spec = self.policy.spec.action
         errors, flips, jumps, elements = (np.mean([row[index] for row in rows], axis=0) for index in range(4))
         labels = spec.labels or tuple(str(index) for index in range(spec.width))
         named = {} if spec.kind == "discrete" else dict(zip(labels, elements.tolist(), strict=True))
         graphs = ", ".join(dict.fromkeys(graph for graph, _ in group))
-        share = float(sum(self.shares[place] for place in group))
+        share = float(sum(self.shares[layer_id] for layer_id in group))
         name = "+".join(layer for _, layer in group)
         return LayerError(name, graphs, float(errors), named, float(flips), float(jumps), share, len(rows))
 

@@ -38,10 +38,7 @@ def counted_shares(path: Path, context: Context) -> dict[str, float]:
     seen = _run(path) if unknown else {}
     if not seen.keys().isdisjoint(unknown):
         model = require("onnx", "build").load(str(path), load_external_data=False)
-        wanted = {
-            *unknown,
-            *read_run_shapes(model),
-        }  # what the graph before it noted holds for layers that are the same
+        wanted = {*unknown, *read_run_shapes(model)}  # shapes of an earlier graph hold for layers that are the same
         write_run_shapes(model, {name: node for name, node in seen.items() if name in wanted})
         path.write_bytes(model.SerializeToString())
         shares, unknown = shares_and_unknown(path)

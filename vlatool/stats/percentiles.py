@@ -90,7 +90,7 @@ def percentile(
         return Percentile(percent, math.nan, math.nan, needed, size, confidence)
     ordered = np.sort(series)
     count = len(ordered)
-    allowed = exceeding(int(size), share, confidence) / int(size)  # of the calls, beyond the bound
+    allowed = required_exceedances(int(size), share, confidence) / int(size)  # of the calls, beyond the bound
     value = ordered[min(count - 1, max(0, math.ceil(share * count) - 1))]
     bound = ordered[min(count - 1, count - 1 - math.floor(allowed * count))]
     return Percentile(percent, float(value), float(max(bound, value)), needed, size, confidence)
@@ -118,7 +118,7 @@ def proven_above(
     return bool(1 - fewer <= 1 - confidence)
 
 
-def exceeding(count: int, share: float, confidence: float = CONFIDENCE) -> int:
+def required_exceedances(count: int, share: float, confidence: float = CONFIDENCE) -> int:
     """Return how many of ``count`` calls may exceed the bound of a percentile; -1 when none of them is enough.
 
     The largest t with P(at most t of n exceed) <= 1 - confidence, where each exceeds with chance ``1 - share``.
@@ -132,15 +132,15 @@ def floor(share: float, confidence: float = CONFIDENCE) -> int:
     One, and not none: a single stall would otherwise decide (the floors of loadgen, 64 for p90 and 662 for p99).
     """
     low, high = 1, 1
-    while exceeding(high, share, confidence) < 1:
+    while required_exceedances(high, share, confidence) < 1:
         low, high = high, high * 2
     while low + 1 < high:
         middle = (low + high) // 2
-        low, high = (low, middle) if exceeding(middle, share, confidence) >= 1 else (middle, high)
+        low, high = (low, middle) if required_exceedances(middle, share, confidence) >= 1 else (middle, high)
     return high
 
 
-def independent(series: Array) -> float:
+def effective_calls(series: Array) -> float:
     """Return how many independent calls a series is worth: n (1 - r) / (1 + r), r the lag-1 correlation of the ranks.
 
     That is exact for a first-order autoregression; ranks keep one long stall from hiding what the others do. A series
@@ -169,7 +169,7 @@ def effective_sample_size(series: Array, share: float, processes: Sequence[int] 
     neighbours do not show (Kish's design effect 1 + (m - 1) rho; rho by one-way analysis of variance of which calls
     exceed the percentile).
     """
-    worth = independent(series)
+    worth = effective_calls(series)
     if processes is None or len(set(processes)) < 2:
         return worth
     exceeds = (series > np.quantile(series, share)).astype(np.float64)

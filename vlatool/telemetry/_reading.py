@@ -31,7 +31,7 @@ SHARE = "share"
 COUNT = "count"
 THROTTLE = "throttle"
 """Of a counter: throttle events. Of a gauge: 1 while the machine is throttled for this reason, else 0."""
-COLDEST = -200.0
+MIN_TEMPERATURE = -200.0
 """Below this in degC a thermal zone is powered off: Jetsons show -256."""
 COMMAND_TIMEOUT_S = 2.0
 
@@ -115,7 +115,7 @@ class NumberFile:
         name, unit, kind, wraps, note: Of the reading.
         path: Relative to the root of the file system.
         factor: From the number to the unit.
-        least: The smallest value that means something.
+        minimum: The smallest value that means something.
     """
 
     name: str
@@ -125,7 +125,7 @@ class NumberFile:
     kind: Kind = "gauge"
     wraps: float | None = None
     note: str = ""
-    least: float = -math.inf
+    minimum: float = -math.inf
 
 
 class FileReader(Reader):
@@ -137,11 +137,11 @@ class FileReader(Reader):
 
     def read(self) -> list[Reading]:
         """Return a reading of every file that can be read now."""
-        values = [(file, scaled(self._root, file.path, file.factor)) for file in self._files]
+        values = [(file, number(self._root, file.path, file.factor)) for file in self._files]
         return [
             Reading(file.name, value, file.unit, file.kind, file.wraps, file.note)
             for file, value in values
-            if value is not None and value >= file.least
+            if value is not None and value >= file.minimum
         ]
 
 
@@ -154,21 +154,21 @@ class CommandReader(Reader):
 
 def gauge(name: str, value: float | None, unit: str, note: str = "") -> list[Reading]:
     """Return one gauge; nothing when there is no finite value."""
-    return _known(name, value, unit, "gauge", None, note)
+    return _finite(name, value, unit, "gauge", None, note)
 
 
 def counter(name: str, value: float | None, unit: str, wraps: float | None = None, note: str = "") -> list[Reading]:
     """Return one counter; nothing when there is no finite value."""
-    return _known(name, value, unit, "counter", wraps, note)
+    return _finite(name, value, unit, "counter", wraps, note)
 
 
-def _known(name: str, value: float | None, unit: str, kind: Kind, wraps: float | None, note: str) -> list[Reading]:
+def _finite(name: str, value: float | None, unit: str, kind: Kind, wraps: float | None, note: str) -> list[Reading]:
     if value is None or not math.isfinite(value):
         return []
     return [Reading(name, value, unit, kind, wraps, note)]
 
 
-def scaled(root: Path, path: str, factor: float) -> float | None:
+def number(root: Path, path: str, factor: float) -> float | None:
     """Return a file that holds one whole number, times ``factor``; None when there is none."""
     try:
         number = read_number(root, path)
@@ -177,7 +177,7 @@ def scaled(root: Path, path: str, factor: float) -> float | None:
         return None
 
 
-def listed(root: Path, folder: str, pattern: str) -> list[str]:
+def find(root: Path, folder: str, pattern: str) -> list[str]:
     """Return the entries of a folder that match, relative to ``root``; ``hwmon2`` comes before ``hwmon10``."""
     try:
         paths = [path.relative_to(root).as_posix() for path in (root / folder).glob(pattern)]

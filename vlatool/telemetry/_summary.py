@@ -59,7 +59,7 @@ class Gauge:
 
 
 @dataclass(frozen=True)
-class Counted:
+class Change:
     """How far a counter moved, in ``unit``, during ``seconds``."""
 
     unit: str
@@ -92,7 +92,7 @@ class Energy:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class Summary:
     """What was measured during a run, and what was not.
 
     Args:
@@ -111,7 +111,7 @@ class Recorded:
     throttled: bool | None
     throttling: tuple[str, ...]
     gauges: Mapping[str, Gauge]
-    counters: Mapping[str, Counted]
+    counters: Mapping[str, Change]
     unmeasured: tuple[Absent, ...]
 
 
@@ -123,7 +123,7 @@ def collect(samples: Iterable[tuple[float, Reading]]) -> dict[str, Series]:
     return series
 
 
-def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> Recorded:
+def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> Summary:
     """Return the summary of a run.
 
     Args:
@@ -138,20 +138,20 @@ def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> R
     """
     missing = list(absent)
     gauges = {name: _gauge(series) for name, series in samples.items() if series.first.kind == "gauge"}
-    counters: dict[str, Counted] = {}
+    counters: dict[str, Change] = {}
     for name, series in samples.items():
         if series.first.kind == "counter":
             moved = _difference(series)
             if isinstance(moved, str):
                 missing.append(Absent(name, moved))
             else:
-                counters[name] = Counted(series.first.unit, moved, series.times[-1] - series.times[0], series.note)
+                counters[name] = Change(series.first.unit, moved, series.times[-1] - series.times[0], series.note)
     energies = [_energy(total, samples) for total in totals(series.first for series in samples.values())]
     missing += [energy for energy in energies if isinstance(energy, Absent)]
     missing += [] if energies else [Absent("energy", NO_POWER)]
     throttled, throttling = _throttled(gauges, counters)
     times = [time_s for series in samples.values() for time_s in (series.times[0], series.times[-1])]
-    return Recorded(
+    return Summary(
         seconds=max(times) - min(times) if times else 0.0,
         energy=tuple(energy for energy in energies if isinstance(energy, Energy)),
         throttled=throttled,
@@ -227,7 +227,7 @@ def _trapezoid(times: Sequence[float], watts: Sequence[float]) -> float:
     return sum((after - before) * (first + second) / 2 for (before, after), (first, second) in steps)
 
 
-def _throttled(gauges: Mapping[str, Gauge], counters: Mapping[str, Counted]) -> tuple[bool | None, tuple[str, ...]]:
+def _throttled(gauges: Mapping[str, Gauge], counters: Mapping[str, Change]) -> tuple[bool | None, tuple[str, ...]]:
     flags = [(flag.note or name, flag.max) for name, flag in gauges.items() if flag.unit == THROTTLE]
     events = [(event.note or name, event.difference) for name, event in counters.items() if event.unit == THROTTLE]
     if not flags and not events:

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT
-from vlatool.telemetry._reading import THROTTLE, Absent, FileReader, NumberFile, Run, listed
+from vlatool.telemetry._reading import THROTTLE, Absent, FileReader, NumberFile, Run, find
 
 COUNT = re.compile(r"/(oc\d+)_event_cnt$")
 
@@ -25,7 +25,7 @@ class OvercurrentReader(FileReader):
         """Find the counters; absent where there are none, which is everywhere but on a Jetson."""
         paths = {
             match[1]: path
-            for path in listed(root, "sys/class/hwmon", "hwmon*/oc*_event_cnt")
+            for path in find(root, "sys/class/hwmon", "hwmon*/oc*_event_cnt")
             if (match := COUNT.search(path))
         }
         files = [

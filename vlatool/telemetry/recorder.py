@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from types import TracebackType
 
 from vlatool.telemetry._reading import Absent, Reader
-from vlatool.telemetry._summary import Recorded, Series, summarise
+from vlatool.telemetry._summary import Series, Summary, summarise
 
 STOP_TIMEOUT_S = 10.0
 """A read takes at most a few commands of two seconds each; after this the thread is left alone."""
@@ -83,7 +83,7 @@ class Recorder:
                 self._read(reader, now)
 
     @property
-    def recorded(self) -> Recorded:
+    def recorded(self) -> Summary:
         """The summary of what has been sampled so far."""
         with self._lock:
             partly = [part for reader in self._readers for part in reader.absent()]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vlatool.machine.host import ROOT
 from vlatool.telemetry import _reading
-from vlatool.telemetry._reading import COLDEST, Absent, CommandReader, Reading, Run, gauge, runner
+from vlatool.telemetry._reading import MIN_TEMPERATURE, Absent, CommandReader, Reading, Run, gauge, runner
 
 COMMAND = ("sh", "-c", "timeout 1 tegrastats --interval 100 | head -n 1")
 """One line: tegrastats runs until it is stopped."""
@@ -94,7 +94,7 @@ def _clock(limit: str) -> str:
 def _temperatures(line: str) -> list[Reading]:
     readings: list[Reading] = []
     for name, text in TEMPERATURE.findall(line):
-        if float(text) > COLDEST and "PMIC" not in name.upper():
+        if float(text) > MIN_TEMPERATURE and "PMIC" not in name.upper():
             readings += gauge(f"tegrastats.{name}.temperature", float(text), _reading.DEGREE)
     return readings
 

@@ -42,17 +42,17 @@ class VcgencmdReader(Reader):
     def open(cls, root: Path = ROOT, run: Run | None = None) -> VcgencmdReader | Absent:
         """Ask for every value once; absent where neither temperature nor throttling is told."""
         ask = runner(root, run)
-        bits = throttled(ask(("vcgencmd", "get_throttled")) or "")
-        degrees = temperature(ask(("vcgencmd", "measure_temp")) or "")
+        bits = parse_throttling(ask(("vcgencmd", "get_throttled")) or "")
+        degrees = parse_temperature(ask(("vcgencmd", "measure_temp")) or "")
         if bits is None and degrees is None:
             return Absent(cls.name, REASON)
-        rails = pmic_watts(ask(("vcgencmd", "pmic_read_adc")) or "")
+        rails = parse_pmic_watts(ask(("vcgencmd", "pmic_read_adc")) or "")
         return cls(ask, bool(rails), (bits or 0) >> SINCE_START)
 
     def read(self) -> list[Reading]:
         """Return what vcgencmd says now."""
-        readings = gauge("vcgencmd.temperature", temperature(self._ask("measure_temp")), DEGREE)
-        bits = throttled(self._ask("get_throttled"))
+        readings = gauge("vcgencmd.temperature", parse_temperature(self._ask("measure_temp")), DEGREE)
+        bits = parse_throttling(self._ask("get_throttled"))
         for bit, words in BITS.items() if bits is not None else ():
             name = words.replace(" ", "_")
             readings += gauge(f"vcgencmd.{name}", _bit(bits, bit), THROTTLE, words)
@@ -60,7 +60,7 @@ class VcgencmdReader(Reader):
                 sticky = _bit(bits, bit + SINCE_START)
                 readings += counter(f"vcgencmd.{name}_since_start", sticky, THROTTLE, note=words)
         if self._has_rails:
-            for rail, watts in pmic_watts(self._ask("pmic_read_adc")).items():
+            for rail, watts in parse_pmic_watts(self._ask("pmic_read_adc")).items():
                 readings += gauge(f"vcgencmd.{rail}", watts, WATT)
         return readings
 
@@ -84,19 +84,19 @@ def _bit(bits: int | None, bit: int) -> int:
     return (bits or 0) >> bit & 1
 
 
-def temperature(text: str) -> float | None:
+def parse_temperature(text: str) -> float | None:
     """Return the degC of ``temp=48.0'C``; None when there is none."""
     degrees = TEMPERATURE.search(text)
     return float(degrees[1]) if degrees else None
 
 
-def throttled(text: str) -> int | None:
+def parse_throttling(text: str) -> int | None:
     """Return the bits of ``throttled=0x50000``; None when there are none."""
     bits = THROTTLED.search(text)
     return int(bits[1], 16) if bits else None
 
 
-def pmic_watts(text: str) -> dict[str, float]:
+def parse_pmic_watts(text: str) -> dict[str, float]:
     r"""Return the watts of every rail that has both a current and a voltage, paired by name.
 
     The numbers in brackets are channels of the converter and differ between the two. ``EXT5V`` and ``BATT`` have no

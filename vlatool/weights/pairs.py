@@ -52,14 +52,14 @@ def neighbours(weight: Array, kind: str, axis: int) -> Iterator[tuple[Array, Arr
 
 def largest_sums(weight: Array, kind: str, axis: int) -> Array:
     """Return the largest magnitude of a sum of two neighbours for each output, float32."""
-    found: Array = np.zeros(weight.shape[axis], np.float32)
+    largest: Array = np.zeros(weight.shape[axis], np.float32)
     for first, second in neighbours(weight.astype(np.float32, copy=False), kind, axis):
         others = tuple(index for index in range(first.ndim) if index != (0 if kind == "Conv" else axis))
-        found = np.maximum(found, np.abs(first + second).max(axis=others, initial=0.0))
-    return found
+        largest = np.maximum(largest, np.abs(first + second).max(axis=others, initial=0.0))
+    return largest
 
 
-def fit(codes: Array, kind: str, axis: int) -> bool:
+def pairs_fit(codes: Array, kind: str, axis: int) -> bool:
     """Return whether the sum of any two int8 neighbours fits into int8.
 
     Two numbers of one sign overflow when their sum, cut to 8 bits, has the other sign.

@@ -10,7 +10,7 @@ import math
 import mmap
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import SourceError
 
-READABLE = "see that this user may read it, and that its disk is well"
+READ_FIX = "see that this user may read it, and that its disk is well"
 
 Array = NDArray[Any]
 ITEM_BYTES = {
@@ -34,10 +34,10 @@ NUMPY_NAMES = {"bool": "BOOL", "float32": "F32", "float16": "F16", "bfloat16": "
 }
 INDEX = ".safetensors.index.json"
 PAGE = 4096
-LARGEST_HEADER = 100_000_000
-DIRECT_FROM = 1 << 20
+MAX_HEADER_BYTES = 100_000_000
+MIN_DIRECT_BYTES = 1 << 20
 """Bytes from which a read goes past the page cache."""
-AGAIN = "download or copy the weights again"
+DOWNLOAD_FIX = "download or copy the weights again"
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def shard_files(folder: Path, pattern: str) -> list[Path]:
     """
     files = sorted(path for path in folder.glob(pattern) if path.is_file())
     if not files:
-        raise SourceError(f"No file in {folder} matches 'weights: {pattern}'.", AGAIN)
+        raise SourceError(f"No file in {folder} matches 'weights: {pattern}'.", DOWNLOAD_FIX)
     return files
 
 
@@ -118,17 +118,17 @@ def _check_indexes(files: list[Path]) -> None:
     """Every shard that an index beside the shards names must be there and hold what the index says."""
     for index in sorted({path for file in files for path in file.parent.glob(f"*{INDEX}")}):
         try:
-            named = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
-            files_of = {str(tensor): str(file) for tensor, file in named.items()}
+            weight_map = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
+            files_of = {str(tensor): str(file) for tensor, file in weight_map.items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise SourceError(f"{index} is not an index of safetensors shards: {error!r}.", AGAIN) from error
+            raise SourceError(f"{index} is not an index of safetensors shards: {error!r}.", DOWNLOAD_FIX) from error
         for name in sorted(set(files_of.values())):
             if not (index.parent / name).is_file():
-                raise SourceError(f"{index} names the shard {name}, which is missing.", AGAIN)
+                raise SourceError(f"{index} names the shard {name}, which is missing.", DOWNLOAD_FIX)
         held = {name: {tensor.name for tensor in read_header(index.parent / name)} for name in set(files_of.values())}
         for tensor, name in files_of.items():
             if tensor not in held[name]:
-                raise SourceError(f"{index} says that '{tensor}' is in {name}, which does not hold it.", AGAIN)
+                raise SourceError(f"{index} says that '{tensor}' is in {name}, which does not hold it.", DOWNLOAD_FIX)
 
 
 def read_header(file: Path) -> list[StoredTensor]:
@@ -141,9 +141,9 @@ def read_header(file: Path) -> list[StoredTensor]:
     try:
         entries = json.loads(header)
     except ValueError as error:
-        raise SourceError(f"{file} has a damaged safetensors header: {error}.", AGAIN) from error
+        raise SourceError(f"{file} has a damaged safetensors header: {error}.", DOWNLOAD_FIX) from error
     if not isinstance(entries, Mapping):
-        raise SourceError(f"{file} has a damaged safetensors header: it is not a mapping.", AGAIN)
+        raise SourceError(f"{file} has a damaged safetensors header: it is not a mapping.", DOWNLOAD_FIX)
     return [_entry(file, str(name), entry, start, size) for name, entry in entries.items() if name != "__metadata__"]
 
 
@@ -153,14 +153,14 @@ def _header_bytes(file: Path) -> tuple[bytes, int, int]:
         with file.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             length = struct.unpack("<Q", stream.read(8))[0] if size >= 8 else 0
-            if not 2 <= length <= min(size - 8, LARGEST_HEADER):
+            if not 2 <= length <= min(size - 8, MAX_HEADER_BYTES):
                 raise SourceError(
                     f"{file} is not a safetensors file, or is cut off: {size} bytes cannot hold a header of {length}.",
-                    AGAIN,
+                    DOWNLOAD_FIX,
                 )
             return stream.read(length), 8 + length, size
     except OSError as error:
-        raise SourceError(f"{file} cannot be read: {error.strerror}.", READABLE) from error
+        raise SourceError(f"{file} cannot be read: {error.strerror}.", READ_FIX) from error
 
 
 def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTensor:
@@ -168,7 +168,7 @@ def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTe
         dtype, shape = str(entry["dtype"]), tuple(int(axis) for axis in entry["shape"])
         begin, end = (int(offset) for offset in entry["data_offsets"])
     except (KeyError, TypeError, ValueError) as error:
-        raise SourceError(f"{file} has a damaged safetensors header at '{name}': {error!r}.", AGAIN) from error
+        raise SourceError(f"{file} has a damaged safetensors header at '{name}': {error!r}.", DOWNLOAD_FIX) from error
     if dtype not in ITEM_BYTES:
         raise SourceError(
             f"{file} holds '{name}' as {dtype}; known dtypes: {', '.join(ITEM_BYTES)}.", "store it in one of these"
@@ -177,10 +177,10 @@ def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTe
     if min((0, *shape)) < 0 or begin < 0 or end - begin != tensor.nbytes:
         raise SourceError(
             f"{file} has a damaged safetensors header: '{name}' {list(shape)} {dtype} cannot take {end - begin} bytes.",
-            AGAIN,
+            DOWNLOAD_FIX,
         )
     if start + end > size:
-        raise SourceError(f"{file} is cut off: it has {size} bytes, '{name}' ends at {start + end}.", AGAIN)
+        raise SourceError(f"{file} is cut off: it has {size} bytes, '{name}' ends at {start + end}.", DOWNLOAD_FIX)
     return tensor
 
 
@@ -212,11 +212,17 @@ def sampled_hash(files: list[Path]) -> str:
 
 
 class Reader:
-    """Reads parts of tensors into one buffer; for one thread. Large reads go past the page cache where that works."""
+    """Reads parts of tensors into one buffer; for one thread. Large reads bypass the page cache where possible."""
 
     def __init__(self) -> None:
         self._files: dict[tuple[Path, bool], int] = {}
         self._buffer: mmap.mmap | None = None
+
+    def __enter__(self) -> Reader:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
 
     def read(self, tensor: StoredTensor, begin: int, size: int) -> Array:
         """Return bytes ``begin`` to ``begin + size`` of a tensor as (size,) uint8, valid until the next call.
@@ -229,22 +235,22 @@ class Reader:
         start = tensor.offset + begin
         aligned = start - start % PAGE
         length = -(-(start + size - aligned) // PAGE) * PAGE
-        buffer = self._room(length)
+        buffer = self._sized_buffer(length)
         try:
             got = self._fill(tensor.file, memoryview(buffer)[:length], aligned, start + size - aligned)
         except OSError as error:
-            raise SourceError(f"{tensor.file} cannot be read: {error.strerror}.", READABLE) from error
+            raise SourceError(f"{tensor.file} cannot be read: {error.strerror}.", READ_FIX) from error
         if got < start + size - aligned:
-            raise SourceError(f"{tensor.file} is cut off: it ends within '{tensor.name}'.", AGAIN)
+            raise SourceError(f"{tensor.file} is cut off: it ends within '{tensor.name}'.", DOWNLOAD_FIX)
         return np.frombuffer(buffer, np.uint8, size, start - aligned)
 
-    def _room(self, size: int) -> mmap.mmap:
+    def _sized_buffer(self, size: int) -> mmap.mmap:
         if self._buffer is None or len(self._buffer) < size:
             self._buffer = mmap.mmap(-1, size)
         return self._buffer
 
     def _fill(self, file: Path, view: memoryview, offset: int, needed: int) -> int:
-        direct = len(view) >= DIRECT_FROM
+        direct = len(view) >= MIN_DIRECT_BYTES
         got = 0
         while got < needed:
             try:
@@ -282,13 +288,3 @@ def open_direct(file: Path, flags: int) -> int:
         if error.errno != errno.EINVAL:
             raise
         return os.open(file, flags, 0o666)
-
-
-@contextlib.contextmanager
-def reading() -> Iterator[Reader]:
-    """Yield a reader that is closed at the end."""
-    reader = Reader()
-    try:
-        yield reader
-    finally:
-        reader.close()

@@ -27,7 +27,7 @@ from vlatool.quantize.streamed.record_file import write_records
 from vlatool.quantize.streamed.records import Record
 from vlatool.quantize.streamed.tensor_jobs import Job, records_for
 from vlatool.stage.base import Tell
-from vlatool.weights.shards import StoredTensor, fingerprint, read_header, read_shards, reading, stored_array
+from vlatool.weights.shards import Reader, StoredTensor, fingerprint, read_header, read_shards, stored_array
 
 FORM = BlockFormat()
 
@@ -253,7 +253,7 @@ def test_forgotten_work_is_swept(shard, tmp_path):
 def test_parts_of_tensors_are_read(shard):
     tensor = next(each for each in read_header(shard) if each.name == "layer.3")
     raw = shard.read_bytes()[tensor.offset : tensor.offset + tensor.nbytes]
-    with reading() as reader:
+    with Reader() as reader:
         assert reader.read(tensor, 0, tensor.nbytes).tobytes() == raw
         assert reader.read(tensor, 1000, 77).tobytes() == raw[1000:1077]
         held = stored_array("x", np.arange(6, dtype=np.int64).reshape(2, 3), shard)
@@ -267,7 +267,7 @@ def test_parts_of_tensors_are_read(shard):
 def test_large_reads_past_the_page_cache(tmp_path):
     content = np.random.default_rng(0).integers(0, 256, 3_000_001, np.uint8)
     content.tofile(tmp_path / "large")
-    with reading() as reader:
+    with Reader() as reader:
         tensor = StoredTensor("large", tmp_path / "large", 0, "U8", (len(content),))
         np.testing.assert_array_equal(reader.read(tensor, 5, 2_999_000), content[5 : 5 + 2_999_000])
         np.testing.assert_array_equal(reader.read(tensor, 1_000_000, 2_000_001), content[1_000_000:])

@@ -36,7 +36,7 @@ from vlatool.gate.result import worst
 from vlatool.gate.run import run_gate
 from vlatool.measurement.pairs import PairJob, measure_pairs
 from vlatool.stage.base import Context
-from vlatool.stats.sequential import jointly
+from vlatool.stats.sequential import judge_jointly
 
 NEIGHBOUR = """
 import random, time
@@ -107,7 +107,8 @@ def resampled(output: Path, gates: int, margin: float) -> None:
     pool = [both for line in lines for both in zip(line["log_ratios"], line["log_mean_ratios"], strict=True)]
     draw = random.Random(0)
     found = Counter(
-        worst(decision.verdict for decision in jointly(lambda _: draw.choice(pool), 2, margin)[0]) for _ in range(gates)
+        worst(decision.verdict for decision in judge_jointly(lambda _: draw.choice(pool), 2, margin)[0])
+        for _ in range(gates)
     )
     print(f"{gates} gates drawn from {len(pool)} processes (median and mean): {dict(found)}")
     slow = sum("found an observation that is slower" in line["said"] for line in lines)

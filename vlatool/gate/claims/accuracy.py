@@ -21,7 +21,7 @@ from vlatool.gate.episodes import Episodes
 from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
-from vlatool.stats.starts import distinct, independent
+from vlatool.stats.starts import distinct_starts, independent_starts
 from vlatool.stats.success_sequential import exact_drop
 
 MOST_SAMPLES = 100_000
@@ -133,9 +133,9 @@ def _closed_loop(episodes: Episodes) -> _Drop:
     lost = sum(one > two for one, two in zip(before, after, strict=True))
     won = sum(one < two for one, two in zip(before, after, strict=True))
     starts = rows[0].raw[START]
-    value, low, high = exact_drop(lost, won, len(before), CONFIDENCE, independent(starts))
+    value, low, high = exact_drop(lost, won, len(before), CONFIDENCE, independent_starts(starts))
     own = tuple(number for number in rows[1].measurements if number.name == "success")
-    words, begun = "more failed episodes:", f", {distinct(starts)} distinct starts"
+    words, begun = "more failed episodes:", f", {distinct_starts(starts)} distinct starts"
     return _Drop("success_drop", words, value, low, high, len(before), rows[0].measurements,
                  repeated_starts(rows[0]), own, begun, few_starts(rows[0]))  # fmt: skip
 

@@ -10,7 +10,7 @@ from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
 from vlatool.gate.timed import Timed
 from vlatool.measurement.turns import CONFIRM
 from vlatool.report import Measurement
-from vlatool.stats.sequential import Decision, jointly
+from vlatool.stats.sequential import Decision, judge_jointly
 
 STATISTICS = ("median", "mean")
 """Of the calls; of the observations, each the median of its calls."""
@@ -38,7 +38,7 @@ def examine(timed: Timed, claim: LatencyClaim) -> ClaimResult:
         pairs = timed.process(number)
         return pairs.log_ratio, pairs.mean_log_ratio
 
-    decisions, processes = jointly(ratios, len(STATISTICS), claim.margin, claim.interim_analyses)
+    decisions, processes = judge_jointly(ratios, len(STATISTICS), claim.margin, claim.interim_analyses)
     measured = tuple(
         Measurement(
             name, decision.ratio, "x", samples=len(processes), low=decision.low, high=decision.high,

@@ -7,7 +7,7 @@ from vlatool.gate.claims._ratio import confidence_of, judged
 from vlatool.gate.config import MotionClaim
 from vlatool.gate.episodes import Episodes
 from vlatool.gate.result import ClaimResult, worst
-from vlatool.motion.measure import FEWEST, metrics
+from vlatool.motion.measure import MIN_PAIRS, metrics
 from vlatool.report import Row
 
 OF_BODY = ("path_length", "joint_path", "jerk", "joint_jerk")
@@ -55,7 +55,7 @@ def _told_of(baseline: Row) -> tuple[str, ...]:
 def _from_none(title: str, some: int, count: int, confidence: float, doubt: str) -> ClaimResult:
     """Judge a metric that the baseline has nothing of; the test is the exact sign test of pairs, one-sided."""
     if not some:
-        enough = count >= FEWEST and not doubt
+        enough = count >= MIN_PAIRS and not doubt
         words = f"{title} 0 in all {count} common successes of both"
         return ClaimResult("motion", "pass" if enough else "inconclusive", f"{words}{doubt and f' ({doubt})'}")
     verdict = "fail" if 0.5**some <= (1 - confidence) / 2 else "inconclusive"

@@ -29,7 +29,7 @@ class _StatisticsTap(ActivationTap):
 
     def __init__(
         self, graph: str, path: Path, scratch: Path, statistics: dict[str, Statistics], exempt: Collection[str],
-        drops_non_finite: bool,
+        drops_non_finite: bool
     ) -> None:  # fmt: skip
         self.graph, self.statistics, self._exempt, self._drops_non_finite = graph, statistics, exempt, drops_non_finite
         super().__init__(path, scratch / f"{graph}.onnx", self._add_outputs)

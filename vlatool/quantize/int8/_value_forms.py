@@ -13,8 +13,7 @@ from vlatool.graph.onnx_graph import OnnxGraph
 TILE = 16
 """Rows of a tile of a matrix unit; half tiles are nearly as good."""
 FULL_TILE_TOLERANCE = 1.05
-"""Largest ratio of rows in full tiles to rows in half tiles: for 113, 120 beats 128; for 50, 56 beats 64; for 197, 208
-beats 200."""
+"""Largest ratio of rows in full to half tiles: for 113, 120 beats 128; for 50, 56 beats 64; for 197, 208 beats 200."""
 
 
 @dataclass

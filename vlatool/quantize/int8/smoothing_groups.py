@@ -80,9 +80,8 @@ def find_groups(model: Any, layers: Iterable[Layer]) -> list[SmoothingGroup]:
             groups.append(SmoothingGroup(value, tuple(members), tuple(edits)))
             continue
         names = dict.fromkeys(layer.activations[0] for layer in members)
-        groups += [
-            SmoothingGroup(name, tuple(layer for layer in members if layer.activations[0] == name)) for name in names
-        ]
+        readers = ([layer for layer in members if layer.activations[0] == name] for name in names)
+        groups += [SmoothingGroup(name, tuple(layers)) for name, layers in zip(names, readers, strict=True)]
     return groups
 
 
@@ -135,9 +134,8 @@ class _Topology(OnnxGraph):
         fixed = all(self.is_weight(name) for name in node.input[1:] if name)
         if axis not in (-1, rank - 1) or node.output[0] != value or not fixed:
             return None
-        return [
-            ConstantEdit(node.output[0], index, start=start) for index, name in enumerate(node.input) if index and name
-        ]
+        constants = [index for index, name in enumerate(node.input) if index and name]
+        return [ConstantEdit(node.output[0], index, start=start) for index in constants]
 
     def _product(self, node: Any, start: int, width: int) -> list[ConstantEdit] | None:
         if not self.is_weight(node.input[1], rank=2):

@@ -44,7 +44,7 @@ def smooth_scales(activation: Array, weight: Array, alpha: float) -> Array:
 
 
 @dataclass(frozen=True)
-class PeakUncertainty:
+class PeakExcess:
     """How far new observations are assumed to exceed the peaks of the calibration.
 
     A scale that levels all channels leaves none of them headroom: all clip where otherwise only the largest would.
@@ -58,7 +58,7 @@ class PeakUncertainty:
     share: float = 0.0
 
     @classmethod
-    def between(cls, first: Array, second: Array, samples: int) -> PeakUncertainty:
+    def between(cls, first: Array, second: Array, samples: int) -> PeakExcess:
         """Estimate from the peaks of two halves of the calibration: their median ratio, once in half the samples."""
         low, high = np.minimum(first, second), np.maximum(first, second)
         used = low > 0
@@ -66,12 +66,10 @@ class PeakUncertainty:
         return cls(spread, 2 / max(samples, 2))
 
 
-NO_UNCERTAINTY = PeakUncertainty()
+NO_EXCESS = PeakExcess()
 
 
-def int8_loss(
-    activation: Array, weights: Sequence[Array], scales: Array, uncertainty: PeakUncertainty = NO_UNCERTAINTY
-) -> float:
+def int8_loss(activation: Array, weights: Sequence[Array], scales: Array, excess: PeakExcess = NO_EXCESS) -> float:
     """Estimate the squared error of ``X W`` when both are rounded to int8, from the peaks alone.
 
     Rounding to steps d adds noise of variance d^2 / 12. The activation has one step for all channels,
@@ -83,7 +81,7 @@ def int8_loss(
     smooth = activation.astype(np.float64) / scales
     step = 2 * smooth.max() / 255
     energy = float(np.square(smooth / CREST_FACTOR).sum())
-    lost = uncertainty.share * np.square(np.maximum((1 + uncertainty.spread) * smooth - smooth.max(), 0))
+    lost = excess.share * np.square(np.maximum((1 + excess.spread) * smooth - smooth.max(), 0))
     loss = 0.0
     for weight in weights:
         scaled = weight.astype(np.float64) * scales[:, None].astype(np.float64)
@@ -94,15 +92,15 @@ def int8_loss(
 
 
 def best_alpha(
-    activation: Array, weights: Sequence[Array], uncertainty: PeakUncertainty = NO_UNCERTAINTY
+    activation: Array, weights: Sequence[Array], excess: PeakExcess = NO_EXCESS
 ) -> tuple[float | None, Array]:
     """Return the alpha of the grid with the least ``int8_loss`` and its scales; None and ones when none gains."""
     peaks = weight_peaks(weights)
     scales: Array = np.ones(len(activation), np.float32)
-    chosen, least = None, int8_loss(activation, weights, scales, uncertainty)
+    chosen, least = None, int8_loss(activation, weights, scales, excess)
     for alpha in ALPHAS:
         candidate = smooth_scales(activation, peaks, alpha)
-        loss = int8_loss(activation, weights, candidate, uncertainty)
+        loss = int8_loss(activation, weights, candidate, excess)
         if loss < least:
             chosen, least, scales = alpha, loss, candidate
     return chosen, scales

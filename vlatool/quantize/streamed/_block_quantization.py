@@ -324,7 +324,5 @@ def dequantize(stored: Array, scale: Array, zero: Array, form: BlockFormat) -> A
 
 
 METHODS: dict[str, ParameterChoice] = {
-    "rtn": range_parameters,
-    "searched_parameters": searched_parameters,
-    "hqq": half_quadratic_parameters,
-}
+    "rtn": range_parameters, "searched": searched_parameters, "hqq": half_quadratic_parameters
+}  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Any
 
 from vlatool.errors import SourceError
 from vlatool.quantize.streamed.records import Record
-from vlatool.weights.shards import Reader, StoredTensor, reading
+from vlatool.weights.shards import Reader, StoredTensor
 
 DATA, JOURNAL = "data", "journal"
 READ_BYTES = 1 << 23
@@ -41,7 +41,7 @@ class Journal:
         if not lines or lines[0] != self._head or not self._data.is_file():
             self._path.write_bytes(self._head)
             lines = []
-        with reading() as reader:
+        with Reader() as reader:
             for record, line in zip(records, lines[1:], strict=False):
                 entry, advanced = _parse_entry(line), digest.copy()
                 if entry is None or not _is_whole(reader, self._data, offset, record.size, advanced, entry["sha256"]):

@@ -60,10 +60,8 @@ class Prefetcher:
             if not pending:
                 return
             record, record_offset, future = pending.popleft()
-            if future is None:
-                yield record, compute_record(record.fill, record.size, self._file, record_offset, self._tools)
-            else:
-                yield record, future.result()
+            here = (record.fill, record.size, self._file, record_offset, self._tools)
+            yield record, future.result() if future else compute_record(*here)
 
     def _submit(self, record: Record, offset: int) -> Future[dict[str, Any]] | None:
         if not (self._workers and record.portable):

@@ -12,7 +12,7 @@ from vlatool.module.stored import policy_weights, takes_shards
 from vlatool.quantize.streamed._graph_rewrite import MAX_INLINE_BYTES
 from vlatool.quantize.streamed._weightless_export import GraphTemplate, export_templates
 from vlatool.quantize.streamed.tensor_jobs import as_float32
-from vlatool.weights.shards import FLOATS, NUMPY_NAMES, StoredTensor, fingerprint, reading, shard_files, stored_array
+from vlatool.weights.shards import FLOATS, NUMPY_NAMES, Reader, StoredTensor, fingerprint, shard_files, stored_array
 
 BLOCKED_OPSET = 21
 """First opset whose DequantizeLinear supports blocks and int4."""
@@ -89,7 +89,7 @@ def _read_small_constants(template: GraphTemplate) -> None:
     """Load the values of constants that stay in the graph."""
     import onnx_ir
 
-    with reading() as reader:
+    with Reader() as reader:
         for name, tensor in list(template.tensors.items()):
             small = tensor.count * 4 <= MAX_INLINE_BYTES
             if not small or (len(tensor.shape) == 2 and tensor.dtype in FLOATS):

@@ -17,7 +17,7 @@ from vlatool.machine.host import cache_directory
 from vlatool.quantize.streamed._journal import DATA, Journal, hash_part
 from vlatool.quantize.streamed._prefetch import Prefetcher
 from vlatool.quantize.streamed.records import Record
-from vlatool.weights.shards import reading
+from vlatool.weights.shards import Reader
 
 if TYPE_CHECKING:
     from vlatool.stage.base import Tell
@@ -76,7 +76,7 @@ def write_records(records: list[Record], plan: str, directory: Path, processes: 
     total = sum(record.weights for record in records) or 1
     done, unflushed = sum(record.weights for record in records[:resumed]), 0
     try:
-        with reading() as reader, Prefetcher(records, resumed, data, processes) as prefetcher:
+        with Reader() as reader, Prefetcher(records, resumed, data, processes) as prefetcher:
             for record, note in prefetcher:
                 hash_part(reader, data, offset, record.size, digest)
                 journal.add(note, digest.hexdigest())

@@ -69,7 +69,7 @@ class Record:
     verb: str = "quantized"
 
 
-def page_aligned(size: int) -> int:
+def aligned(size: int) -> int:
     """Return ``size`` rounded up to whole pages."""
     return -(-size // PAGE) * PAGE
 

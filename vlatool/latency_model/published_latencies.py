@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vlatool.errors import DataError
-from vlatool.latency_model.features import Place, Question, Work
+from vlatool.latency_model.features import ComputeUnit, Question, Work
 
 DATA = Path(__file__).with_name("data")
-NEEDED = ("device", "runtime", "model", "precision", "metric", "value", "device_class")
+REQUIRED_COLUMNS = ("device", "runtime", "model", "precision", "metric", "value", "device_class")
 PRECISIONS = {
     "fp32": "float32", "float32": "float32", "fp16": "float16", "float16": "float16", "bf16": "bfloat16",
     "bfloat16": "bfloat16", "fp8": "float8", "int8": "int8", "int4": "w4", "w4": "w4", "w8": "w8",
@@ -62,7 +62,7 @@ class Point:
     Args:
         question: What was measured; None when there is no ground to predict it.
         log_ms: Natural logarithm of the milliseconds of one item.
-        group: Name of the board, as held out: see ``TWINS``.
+        group: Name of the board, as held out: see ``DEVICE_ALIASES``.
         kind: ``device_class``: cpu, gpu, igpu, npu.
         model: Name of the model, as held out.
         why: Why there is no question.
@@ -85,14 +85,14 @@ def read_points(path: Path) -> list[Point]:
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             reader = csv.DictReader(stream)
-            missing = [name for name in NEEDED if name not in (reader.fieldnames or ())]
+            missing = [name for name in REQUIRED_COLUMNS if name not in (reader.fieldnames or ())]
             if missing:
                 known = ", ".join(reader.fieldnames or ()) or "none"
                 raise DataError(
                     f"{path} has no column '{missing[0]}'; its columns: {known[:300]}.",
                     f"add the column '{missing[0]}'; docs/concepts/latency-model.md names all of them",
                 )
-            rows = [(reader.line_num, _stripped(row)) for row in reader]
+            rows = [(reader.line_num, _strip_row(row)) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(
             f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.",
@@ -100,12 +100,12 @@ def read_points(path: Path) -> list[Point]:
         ) from error
     points = [_point(row, f"{path}, line {number}") for number, row in rows]
     if not points:
-        fix = f"give a CSV file with a row for each figure; columns: {', '.join(NEEDED)}"
+        fix = f"give a CSV file with a row for each figure; columns: {', '.join(REQUIRED_COLUMNS)}"
         raise DataError(f"{path} holds no row.", fix)
     return points
 
 
-def merged(points: Iterable[Point]) -> list[Point]:
+def merge_versions(points: Iterable[Point]) -> list[Point]:
     """Return points with one for each question: several versions of a runtime count as one figure, their mean log."""
     groups: dict[Question, list[Point]] = {}
     for point in points:
@@ -126,31 +126,31 @@ def _point(row: Mapping[str, str], where: str) -> Point:
             f"{where}: the device class '{kind}' is unknown; allowed: cpu, gpu, igpu, npu.", "write one of these"
         )
     board = _name(row["device"])
-    blank = Point(None, math.nan, TWINS.get(board, board), kind, family(row["model"]))
+    unpredictable = Point(None, math.nan, DEVICE_ALIASES.get(board, board), kind, model_family(row["model"]))
     if not (value > 0 and math.isfinite(value)):
-        return replace(blank, why="its value is 0, endless or missing: nothing was measured")
-    blank = replace(blank, log_ms=math.log(value if metric == "latency_ms" else 1000 / value))
+        return replace(unpredictable, why="its value is 0, endless or missing: nothing was measured")
+    unpredictable = replace(unpredictable, log_ms=math.log(value if metric == "latency_ms" else 1000 / value))
     precision = PRECISIONS.get(row["precision"])
-    place = place_of(row)
+    compute_unit = compute_unit_of(row)
     runtime = runtime_of(f"{row['runtime']} {row['model']}")
-    if on_processor(row):
-        blank, runtime = replace(blank, kind="cpu"), "ncnn-cpu"
+    if runs_on_cpu(row):
+        unpredictable, runtime = replace(unpredictable, kind="cpu"), "ncnn-cpu"
     if precision is None:
-        return replace(blank, why=f"the precision '{row['precision']}' is unknown")
-    if place is None:
-        return replace(blank, why=f"nothing is known of the device '{row['device']}' ({blank.kind})")
+        return replace(unpredictable, why=f"the precision '{row['precision']}' is unknown")
+    if compute_unit is None:
+        return replace(unpredictable, why=f"nothing is known of the device '{row['device']}' ({unpredictable.kind})")
     if not runtime:
-        return replace(blank, why=f"the runtime '{row['runtime']}' is unknown")
+        return replace(unpredictable, why=f"the runtime '{row['runtime']}' is unknown")
     if metric == "tokens_per_s" and precision == "int8":
         precision = "w8"
     work = work_of(row, where, decoding=metric == "tokens_per_s")
     if work is None:
-        return replace(blank, why="neither the row nor data/models.csv says how much it computes")
+        return replace(unpredictable, why="neither the row nor data/models.csv says how much it computes")
     if row.get("batch") in ("throughput", "offline"):
         runtime += ", streams"
     elif metric == "fps" and row.get("batch", "1") not in ("", "1"):
         runtime += f", batch {row['batch']}"
-    return replace(blank, question=Question(work, place, runtime, precision))
+    return replace(unpredictable, question=Question(work, compute_unit, runtime, precision))
 
 
 def runtime_of(name: str) -> str:
@@ -176,8 +176,8 @@ def work_of(row: Mapping[str, str], where: str, *, decoding: bool) -> Work | Non
         return None
     activations = activations if activations > 0 else known.get("macts_m", math.nan)
     layers = layers if layers > 0 else known.get("layers", math.nan)
-    activations = activations if activations > 0 else _usual(ACTIVATIONS, macs, weights, traits)
-    layers = layers if layers > 0 else _usual(LAYERS, macs, weights, traits)
+    activations = activations if activations > 0 else _estimate(ACTIVATIONS, macs, weights, traits)
+    layers = layers if layers > 0 else _estimate(LAYERS, macs, weights, traits)
     return Work(macs * 1e9, weights * 1e6, activations * 1e6, layers, traits, f"{row['model']} {row.get('input', '')}")
 
 
@@ -187,7 +187,7 @@ LAYERS = (3.2, 0.1, 0.12, {"depthwise": 0.5, "attention": 0.5, "grouped": 0.6, "
 rows that name them (activations of 1,094 models; layers of 61, a judgement for attention and grouped convolutions)."""
 
 
-def _usual(
+def _estimate(
     known: tuple[float, float, float, Mapping[str, float]], macs: float, weights: float, traits: Iterable[str]
 ) -> float:
     constant, by_macs, by_weights, by_trait = known
@@ -195,7 +195,7 @@ def _usual(
     return math.exp(constant + by_macs * math.log(macs) + by_weights * math.log(weights) + extra)
 
 
-def _stripped(row: Mapping[str | None, str | None]) -> dict[str, str]:
+def _strip_row(row: Mapping[str | None, str | None]) -> dict[str, str]:
     return {key: (text or "").strip() for key, text in row.items() if key}
 
 
@@ -204,17 +204,17 @@ def _name(device: str) -> str:
     return re.sub(r"\s*\(.*\)", "", re.sub(r" \(oc 2\.9ghz\)", "-2.9ghz", device.lower()))
 
 
-def place_of(row: Mapping[str, str]) -> Place | None:
+def compute_unit_of(row: Mapping[str, str]) -> ComputeUnit | None:
     """Return what a row was measured on; None when the device is not known."""
     name = _name(row["device"])
     devices = known_devices()
-    unit = "cpu" if on_processor(row) else row["device_class"]
+    unit = "cpu" if runs_on_cpu(row) else row["device_class"]
     threads = re.search(r"(\d+)t\b", row["runtime"].lower())
     cluster = re.search(r"powersave=\d", row["runtime"])
     part = CLUSTERS.get(cluster[0], "") if cluster else ""
     other = "gpu" if unit == "igpu" else "igpu"
-    places = ((f"{name} {part}", unit), (name, unit), (name, other))
-    device = next((devices[place] for place in places if place in devices), None)
+    candidates = ((f"{name} {part}", unit), (name, unit), (name, other))
+    device = next((devices[candidate] for candidate in candidates if candidate in devices), None)
     if device is None:
         return None
     cores, peaks = device.cores, dict(device.peaks)
@@ -228,23 +228,23 @@ def place_of(row: Mapping[str, str]) -> Place | None:
     return replace(device, device=name, unit=unit, cores=cores, peaks=peaks, setting=setting)
 
 
-PART = re.compile(r" (end-to-end|backbone|action head|data processing)\b.*")
+PART_SUFFIX = re.compile(r" (end-to-end|backbone|action head|data processing)\b.*")
 """What a name says beside the model's: figures of its parts are held out with it."""
-SPELLING = re.compile(r"[\W_]+")
+SEPARATORS = re.compile(r"[\W_]+")
 """What differs between two spellings of one model's name: ``resnet-50``, ``resnet50`` and ``ResNet_50``."""
 
 
-def family(model: str) -> str:
+def model_family(model: str) -> str:
     """Return the name that a model is held out by.
 
     Example:
         >>> family("LeViT_128") == family("levit-128⭐")
         True
     """
-    return SPELLING.sub("", PART.sub("", model).lower()).replace("yolov11", "yolo11")
+    return SEPARATORS.sub("", PART_SUFFIX.sub("", model).lower()).replace("yolov11", "yolo11")
 
 
-TWINS = {
+DEVICE_ALIASES = {
     "jetson-agx-orin": "jetson-agx-orin-64gb", "jetson-orin-nano-8gb-super": "jetson-orin-nano-8gb",
     "raspberry-pi-5-2.9ghz": "raspberry-pi-5",
 }  # fmt: skip
@@ -253,7 +253,7 @@ CLUSTERS = {"powersave=1": "little", "powersave=2": "big"}
 """ncnn's ``powersave`` -> which cores of a processor with two kinds compute (ncnn, ``set_cpu_powersave``)."""
 
 
-def on_processor(row: Mapping[str, str]) -> bool:
+def runs_on_cpu(row: Mapping[str, str]) -> bool:
     """Say whether a figure of a GPU is one of the processor.
 
     ncnn has no Vulkan kernels for int8: the layers run on the processor, and the published figures of both are equal
@@ -267,12 +267,12 @@ MAX_Q = 0.5
 
 
 @functools.cache
-def known_devices() -> dict[tuple[str, str], Place]:
+def known_devices() -> dict[tuple[str, str], ComputeUnit]:
     """Return (name, unit) -> what is known of each device of ``data/devices.csv``."""
     devices = {}
     for row in _table("devices.csv"):
         peaks = {dtype: float(row[dtype]) for dtype in ("float32", "float16", "int8") if row[dtype]}
-        devices[row["device"].lower(), row["unit"]] = Place(
+        devices[row["device"].lower(), row["unit"]] = ComputeUnit(
             row["device"].lower(), row["unit"], float(row["cores"]), float(row["clock_ghz"]), peaks,
             float(row["bandwidth_gb_s"]), isa=row["isa"],
         )  # fmt: skip
@@ -280,7 +280,7 @@ def known_devices() -> dict[tuple[str, str], Place]:
 
 
 @functools.cache
-def published_as() -> dict[tuple[str, str], str]:
+def published_devices() -> dict[tuple[str, str], str]:
     """Return (profile, unit) -> the device that published figures name so."""
     return {
         (profile, row["unit"]): row["device"].lower()

@@ -13,20 +13,20 @@ from typing import Any
 from vlatool.errors import DataError, ProfileError
 from vlatool.files.edited import whole_file
 from vlatool.graph.workload import PRECISIONS, TRAITS, WORKLOAD_TABLE, Workload, summarize_workload
-from vlatool.hardware.profile import Profile, load_profile, names
-from vlatool.latency_model.board import Candidate, place_of
+from vlatool.hardware.profile import Profile, load_profile, profile_names
+from vlatool.latency_model.board import Candidate, compute_unit_of
 from vlatool.latency_model.features import Question, Work
 from vlatool.machine.host import matches
 from vlatool.report import read_report
 
-PLACES = "VLATOOL_CALIBRATIONS"
+CALIBRATIONS_VARIABLE = "VLATOOL_CALIBRATIONS"
 NUMBERS = ("macs", "weights", "activations", "layers")
-LAYOUT = 1
-AGAIN = "remove it, and make it again: vlatool profiles calibrate PROFILE --from REPORT"
+SCHEMA_VERSION = 1
+REDO_FIX = "remove it, and make it again: vlatool profiles calibrate PROFILE --from REPORT"
 
 
 @dataclass(frozen=True)
-class Measured:
+class BoardMeasurement:
     """One latency on a board.
 
     Args:
@@ -51,10 +51,12 @@ class Measured:
         candidate = Candidate(load_profile(self.profile), self.mode, self.engine, self.precision)
         macs, weights, activations, layers = (float(self.work[name]) for name in NUMBERS)
         work = Work(macs, weights, activations, layers, frozenset(self.work.get("traits", ())))
-        return Question(work, place_of(candidate), candidate.figures.runtime, self.precision)
+        return Question(work, compute_unit_of(candidate), candidate.figures.runtime, self.precision)
 
 
-def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload | None = None) -> list[Measured]:
+def report_measurements(
+    report: Path, profile: Profile, mode: str | None, load: Workload | None = None
+) -> list[BoardMeasurement]:
     """Return the latencies of a benchmark report that was made on a board.
 
     Args:
@@ -87,8 +89,8 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
             continue
         engine = str(described.get("engine") or profile.engine)
         work = {key: described.get(key) for key in (*NUMBERS, "traits")}
-        item = Measured(profile.name, name, engine, str(described.get("precision")), work, latency.value)
-        if engine in profile.engines and is_sound(item):
+        item = BoardMeasurement(profile.name, name, engine, str(described.get("precision")), work, latency.value)
+        if engine in profile.engines and is_valid(item):
             measured.append(item)
     if not measured:
         why = "its rows do not say what they compute" if missing else "it holds no latency of an engine of this board"
@@ -99,27 +101,27 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
     return measured
 
 
-def elsewhere(report: Path, profile: Profile) -> str:
+def foreign_host(report: Path, profile: Profile) -> str:
     """Return what a report was made on when that is not the profile's board; empty when it is, or is not said."""
     made_on = read_report(report).environment
     names = [str(made_on[key]) for key in ("board", "cpu") if made_on.get(key)]
     return "" if matches(profile.model_strings, made_on) else ", ".join(names)
 
 
-def store(measured: list[Measured]) -> Path:
+def store(measured: list[BoardMeasurement]) -> Path:
     """Keep measurements beside those of other boards; return the file."""
     file = calibrations() / f"{measured[0].profile}.json"
     known = [item for item in _read(file) if item not in measured] if file.is_file() else []
     file.parent.mkdir(parents=True, exist_ok=True)
     rows = [dict(vars(item)) for item in (*known, *measured)]
     with whole_file(file) as draft:
-        draft.write_text(json.dumps({"schema": LAYOUT, "measured": rows}, indent=1) + "\n", encoding="utf-8")
+        draft.write_text(json.dumps({"schema": SCHEMA_VERSION, "measured": rows}, indent=1) + "\n", encoding="utf-8")
     return file
 
 
 def calibrations() -> Path:
     """Return where measurements are kept: ``$VLATOOL_CALIBRATIONS``, or the user's data directory."""
-    named = os.environ.get(PLACES)
+    named = os.environ.get(CALIBRATIONS_VARIABLE)
     data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
     return Path(named) if named else data / "vlatool" / "calibrations"
 
@@ -133,27 +135,27 @@ def measured_questions(file: Path | None = None) -> list[tuple[Question, float]]
     questions = []
     for path in [file] if file else sorted(calibrations().glob("*.json")):
         try:
-            questions += [(item.question(), item.ms) for item in _read(path) if file or item.profile in names()]
+            questions += [(item.question(), item.ms) for item in _read(path) if file or item.profile in profile_names()]
         except ProfileError as error:
-            raise DataError(f"The calibration {path} does not fit any more: {error.message}", AGAIN) from error
+            raise DataError(f"The calibration {path} does not fit any more: {error.message}", REDO_FIX) from error
     return questions
 
 
-def _read(file: Path) -> list[Measured]:
+def _read(file: Path) -> list[BoardMeasurement]:
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
-        measured = [Measured(**row) for row in data["measured"]]
+        measured = [BoardMeasurement(**row) for row in data["measured"]]
     except OSError as error:
-        raise DataError(f"The calibration {file} cannot be read: {error.strerror}.", AGAIN) from error
+        raise DataError(f"The calibration {file} cannot be read: {error.strerror}.", REDO_FIX) from error
     except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise DataError(f"The calibration {file} is malformed: {type(error).__name__}: {error}.", AGAIN) from error
+        raise DataError(f"The calibration {file} is malformed: {type(error).__name__}: {error}.", REDO_FIX) from error
     for item in measured:
-        if not is_sound(item):
-            raise DataError(f"The calibration {file} is malformed: {item}.", AGAIN)
+        if not is_valid(item):
+            raise DataError(f"The calibration {file} is malformed: {item}.", REDO_FIX)
     return measured
 
 
-def is_sound(item: Measured) -> bool:
+def is_valid(item: BoardMeasurement) -> bool:
     """Say whether a measurement can be learnt from: names, numbers above zero, a known precision, known traits."""
     named = (item.profile, item.mode, item.engine, item.precision)
     if not isinstance(item.work, Mapping) or not all(isinstance(name, str) for name in named):
