@@ -198,7 +198,7 @@ def test_a_gpu_that_is_powered_off_gives_its_clock_alone(tmp_path: Path) -> None
     found = DevfreqReader.open(root)
     unreadable(root, "sys/class/devfreq/17000000.gpu/device/load")
     assert [*read(found)] == ["devfreq.gpu.clock"]
-    assert "no Jetson" in reason(DevfreqReader.open(tmp_path / "none"))
+    assert "not a Jetson" in reason(DevfreqReader.open(tmp_path / "none"))
 
 
 def test_overcurrent_events_are_throttle_counters(tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_overcurrent_events_are_throttle_counters(tmp_path: Path) -> None:
     assert read(found) == {"overcurrent.oc1": 0, "overcurrent.oc2": 0, "overcurrent.oc3": 2}
     assert isinstance(found, OvercurrentReader)
     assert {(one.kind, one.unit) for one in found.read()} == {("counter", "throttle")}
-    assert "no Jetson" in reason(OvercurrentReader.open(tmp_path / "none"))
+    assert "not a Jetson" in reason(OvercurrentReader.open(tmp_path / "none"))
 
 
 def test_a_line_of_jetpack_4_without_date_and_without_milliwatts() -> None:

@@ -1,4 +1,4 @@
-"""Measurements of a user on a board, as the latency model takes them: ``vlatool profiles calibrate``."""
+"""A user's measurements on a board for the latency model: ``vlatool profiles calibrate``."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class BoardMeasurement:
     """One latency on a board.
 
     Args:
-        profile, mode, engine, precision: As in a profile.
-        work: One inference.
-        ms: Median.
+        profile, mode, engine, precision: Names as in a profile.
+        work: Work of one inference.
+        ms: Median latency.
     """
 
     profile: str
@@ -43,7 +43,7 @@ class BoardMeasurement:
     ms: float
 
     def question(self) -> Question:
-        """Return what the model would have been asked.
+        """Return the corresponding question to the model.
 
         Raises:
             ProfileError: when the profile, its mode or its engine is gone.
@@ -57,16 +57,16 @@ class BoardMeasurement:
 def report_measurements(
     report: Path, profile: Profile, mode: str | None, load: Workload | None = None
 ) -> list[BoardMeasurement]:
-    """Return the latencies of a benchmark report that was made on a board.
+    """Return the latencies of a benchmark report from a board.
 
     Args:
-        report: ``report.json`` or the directory that holds it.
-        profile: The board that it was made on.
-        mode: Its power mode; the default one when None.
-        load: The work of the policy, for a report that does not hold it.
+        report: ``report.json`` or its directory.
+        profile: Profile of the board.
+        mode: Power mode of the board; the default one when None.
+        load: Workload of the policy, for a report without it.
 
     Raises:
-        DataError: when there is no such report, or it holds no latency with its work.
+        DataError: when there is no such report, or it has no latency with its workload.
         ProfileError: when the profile has no such mode.
     """
     measured = []
@@ -93,7 +93,7 @@ def report_measurements(
         if engine in profile.engines and is_valid(item):
             measured.append(item)
     if not measured:
-        why = "its rows do not say what they compute" if missing else "it holds no latency of an engine of this board"
+        why = "its rows have no workload" if missing else "it has no latency of an engine of this board"
         raise DataError(
             f"{report} cannot calibrate {profile.name}: {why}.",
             "name the bundle that was measured with --bundle, or measure it again: vlatool benchmark BUNDLE -o DIR",
@@ -102,14 +102,14 @@ def report_measurements(
 
 
 def foreign_host(report: Path, profile: Profile) -> str:
-    """Return what a report was made on when that is not the profile's board; empty when it is, or is not said."""
+    """Return the host of a report when that is not the profile's board; empty when it is, or is unknown."""
     made_on = read_report(report).environment
     names = [str(made_on[key]) for key in ("board", "cpu") if made_on.get(key)]
     return "" if matches(profile.model_strings, made_on) else ", ".join(names)
 
 
 def store(measured: list[BoardMeasurement]) -> Path:
-    """Keep measurements beside those of other boards; return the file."""
+    """Store measurements together with earlier ones; return the file."""
     file = calibrations() / f"{measured[0].profile}.json"
     known = [item for item in _read(file) if item not in measured] if file.is_file() else []
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -120,14 +120,14 @@ def store(measured: list[BoardMeasurement]) -> Path:
 
 
 def calibrations() -> Path:
-    """Return where measurements are kept: ``$VLATOOL_CALIBRATIONS``, or the user's data directory."""
+    """Return the directory of measurements: ``$VLATOOL_CALIBRATIONS``, or in the user's data directory."""
     named = os.environ.get(CALIBRATIONS_VARIABLE)
     data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
     return Path(named) if named else data / "vlatool" / "calibrations"
 
 
 def measured_questions(file: Path | None = None) -> list[tuple[Question, float]]:
-    """Return what a file of ``store`` holds, or all that is kept.
+    """Return the measurements in a file of ``store``, or all stored ones.
 
     Raises:
         DataError: when the file is missing or malformed, or its board's profile has changed.
@@ -156,7 +156,7 @@ def _read(file: Path) -> list[BoardMeasurement]:
 
 
 def is_valid(item: BoardMeasurement) -> bool:
-    """Say whether a measurement can be learnt from: names, numbers above zero, a known precision, known traits."""
+    """Return whether a measurement is usable: names, numbers above zero, a known precision, known traits."""
     named = (item.profile, item.mode, item.engine, item.precision)
     if not isinstance(item.work, Mapping) or not all(isinstance(name, str) for name in named):
         return False

@@ -1,4 +1,4 @@
-"""What the latency model knows of a question: the work, what computes it, and in which precision."""
+"""Features of the latency model: the work, the compute unit, and the precision."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vlatool.latency_model.gaussian_process import KEYS, Rows
 Array = NDArray[Any]
 
 PROXIES = {"bfloat16": "float16", "float8": "int8"}
-"""Precision -> the one whose published latencies speak for it."""
+"""Precision -> precision whose published latencies stand for it."""
 CENTRE = np.array([0.6, 1.8, 2.0, 4.0])
 SPREAD = np.array([1.8, 0.6, 1.0, 0.6])
 DEVICE_CENTRE = np.array([0.3, 4.3, 0.6, 2.0])
@@ -28,15 +28,15 @@ LAYER_MS = 0.03
 
 @dataclass(frozen=True)
 class Work:
-    """One graph, once.
+    """Work of one run of a graph.
 
     Args:
         macs: Multiply-accumulates.
-        weights: Numbers that it reads from weights, as often as it reads them.
-        activations: Numbers that its compute layers write.
-        layers: Compute layers.
-        traits: Of ``TRAITS``.
-        name: What it is called where it was published; unique for a user's own graph.
+        weights: Elements read from weights, counted at each read.
+        activations: Elements that its compute layers write.
+        layers: Number of compute layers.
+        traits: Traits of ``TRAITS``.
+        name: Published name; unique for a user's own graph.
     """
 
     macs: float
@@ -49,18 +49,17 @@ class Work:
 
 @dataclass(frozen=True)
 class ComputeUnit:
-    """What computes.
+    """A unit of a device that computes.
 
     Args:
-        device: Name of the board or processor; two places with one name share what is known of it.
+        device: Name of the board or processor; units with one name share what is known about it.
         unit: ``cpu``, ``gpu``, ``igpu`` or ``npu``.
-        cores: Cores (threads) that take part.
-        clock_ghz: Of them.
+        cores: Number of cores (threads) in use.
+        clock_ghz: Clock of the cores.
         peaks: Precision -> 10^12 operations per second, dense; at least one.
-        bandwidth_gb_s: Of the memory.
-        setting: What else a measurement was taken with: power mode, threads, version.
-        isa: Instruction set features of its cores, in words, as profiles have them: places with the same ones speak
-            for each other.
+        bandwidth_gb_s: Bandwidth of the memory.
+        setting: Other conditions of a measurement: power mode, threads, version.
+        isa: Instruction set features of its cores, as in profiles: units with the same features inform each other.
     """
 
     device: str
@@ -73,7 +72,7 @@ class ComputeUnit:
     isa: str = ""
 
     def peak(self, precision: str) -> float:
-        """Return the peak that a precision computes at: that of float16, or float32, for weights alone in few bits."""
+        """Return the peak of a precision; for weight-only precisions that of float16, or float32."""
         computed = {"w4": "float16", "w8": "float16"}.get(precision, precision)
         chain = (computed, PROXIES.get(computed, computed), "float16" if computed in PROXIES else "float32", "float32")
         return next((self.peaks[name] for name in chain if name in self.peaks), max(self.peaks.values()))
@@ -81,10 +80,10 @@ class ComputeUnit:
 
 @dataclass(frozen=True)
 class Question:
-    """How long this work takes there.
+    """A question to the model: the latency of this work on this compute unit.
 
     Args:
-        runtime: Inference library, as ``_points`` names it.
+        runtime: Inference library.
         precision: A key of ``PRECISIONS``.
     """
 
@@ -96,9 +95,9 @@ class Question:
 
 @dataclass(frozen=True)
 class Shares:
-    """What is reached of the peaks before anything is known (0-1), and a factor on ``LAYER_MS``.
+    """Prior shares of the peaks that are reached (0-1), and a factor on ``LAYER_MS``.
 
-    Weights are read in one stream, activations are written and read in pieces: each has a share of the bandwidth.
+    Weights are read in one stream, activations are written and read in pieces: each has its own share of the bandwidth.
     """
 
     compute: float = 0.3
@@ -108,7 +107,7 @@ class Shares:
 
 
 def roofline_ms(question: Question, shares: Shares) -> float:
-    """Return compute, memory and layers in ms, added up."""
+    """Return the sum of compute, memory and overhead in ms."""
     return sum(roofline_parts(question, shares).values())
 
 

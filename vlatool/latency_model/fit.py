@@ -25,19 +25,19 @@ from vlatool.latency_model.published_latencies import Point, merge_versions, rea
 
 Array = NDArray[Any]
 TAIL_WEIGHT = 0.3
-"""What the 90th percentile counts beside the median."""
+"""Weight of the 90th percentile relative to the median."""
 DEVICE_WEIGHT = 0.6
-"""What an unseen device counts beside an unseen model."""
+"""Weight of an unseen device relative to an unseen model."""
 CALIBRATED_WEIGHT, MAX_SEARCH_MODELS = 0.6, 6
-"""What a device counts of which one model is known; how many of its models are tried in the search for scales."""
+"""Weight of a device with one known model; number of its models in the search for scales."""
 INITIAL_STEP, MIN_STEP = 0.5, 0.04
-"""Of the search for scales, in their logarithm: the first, and what is too small to try."""
+"""Steps of the search for scales, in their logarithm: the first, and the smallest."""
 MAX_SEARCH_FIGURES = 32
-"""Figures of one device, runtime and precision that the search for scales looks at."""
+"""Largest number of figures of one device, runtime and precision in the search for scales."""
 
 
 def loss(error: Array) -> float:
-    """Return median and 90th percentile of the relative error, weighed."""
+    """Return the weighted sum of median and 90th percentile of the relative error."""
     if not len(error):
         return 0.0
     relative = np.abs(np.expm1(error))
@@ -45,7 +45,7 @@ def loss(error: Array) -> float:
 
 
 def search_objective(sample: Sample, scales: Scales, shares: Shares) -> float:
-    """Return what the search for scales lowers."""
+    """Return the objective that the search for scales minimizes."""
     folds = Folds(rows_of(sample.questions, shares), sample, scales)
     likelihood = 0.0
     total = 0.0
@@ -58,7 +58,7 @@ def search_objective(sample: Sample, scales: Scales, shares: Shares) -> float:
 
 
 LIKELIHOOD_WEIGHT = 0.05
-"""What the predictive likelihood counts: it keeps the intervals honest where the error alone does not care."""
+"""Weight of the predictive likelihood, which keeps the intervals honest where the error is indifferent."""
 
 
 def tune(
@@ -69,12 +69,12 @@ def tune(
     seed: int = 0,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[Scales, Shares]:
-    """Search scales and shares by coordinates, in the logarithm, until the time is over.
+    """Search scales and shares by coordinate descent in the logarithm, until the time is over.
 
     Args:
-        seconds: For the search.
-        seed: Of the order of the coordinates.
-        tell: Called with each improvement.
+        seconds: Time limit of the search.
+        seed: Random seed of the order of the coordinates.
+        tell: Receiver of each improvement.
     """
     names = [field.name for field in dataclasses.fields(Scales) if field.name != "constant"]
     names += [f"shares.{field.name}" for field in dataclasses.fields(Shares)]
@@ -108,9 +108,9 @@ def _scaled_parameter(scales: Scales, shares: Shares, name: str, factor: float) 
 
 
 def conformal(sample: Sample, scales: Scales, shares: Shares) -> dict[str, dict[str, float]]:
-    """Return regime -> unit -> how many standard deviations reach ``LEVEL`` of what is left out (split conformal).
+    """Return regime -> unit -> standard deviations that cover ``LEVEL`` of the left-out figures (split conformal).
 
-    Where a unit has few models or devices, it is drawn towards all of the regime (``Scores.reach``).
+    A unit with few models or devices is shrunk towards all units of the regime (``Scores.quantile``).
     """
     rows = rows_of(sample.questions, shares)
     folds = Folds(rows, sample, scales)
@@ -125,18 +125,18 @@ def conformal(sample: Sample, scales: Scales, shares: Shares) -> dict[str, dict[
 
 
 SHRINKAGE_COUNT = 4
-"""Models or devices that all units together count for beside those of one unit: few of a unit say little."""
+"""Weight of all units together, in models or devices of one unit: few of them say little."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How many standard deviations left-out figures are away.
+    """Distances of left-out figures in standard deviations.
 
     Args:
-        values: (n,) for each published figure, several versions of a runtime apart.
-        groups: (n,) what it was left out with.
+        values: (n,) distance of each published figure, versions of a runtime counted separately.
+        groups: (n,) group that it was left out with.
         units: (n,) index into ``UNITS``.
-        draws: (n,) which draw it is of: a model; a device with a runtime and precision; a device with the model that
+        draws: (n,) index of the draw: a model; a device with a runtime and precision; a device with the model that
             calibrates it.
     """
 
@@ -154,7 +154,7 @@ class Scores:
 
     @staticmethod
     def for_calibrated(sample: Sample, folds: Folds) -> Scores:
-        """Return the scores of devices of which one model is known, for many of their models."""
+        """Return the scores of devices with one known model, for many of their models."""
         error, deviation, rows, draws = folds.leave_out_calibrated(sample.devices)
         order = np.argsort(sample.figures, kind="stable")
         starts = np.searchsorted(sample.figures[order], np.arange(len(sample.logs) + 1))
@@ -166,11 +166,11 @@ class Scores:
         return Scores(values, sample.devices[at], sample.units[at], draws[copy])
 
     def quantile(self, unit: int, but: int | None = None) -> float:
-        """Return the score that ``LEVEL`` do not exceed: this unit's, drawn towards all units' where it has few groups.
+        """Return the ``LEVEL`` quantile of a unit's scores, shrunk towards that of all units where it has few groups.
 
         Args:
             unit: Index into ``UNITS``.
-            but: A group that takes no part.
+            but: Excluded group.
         """
         others = np.ones(len(self.values), bool) if but is None else self.groups != but
         alike = others & (self.units == unit)
@@ -181,13 +181,13 @@ class Scores:
         return (apart * own + SHRINKAGE_COUNT * self._share(others)) / (apart + SHRINKAGE_COUNT)
 
     def _share(self, rows: Array) -> float:
-        """Return the score that ``LEVEL`` of some rows do not exceed."""
+        """Return the ``LEVEL`` quantile of the scores of some rows."""
         values, groups, draws = self.values[rows], self.groups[rows], len(np.unique(self.draws[rows]))
         _, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
-        weights = counts[inverse] ** -0.5  # figures of one group are no independent witnesses
+        weights = counts[inverse] ** -0.5  # figures of one group are not independent
         order = np.argsort(values)
         share = np.cumsum(weights[order]) / weights.sum()
-        level = LEVEL * (draws + 1) / draws  # what comes is one draw more (Lei et al., JASA 2018, section 2)
+        level = LEVEL * (draws + 1) / draws  # a prediction is one draw more (Lei et al., JASA 2018, section 2)
         return float(values[order][min(len(order) - 1, int(np.searchsorted(share, level)))])
 
 
@@ -201,9 +201,9 @@ def split_by_part(points: Sequence[Point]) -> dict[str, list[Point]]:
 
 
 def subsample(points: Sequence[Point], limit: int = MAX_SEARCH_FIGURES, seed: int = 0) -> list[Point]:
-    """Return at most so many figures of a device, runtime and precision, drawn at random.
+    """Return a random subset of at most ``limit`` figures of each device, runtime and precision.
 
-    The search for scales needs no more of them, and its work grows with the third power.
+    The search for scales needs no more of them, and its cost grows with the third power.
     """
     random = np.random.default_rng(seed)
     alike: dict[tuple[str, ...], list[Point]] = {}
@@ -220,10 +220,10 @@ def fit(
     """Return the model of some figures.
 
     Args:
-        before: Where the search for scales begins; at ``Scales()`` and ``Shares()`` when None.
-        seconds: For the search; 0 keeps the scales.
-        seed: Of the search.
-        tell: Called with what is done.
+        before: Start of the search for scales; ``Scales()`` and ``Shares()`` when None.
+        seconds: Time limit of the search; 0 keeps the scales.
+        seed: Random seed of the search.
+        tell: Receiver of progress.
     """
     parts: dict[str, TrainingData] = {}
     shares: dict[str, Shares] = {}
@@ -250,10 +250,10 @@ def fit(
 
 
 def _refuse_foreign_files(out: Path) -> None:
-    """Refuse files called as the model's that are no model.
+    """Refuse files with the model's names that are not a model.
 
     Raises:
-        OutputError: when there are.
+        OutputError: when there are such files.
     """
     present = [out / name for name in ("latency.npz", "latency.json") if os.path.lexists(out / name)]
     if not present:
@@ -273,13 +273,13 @@ def fit_files(
     """Fit on a file and write the model's data.
 
     Args:
-        anew: Begin the search for scales at ``Scales()`` and ``Shares()``, and not at those of the shipped model, which
-            saw all that was published.
-        tell: Called with what is done.
+        anew: Start the search for scales at ``Scales()`` and ``Shares()``, instead of those of the shipped model, which
+            was fitted on all published figures.
+        tell: Receiver of progress.
 
     Raises:
         DataError: when the file is malformed, or has no row to fit on.
-        OutputError: when other files have the names of the model's.
+        OutputError: when other files have the names of the model's files.
     """
     _refuse_foreign_files(out)
     points = read_points(path)

@@ -1,4 +1,4 @@
-"""Predictions of published latencies without the model, or the device, that they belong to.
+"""Predictions of published latencies with their model, or their device, left out.
 
 Leaving a group out of a Gaussian process needs no second fit: with A the inverse of the covariance of all rows, the
 group's mean is y_g - inv(A_gg) (A y)_g and its covariance inv(A_gg) (Rasmussen and Williams 2006, section 5.4.2).
@@ -20,20 +20,20 @@ from vlatool.latency_model.published_latencies import Point, merge_versions
 Array = NDArray[Any]
 UNITS = ("cpu", "gpu", "igpu", "npu")
 MAX_MODELS = 32
-"""Models that calibrate a held-out device, one after the other, at most."""
+"""Largest number of models that calibrate a held-out device, one at a time."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """The rows that a fit works on.
+    """The rows of a fit.
 
     Args:
-        questions: One for each row.
+        questions: Question of each row.
         logs: (n,) natural logarithm of ms.
-        models, devices: (n,) codes of the groups that are left out whole.
+        models, devices: (n,) codes of the groups that are left out as a whole.
         units: (n,) index into ``UNITS``.
-        figures: (m,) row of each published figure: several versions of a runtime are one row.
-        published: (m,) their logarithms.
+        figures: (m,) row of each published figure: several versions of a runtime share a row.
+        published: (m,) logarithms of the figures.
     """
 
     questions: tuple[Question, ...]
@@ -46,7 +46,7 @@ class Sample:
 
     @staticmethod
     def from_points(points: Sequence[Point]) -> Sample:
-        """Take the points that can be asked about, one row for each question."""
+        """Return a sample of the predictable points, one row for each question."""
         asked = [point for point in points if point.question is not None]
         known = merge_versions(asked)
         row = {point.question: index for index, point in enumerate(known)}
@@ -68,9 +68,9 @@ class Folds:
     """Predictions of each row without its group.
 
     Args:
-        rows: Of the sample.
+        rows: Rows of the sample.
         sample: The sample.
-        scales: Of the process.
+        scales: Scales of the process.
     """
 
     def __init__(self, rows: Rows, sample: Sample, scales: Scales) -> None:
@@ -82,21 +82,21 @@ class Folds:
         self._sample = sample
 
     def leave_out(self, groups: Array) -> tuple[Array, Array]:
-        """Return error of log(ms) (predicted less measured) and its predicted standard deviation, row by row."""
+        """Return error of log(ms) (predicted minus measured) and its predicted standard deviation for each row."""
         error, deviation = np.zeros(len(groups)), np.zeros(len(groups))
         for index, mean, covariance in self._left_out_groups(groups):
             error[index], deviation[index] = mean - self._residual[index], np.sqrt(np.diag(covariance))
         return error, deviation
 
     def leave_out_calibrated(self, groups: Array, limit: int = MAX_MODELS) -> tuple[Array, Array, Array, Array]:
-        """Leave each device out, tell the process of one of its models, and predict the others; for many of its models.
+        """Leave each device out, condition on one of its models, and predict the others; for many of its models.
 
         Args:
-            groups: Devices.
-            limit: Models of each that are told, one after the other.
+            groups: Codes of the devices.
+            limit: Largest number of calibrating models of each device.
 
         Returns:
-            Errors, standard deviations, the rows that they belong to, and which telling each is of.
+            Errors, standard deviations, their rows, and the index of the calibration of each.
         """
         errors: list[Array] = []
         deviations: list[Array] = []
@@ -110,16 +110,16 @@ class Folds:
                     errors.append(error)
                     deviations.append(deviation)
                     rows.append(index[~observed])
-        if not errors:  # every device has one model alone
+        if not errors:  # every device has only one model
             return np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)
         draws = np.repeat(np.arange(len(rows)), [len(part) for part in rows])
         return np.concatenate(errors), np.concatenate(deviations), np.concatenate(rows), draws
 
     def leave_out_once(self, groups: Array, random: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Leave each device out, tell the process of one of its models, drawn at random, and predict the others.
+        """Leave each device out, condition on one of its models, drawn at random, and predict the others.
 
         Returns:
-            Error and standard deviation of each row, and which rows were told.
+            Error and standard deviation of each row, and the mask of calibrating rows.
         """
         error, deviation = np.zeros(len(groups)), np.ones(len(groups))
         calibrating = np.zeros(len(groups), bool)
@@ -133,7 +133,7 @@ class Folds:
         return error, deviation, calibrating
 
     def _errors_given(self, observed: Array, index: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Return error and standard deviation of a group's other rows, once the process is told those that are seen."""
+        """Return error and standard deviation of a group's other rows, conditioned on the observed ones."""
         residual, rest = self._residual[index], ~observed
         across = covariance[np.ix_(rest, observed)] @ np.linalg.inv(covariance[np.ix_(observed, observed)])
         error = mean[rest] + across @ (residual[observed] - mean[observed]) - residual[rest]

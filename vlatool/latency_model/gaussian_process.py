@@ -1,10 +1,10 @@
-"""A Gaussian process over the logarithm of latency: what is published near a question decides, and how far it is.
+"""A Gaussian process over the logarithm of latency: nearby published figures determine a prediction.
 
     log(ms) = log(roofline) + f,   f ~ GP(0, K)
 
-K is a sum of components: some are shared by all that has one runtime, one device, one precision or one model; some
-vary smoothly with what a model and a device are (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
-chapters 2 and 5). A measurement on a board is one more point: conditioning on it is the calibration.
+K is a sum of components: some are shared by all rows of one runtime, device, precision or model; some vary smoothly
+with the features of model and device (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapters 2
+and 5). A measurement on a board is one more point: calibration conditions on it.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ PARTS = tuple(field.name for field in fields(Rows))[1:]
 
 @dataclass(frozen=True)
 class Scales:
-    """What the fit chooses: standard deviations of the components in log(ms), and lengths.
+    """Parameters of the fit: standard deviations of the components in log(ms), and length scales.
 
     The ``*_m`` components vary with the model (its features, ``lengths`` apart), the ``*_d`` ones with the device.
     """
@@ -98,7 +98,7 @@ class Scales:
 
 
 BLOCK = 32
-"""Rows of the covariance that are made at a time: they stay in the processor's cache."""
+"""Rows of the covariance that are computed at a time: they stay in the processor's cache."""
 
 
 def kernel(first: Rows, second: Rows, scales: Scales) -> Array:
@@ -116,7 +116,7 @@ def kernel(first: Rows, second: Rows, scales: Scales) -> Array:
 
 
 def _similarities(squares: Array) -> tuple[Array, Array]:
-    """Return how alike models are, with a long tail and with a short one."""
+    """Return similarities of models, with a long tail and with a short one."""
     return 1 / (1 + squares / 2), np.exp(-squares / 2)
 
 
@@ -150,12 +150,12 @@ def _squares(first: Array, second: Array) -> Array:
 
 
 class Process:
-    """The process given measurements.
+    """The process conditioned on measurements.
 
     Args:
-        rows: What was measured.
+        rows: Measured rows.
         logs: (n,) natural logarithm of the latency in ms.
-        scales: Of the fit.
+        scales: Scales of the fit.
         noise: (n,) standard deviation of each measurement; that of the fit when None.
     """
 
@@ -170,7 +170,7 @@ class Process:
         self._weights = cho_solve((self._factor, True), logs - rows.prior)
 
     def predict(self, questions: Rows) -> tuple[Array, Array]:
-        """Return mean and standard deviation of log(ms) of each question; the noise of a measurement is in it."""
+        """Return mean and standard deviation of log(ms) of each question, including the noise of a measurement."""
         mean, covariance = self.joint(questions)
         return mean, np.sqrt(np.diag(covariance) + self.scales.noise**2)
 

@@ -1,4 +1,4 @@
-"""How long a graph takes on a board: a prediction with an interval, or why there is no ground for one."""
+"""Latency of a graph on a board: a prediction with an interval, or the reason why it is unknown."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from vlatool.latency_model.gaussian_process import KEYS, Process, Rows, Scales
 Array = NDArray[Any]
 DATA = Path(__file__).with_name("data")
 MODEL_ENV = "VLATOOL_LATENCY"
-"""Variable that names a directory of ``vlatool hwselect fit``."""
+"""Environment variable with a directory of ``vlatool hwselect fit``."""
 LEVEL = 0.8
-"""Share of measurements that fall into the interval."""
+"""Share of measurements inside the interval."""
 MAX_HALF_INTERVAL = 1.4
-"""Half an interval in log(ms), above which nothing useful is said: more than a factor of 4 either way."""
+"""Largest useful half width of an interval in log(ms): a factor of 4 in either direction."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class Prediction:
 
     Args:
         ms: Median; NaN when unknown.
-        low, high: Interval that ``LEVEL`` of measurements fall into.
+        low, high: Interval with ``LEVEL`` of measurements.
         regime: ``known`` (this runtime and precision were measured on this device), ``calibrated`` (the user measured
             something there), ``unseen``.
-        why: Why it is unknown; empty when it is known.
+        why: Reason why it is unknown; empty when it is known.
     """
 
     ms: float
@@ -57,12 +57,12 @@ class Prediction:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What a process is given: figures and scales.
+    """Data of a process: figures and scales.
 
     Args:
-        rows: What was measured.
+        rows: Measured rows.
         logs: (n,) natural logarithm of the ms.
-        scales: Of the fit.
+        scales: Scales of the fit.
     """
 
     rows: Rows
@@ -70,13 +70,13 @@ class TrainingData:
     scales: Scales
 
     def process_without(self, runtimes: Iterable[int]) -> Process:
-        """Return the process that is not given the figures of some runtimes (codes of ``KEYS``)."""
+        """Return the process without the figures of some runtimes (codes of ``KEYS``)."""
         kept = ~np.isin(self.rows.keys["runtime"], sorted(runtimes))
         return Process(self.rows.take(kept), self.logs[kept], self.scales)
 
 
 MAX_IDLE_FIGURES = 900
-"""Figures of one runtime that are left out when nobody asks about it."""
+"""Number of figures above which a runtime is left out when no question is about it."""
 
 
 def crowded_runtimes(rows: Rows) -> set[int]:
@@ -90,10 +90,10 @@ class LatencyModel:
     """Two processes: one for processors and GPUs, one for neural processing units.
 
     Args:
-        parts: ``processors`` and ``npu`` -> what the process is given.
-        shares: The same -> the roofline below it.
-        conformal: The same -> regime -> unit -> standard deviations that the interval spans on either side.
-        about: Where it was fitted, for reports.
+        parts: ``processors`` and ``npu`` -> data of the process.
+        shares: The same -> shares of the roofline.
+        conformal: The same -> regime -> unit -> half width of the interval in standard deviations.
+        about: Description of the fit, for reports.
         own: Codes of the devices (of ``KEYS``) that the user measured.
     """
 
@@ -110,7 +110,7 @@ class LatencyModel:
     )
 
     def predict(self, questions: Sequence[Question]) -> list[Prediction]:
-        """Answer every question, in order."""
+        """Return the prediction for every question, in order."""
         answers = [Prediction(math.nan, why="the latency model has no figures of such a unit")] * len(questions)
         for part in self.parts:
             indices = [index for index, question in enumerate(questions) if part_of(question) == part]
@@ -120,9 +120,9 @@ class LatencyModel:
         return answers
 
     def conditioned(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
-        """Return the model that also knows what a user measured: (question, ms); the same object for the same figures.
+        """Return the model with a user's measurements added: (question, ms); the same object for the same figures.
 
-        Its processes, about a second of work, are so made once in a command, however many bundles are predicted.
+        Its processes, about a second of work, are therefore built once in a command, for any number of bundles.
         """
         if not measured:
             return self
@@ -172,8 +172,8 @@ class LatencyModel:
     def _process(self, part: str, rows: Rows) -> Process:
         """Return the process for some questions.
 
-        A runtime with very many figures that nobody asks about is left out: it says next to nothing of the others, and
-        the work grows with the third power of the figures.
+        A runtime with very many figures that no question is about is left out: it says next to nothing about the
+        others, and the cost grows with the third power of the figures.
         """
         unasked = frozenset(crowded_runtimes(self.parts[part].rows) - set(rows.keys["runtime"].tolist()))
         if (part, unasked) not in self._processes:
@@ -181,21 +181,21 @@ class LatencyModel:
         return self._processes[part, unasked]
 
 
-UNKNOWN_NPU = "figures of one neural processing unit say too little of another; measure it on the board"
+UNKNOWN_NPU = "figures of one neural processing unit say too little about another; measure it on the board"
 
 
 def part_of(question: Question) -> str:
-    """Return which process answers."""
+    """Return the part that answers a question."""
     return "npu" if question.compute_unit.unit == "npu" else "processors"
 
 
 def unknown_reason(question: Question, published: bool, device_known: bool) -> str:
-    """Return why nothing can be said, or an empty string.
+    """Return why a question cannot be answered, or an empty string.
 
     Args:
-        question: What is asked.
+        question: The question.
         published: Whether a figure of the runtime is known.
-        device_known: Whether one of this device is known.
+        device_known: Whether a figure of this device is known.
     """
     if question.runtime == "hailort" and "attention" in question.work.traits:
         return "Hailo's published figures are of convolutional networks; a transformer's latency there is unknown"
@@ -226,7 +226,7 @@ def load_model() -> LatencyModel:
 READ_ERRORS = (
     OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""What reading a file that is none of ours raises."""
+"""Exceptions of reading a file in another format."""
 
 
 @functools.cache

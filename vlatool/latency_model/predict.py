@@ -1,4 +1,4 @@
-"""What a profile's board would need for a bundle, as predictions that say so."""
+"""Predictions for a bundle on the board of a profile."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ SHOWN = ("latency_p50", "memory", "energy")
 
 
 def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Measurement]:
-    """Return predicted latency, memory and energy of a bundle on a board; NaN with a note where there is no ground.
+    """Return predicted latency, memory and energy of a bundle on a board; NaN with a note where unknown.
 
     Args:
-        profile: The board.
-        bundle: With graphs.
-        engine: Which engine of the board runs it; when empty, the bundle's own, where the board has that, or its
-            preferred one, where it runs such graphs, or one that does.
+        profile: Profile of the board.
+        bundle: Bundle with graphs.
+        engine: Engine of the board; when empty, the bundle's own, where the board has that, or its preferred one, where
+            it runs such graphs, or another one that does.
     """
     load, model = workload(bundle), load_model().conditioned(measured_questions())
     engine = engine or engine_for(profile, load, bundle.manifest.engine)

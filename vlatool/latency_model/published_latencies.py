@@ -4,8 +4,8 @@
     macts_m, n_layers, device_class; any others are not read
 
 ``gflops_or_gmacs`` holds 10^9 multiply-accumulates, ``params_m`` and ``macts_m`` 10^6 weights and activations.
-``data/models.csv`` says more of some models (weights as often as they are read); what is left out follows from the
-other columns; a row without any ground is kept apart, with the reason.
+``data/models.csv`` has more about some models (weights counted at each read); missing values follow from the other
+columns; an unpredictable row is kept separately, with the reason.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ RUNTIMES = (
     ("executorch", "executorch-cpu"), ("onnxruntime-(gpu|cuda)", "onnxruntime-gpu"),
     ("onnxruntime", "onnxruntime-cpu"),
 )  # fmt: skip
-"""Beginning of a published runtime's name and the model -> the runtime that its figures count for. "dit_only" leaves
-the backbone to PyTorch, and the 127 ms that are published are PyTorch's."""
+"""Pattern of a published runtime's name with the model -> runtime that its figures count for. "dit_only" leaves the
+backbone to PyTorch, and the published 127 ms are PyTorch's."""
 TRAIT_NAMES = (
     ("depthwise", "mobile|shuffle|mnas|efficientnet|ghost|proxyless|blazeface|fastestdet|yolo-fastest|mixnet|fbnet"
                   "|lcnet|tinynet|edgenext|repvit|hardcore|fastvit|convnext|efficientformer|rexnet|semnas|mobilevit|convmixer"
@@ -50,9 +50,9 @@ TRAIT_NAMES = (
     ("branches", "densenet|dpn|inception|googlenet|squeeze|dla|hrnet|nasnet|yolo|ssd|shuffle|retinanet|unet"),
     ("dense", "alexnet|vgg|llama|gpt|chatglm|phi|smollm"),
 )  # fmt: skip
-"""Trait -> names of architectures that have it, where no graph is at hand."""
+"""Trait -> names of architectures that have it, where no graph is available."""
 ROW_OF_WEIGHTS = 3000.0
-"""Numbers in a row of a language model's weights, where a step of decoding is not described further."""
+"""Elements in a row of a language model's weights, where a decoding step is not described further."""
 
 
 @dataclass(frozen=True)
@@ -60,12 +60,12 @@ class Point:
     """One published figure.
 
     Args:
-        question: What was measured; None when there is no ground to predict it.
+        question: Question that was measured; None when it cannot be predicted.
         log_ms: Natural logarithm of the milliseconds of one item.
-        group: Name of the board, as held out: see ``DEVICE_ALIASES``.
+        group: Name of the board for hold-out: see ``DEVICE_ALIASES``.
         kind: ``device_class``: cpu, gpu, igpu, npu.
-        model: Name of the model, as held out.
-        why: Why there is no question.
+        model: Name of the model for hold-out.
+        why: Reason why there is no question.
     """
 
     question: Question | None
@@ -106,7 +106,7 @@ def read_points(path: Path) -> list[Point]:
 
 
 def merge_versions(points: Iterable[Point]) -> list[Point]:
-    """Return points with one for each question: several versions of a runtime count as one figure, their mean log."""
+    """Return one point for each question: several versions of a runtime count as one figure, their mean log."""
     groups: dict[Question, list[Point]] = {}
     for point in points:
         if point.question is not None:
@@ -159,7 +159,7 @@ def runtime_of(name: str) -> str:
 
 
 def work_of(row: Mapping[str, str], where: str, *, decoding: bool) -> Work | None:
-    """Return the work of a row; None when its multiply-accumulates are not known."""
+    """Return the work of a row; None when its multiply-accumulates are unknown."""
     macs, weights = (
         _number(row.get("gflops_or_gmacs", ""), where, "gmacs"),
         _number(row.get("params_m", ""), where, "p"),
@@ -205,7 +205,7 @@ def _name(device: str) -> str:
 
 
 def compute_unit_of(row: Mapping[str, str]) -> ComputeUnit | None:
-    """Return what a row was measured on; None when the device is not known."""
+    """Return the compute unit of a row; None when the device is unknown."""
     name = _name(row["device"])
     devices = known_devices()
     unit = "cpu" if runs_on_cpu(row) else row["device_class"]
@@ -229,9 +229,9 @@ def compute_unit_of(row: Mapping[str, str]) -> ComputeUnit | None:
 
 
 PART_SUFFIX = re.compile(r" (end-to-end|backbone|action head|data processing)\b.*")
-"""What a name says beside the model's: figures of its parts are held out with it."""
+"""Suffix of a name for a part of the model: figures of parts are held out with it."""
 SEPARATORS = re.compile(r"[\W_]+")
-"""What differs between two spellings of one model's name: ``resnet-50``, ``resnet50`` and ``ResNet_50``."""
+"""Separators, which differ between spellings of a model's name: ``resnet-50``, ``resnet50`` and ``ResNet_50``."""
 
 
 def model_family(model: str) -> str:
@@ -248,15 +248,15 @@ DEVICE_ALIASES = {
     "jetson-agx-orin": "jetson-agx-orin-64gb", "jetson-orin-nano-8gb-super": "jetson-orin-nano-8gb",
     "raspberry-pi-5-2.9ghz": "raspberry-pi-5",
 }  # fmt: skip
-"""Name -> the board that it is, overclocked, in another power mode, or named in another way: held out with it."""
+"""Name -> the same board, overclocked, in another power mode, or under another name: held out together."""
 CLUSTERS = {"powersave=1": "little", "powersave=2": "big"}
-"""ncnn's ``powersave`` -> which cores of a processor with two kinds compute (ncnn, ``set_cpu_powersave``)."""
+"""ncnn's ``powersave`` -> cores in use of a processor with two kinds (ncnn, ``set_cpu_powersave``)."""
 
 
 def runs_on_cpu(row: Mapping[str, str]) -> bool:
-    """Say whether a figure of a GPU is one of the processor.
+    """Return whether a figure of a GPU is really one of the CPU.
 
-    ncnn has no Vulkan kernels for int8: the layers run on the processor, and the published figures of both are equal
+    ncnn has no Vulkan kernels for int8: the layers run on the CPU, and the published figures of both are equal
     (ResNet-50 with one thread: 107.0 and 106.8 ms on AGX Orin, 374.8 and 370.6 on AGX Xavier, 516 and 517 on Nano).
     """
     return row["runtime"].lower().startswith("ncnn-vulkan") and row["precision"] == "int8"
@@ -268,7 +268,7 @@ MAX_Q = 0.5
 
 @functools.cache
 def known_devices() -> dict[tuple[str, str], ComputeUnit]:
-    """Return (name, unit) -> what is known of each device of ``data/devices.csv``."""
+    """Return (name, unit) -> compute unit of each device in ``data/devices.csv``."""
     devices = {}
     for row in _table("devices.csv"):
         peaks = {dtype: float(row[dtype]) for dtype in ("float32", "float16", "int8") if row[dtype]}
@@ -281,7 +281,7 @@ def known_devices() -> dict[tuple[str, str], ComputeUnit]:
 
 @functools.cache
 def published_devices() -> dict[tuple[str, str], str]:
-    """Return (profile, unit) -> the device that published figures name so."""
+    """Return (profile, unit) -> name of the device in published figures."""
     return {
         (profile, row["unit"]): row["device"].lower()
         for row in _table("devices.csv")

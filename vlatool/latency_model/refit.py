@@ -1,4 +1,4 @@
-"""Score the whole way of fitting: scales, figures and intervals are found without what is then predicted."""
+"""Score the whole fit: scales, figures and intervals are found without the rows that are then predicted."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ PredictedPoints = list[tuple[Point, Prediction]]
 def refit_points(
     path: Path, held_out: str | None, seed: int, seconds: float, tell: Callable[[str, float | None], None]
 ) -> dict[str, dict[str, Any]]:
-    """Predict a file's rows with models that were fitted anew without them, in a process for each processor.
+    """Predict a file's rows with models that were fitted without them, in one process for each core.
 
-    Nothing of what is left out takes part: not in the scales, which begin at built-in values, not in the figures, and
-    not in the intervals.
+    Left-out rows have no influence at all: not on the scales, which start at built-in values, not on the figures, and
+    not on the intervals.
 
     Args:
-        path: Published latencies.
+        path: File of published latencies.
         held_out: ``models``: a tenth of the models at a time; ``devices``: each board.
-        seed: Of the dealing of models, of the search, and of the choice of the models that calibrate.
-        seconds: For the search of each part.
-        tell: Called with what is done and the share of it.
+        seed: Random seed of the folds, of the search, and of the calibrating models.
+        seconds: Time limit of the search of each part.
+        tell: Receiver of progress and the share that is done.
 
     Returns:
-        ``models``; or ``devices`` and ``calibrated``, where a board is left out but for one of its models.
+        ``models``; or ``devices`` and ``calibrated``, where a board is left out except for one of its models.
 
     Raises:
-        UsageError: when ``held_out`` is none of these.
-        DataError: when the file is malformed, or nothing of it is left to fit on.
+        UsageError: when ``held_out`` is unknown.
+        DataError: when the file is malformed, or no rows are left to fit on.
     """
     if held_out not in KINDS:
         got = "not given" if held_out is None else f"'{held_out}'"
@@ -90,7 +90,7 @@ def deal_folds(points: Sequence[Point], held_out: str, seed: int) -> list[frozen
 
 
 def fold(job: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> dict[str, Any]:
-    """Compute one part in this process: kind -> number of the point and what was predicted for it."""
+    """Compute one part in this process: kind -> index of the point and its prediction."""
     points = read_points(Path(job["points"]))
     numbers = {id(point): number for number, point in enumerate(points)}
     answered = one_fold(points, frozenset(job["held"]), job["held_out"], job["seed"], job["seconds"])
@@ -100,7 +100,7 @@ def fold(job: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> 
 def one_fold(
     points: Sequence[Point], held: frozenset[str], held_out: str, seed: int, seconds: float
 ) -> dict[str, PredictedPoints]:
-    """Return what a model that was fitted without some models or boards says of them."""
+    """Return the predictions of a model that was fitted without some models or boards, for these."""
 
     def out(point: Point) -> bool:
         return (point.model if held_out == "models" else point.group) in held
@@ -123,5 +123,5 @@ def one_fold(
 
 
 def predict_points(model: LatencyModel, points: Sequence[Point]) -> PredictedPoints:
-    """Return what a model says of some points."""
+    """Return the predictions of a model for some points."""
     return list(zip(points, model.predict([point.question for point in points if point.question]), strict=True))

@@ -1,4 +1,4 @@
-"""How far predictions are from published latencies, and how often their intervals hold."""
+"""Errors of predictions of published latencies, and the coverage of their intervals."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from vlatool.latency_model.published_latencies import Point, read_points
 Array = NDArray[Any]
 SPLITS = ("models", "devices", "calibrated")
 DRAWS = 5
-"""Models that calibrate each device, one after the other."""
+"""Number of models that calibrate each device, one at a time."""
 FOLDS = 10
-"""Parts that the models are dealt into; one part is left out at a time. Devices are left out one at a time."""
+"""Number of folds of the models; one fold is left out at a time. Devices are left out one at a time."""
 
 
 def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict[str, Any]:
     """Predict a file; with ``held_out`` from its own other rows.
 
     Args:
-        path: Published latencies.
+        path: File of published latencies.
         held_out: ``models``: a tenth of the models is left out at a time; ``devices``: each device; ``calibrated``:
-            each device but for one of its models. The widths of the intervals come from the errors of the others,
-            whose predictions knew what is left out here; ``_refit`` is stricter.
+            each device except for one of its models. The widths of the intervals come from the errors of the others,
+            whose predictions used the rows that are left out here; ``refit`` is stricter.
             None: the shipped model predicts every row.
-        seed: Of the dealing of models, and of the choice of the model that calibrates.
+        seed: Random seed of the folds, and of the calibrating models.
 
     Raises:
-        UsageError: when ``held_out`` is none of these.
-        DataError: when the file is malformed, or the model knows nothing of its kind of unit.
+        UsageError: when ``held_out`` is unknown.
+        DataError: when the file is malformed, or the model has no data for its kind of unit.
     """
     points = read_points(path)
     own = os.environ.get(MODEL_ENV)
@@ -64,7 +64,7 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
 
 
 def describe_split(held_out: str, seed: int) -> str:
-    """Return what is left out, in words."""
+    """Return a description of the left-out rows."""
     return {
         "models": f"{FOLDS} folds of whole models, dealt with seed {seed}",
         "devices": "each device left out whole",
@@ -73,7 +73,7 @@ def describe_split(held_out: str, seed: int) -> str:
 
 
 def _predict_left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, Prediction]:
-    """Return question -> its prediction from the rows that are not left out with it."""
+    """Return question -> prediction from the rows that are not left out with it."""
     model = load_model()
     if part not in model.parts:
         raise DataError(f"The latency model has no figures of {part}, and so no scales for them.", f"unset {MODEL_ENV}")
@@ -111,7 +111,7 @@ def _predict_left_out(sample: Sample, part: str, held_out: str, seed: int) -> di
 
 
 def _unknown_runtimes(sample: Sample, groups: Array, calibrating: Array) -> Array:
-    """Say of each row whether its runtime occurs in no other group and was not told: then nothing is known of it."""
+    """Return the mask of rows whose runtime occurs in no other group and does not calibrate: it is unknown."""
     runtimes = np.array([question.runtime for question in sample.questions])
     unknown = np.zeros(len(runtimes), bool)
     for runtime in np.unique(runtimes):
@@ -121,7 +121,7 @@ def _unknown_runtimes(sample: Sample, groups: Array, calibrating: Array) -> Arra
 
 
 def summarize(points: Sequence[Point], answers: Sequence[Prediction], how: str) -> dict[str, Any]:
-    """Return how far predictions are from figures, as JSON values."""
+    """Return the errors of predictions, as JSON values."""
     asked = [point for point in points if point.question]
     why: Counter[str] = Counter()
     why.update(point.why for point in points if not point.question)
@@ -148,7 +148,7 @@ def _errors(pairs: Sequence[tuple[Point, Prediction]]) -> dict[str, float]:
 
 
 def summary_lines(scored: Mapping[str, Any]) -> Iterator[str]:
-    """Return what a person reads."""
+    """Return the summary as lines of text."""
     yield f"{scored['how']}"
     yield f"{scored['predicted']} of {scored['rows']} rows predicted; relative error |predicted - measured| / measured"
     yield f"{'':14}{'rows':>6}{'median':>9}{'90th pct':>10}{'in interval':>13}{'interval':>10}"

@@ -1,8 +1,8 @@
-"""A float32 graph in which every layer can be switched to int8 by an input of its own.
+"""A float32 graph in which a separate input switches each layer to int8.
 
-Each layer becomes an ``If`` on a boolean scalar: one branch quantizes and dequantizes what the layer reads, as the int8
-graph does, the other is the float layer as it was. One session then serves all choices of layers, and the constants of
-the branch that is not taken cost nothing.
+Each layer becomes an ``If`` on a boolean scalar: one branch quantizes and dequantizes the inputs of the layer, as the
+int8 graph does, the other is the original float layer. One session then serves all combinations of layers, and the
+constants of the branch that is not taken cost nothing.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ FLAG_PREFIX = "int8."
 def add_switches(
     path: Path, layers: Iterable[Layer], ranges: Mapping[str, Range] | None, style: Style
 ) -> tuple[Any, dict[str, str]]:
-    """Return the graph with its switches, and layer name -> name of the boolean input of shape () that switches it.
+    """Return the graph with switches, and layer name -> name of its boolean input of shape ().
 
     Args:
         path: A float32 ONNX file.
-        layers: From ``find_layers`` of that file.
-        ranges: Value name -> (low, high), of every value that ``calibrated_values`` names; when None, ranges are taken
-            from the values at run time (uint8, DynamicQuantizeLinear).
-        style: How the int8 graph writes its layers.
+        layers: Layers from ``find_layers`` of that file.
+        ranges: Value name -> (low, high), for every value of ``calibrated_values``; when None, ranges are computed at
+            run time (uint8, DynamicQuantizeLinear).
+        style: Quantization style of the layers.
 
     Raises:
         GraphError: when a range is missing, or a weight holds NaN or infinity.
@@ -54,7 +54,7 @@ def add_switches(
 
 
 class _Pairs(OnnxGraph):
-    """The quantize-dequantize nodes of an int8 graph, copied to where they are needed."""
+    """Copies of the quantize-dequantize nodes of an int8 graph."""
 
     def __init__(self, model: Any, *, dynamic: bool) -> None:
         super().__init__(model)
@@ -63,13 +63,13 @@ class _Pairs(OnnxGraph):
         self.used: dict[str, Any] = {}
 
     def input_pair(self, layer: str, index: int, source: str, suffix: str) -> tuple[list[Any], str]:
-        """Return the nodes before an input of a layer, and the name they give; none when it is read as it is.
+        """Return the nodes before an input of a layer, and the name of their output; none for an unquantized input.
 
         Args:
             layer: Name of the node.
-            index: Which of its inputs.
-            source: What the copied QuantizeLinear reads.
-            suffix: Makes the names of the copies unique.
+            index: Index of the input.
+            source: Input of the copied QuantizeLinear.
+            suffix: Suffix that makes the names of the copies unique.
         """
         node = self.nodes[layer]
         last = self.producers.get(node.input[index])
@@ -83,7 +83,7 @@ class _Pairs(OnnxGraph):
         return [copy], copy.output[0]
 
     def output_pair(self, name: str, suffix: str) -> tuple[list[Any], str]:
-        """Return the pair that quantizes what a convolution gives, and the name it gives."""
+        """Return the pair that quantizes the output of a convolution, and the name of its output."""
         first = next(node for node in self.readers[name] if node.op_type == "QuantizeLinear")
         return self._pair(first, self.readers[first.output[0]][0], name, suffix)
 
@@ -143,7 +143,7 @@ class _Writer(OnnxGraph):
         return self._if(flag, node, inputs, before)
 
     def _switch_output(self, layer: Layer) -> None:
-        """Let all later readers of a convolution's output read what its flag makes of it."""
+        """Redirect all later readers of a convolution's output to the switched output."""
         flag, target = self.flags[layer.name], f"{layer.output}@switched"
         before, value = self.pairs.output_pair(layer.output, f"@{flag}.out")
         node = self.node("Identity", [layer.output], [target], f"{layer.name}@out")

@@ -1,4 +1,4 @@
-"""Measure what each layer costs in a child process: the graphs have switches in them, and nobody has run them yet."""
+"""Measure the sensitivities in a child process, since the graphs with switches have never run before."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ PRELOAD = ("numpy", "onnx", "onnxruntime", __name__)
 def sensitivities_in_child(
     bundle: Bundle, stage: StaticInt8, recorded: int, samples: int, context: Context, seconds: float
 ) -> list[LayerError]:
-    """Return what ``sensitivities`` gives.
+    """Return the result of ``sensitivities``.
 
     Args:
-        bundle: A float32 bundle that carries a recording.
-        stage: Which layers, and how they are written.
-        recorded: Observations of that recording, of which ``samples`` are taken, spread over them.
-        samples: How many.
-        context: For progress.
+        bundle: A float32 bundle with a recording.
+        stage: Stage that selects the layers and their style.
+        recorded: Number of observations of that recording to choose from.
+        samples: Number of observations to measure on, spread over these.
+        context: Receiver of progress.
         seconds: See ``sensitivities``.
 
     Raises:
-        VlatoolError: what ``sensitivities`` raises; GraphError when the engine ends the child.
+        VlatoolError: errors of ``sensitivities``; GraphError when the engine crashes the child.
     """
     job = {
         "bundle": str(bundle.path.absolute()), "options": stage.given(), "recorded": recorded, "samples": samples,
@@ -43,7 +43,7 @@ def sensitivities_in_child(
 
 
 def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:
-    """Measure the layers of a job in this process; return them as JSON, in which numbers may be infinite or none."""
+    """Measure the layers of a job in this process; return them as JSON, with possible infinities and NaN."""
     bundle = Bundle.open(Path(job["bundle"]), verify=False)
     observations, limit = recorded_observations(bundle, job["recorded"]), job["samples"]
     selected = observations[:: max(1, len(observations) // limit)][:limit]

@@ -1,4 +1,4 @@
-"""What each layer costs when it alone is int8: error of the actions, on recorded observations."""
+"""Sensitivity of each layer: error of the actions with only this layer in int8, on recorded observations."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ LayerId = tuple[str, str]
 
 @dataclass(frozen=True)
 class LayerError:
-    """What int8 in one layer, or in a group of layers, does to the actions.
+    """Effect of int8 in one layer, or in a group of layers, on the actions.
 
     Args:
         name: Node name, for example ``blocks.3.attn.out/MatMul``; names joined by ``+`` for a group.
-        graph: Name of the graph that it is in.
+        graph: Name of its graph.
         error: Relative L2 error of the raw action output, mean over the observations.
         elements: Label -> mean |error| in physical units (un-normalised); empty for discrete actions.
         flips: Share of steps whose gripper element changes sign, or (discrete) whose largest logit is another one; 0
             when there is none.
         jump: ``|d' - d|₂ / |d|₂`` with ``d`` the raw last step minus the first of a chunk, mean over the observations:
-            how far the place where the next chunk begins moves. 0 for chunks of one step and for discrete actions.
+            how far the start of the next chunk moves. 0 for chunks of one step and for discrete actions.
         macs_share: Share of the graph's multiply-accumulates (0-1); NaN when they cannot be counted.
-        samples: Observations that it was measured on.
+        samples: Number of observations of the measurement.
     """
 
     name: str
@@ -71,19 +71,19 @@ def sensitivities(
     *,
     seconds: float = math.inf,
 ) -> list[LayerError]:
-    """Measure every layer that a stage would quantize, alone in int8 and all else in float32; the worst first.
+    """Measure every layer that a stage would quantize, with only this layer in int8; the worst first.
 
-    The noise of each observation is drawn from the same seed. What a policy keeps is what it kept of the observations
-    before, in float32; zero where the observations are no recording's.
+    The noise of each observation is drawn from the same seed. The state of a policy is that after the earlier
+    observations in float32; zero where the observations are not from a recording.
 
     Args:
         bundle: A float32 bundle.
-        stage: Which layers, and how they are written.
-        ranges: Graph -> value -> (low, high), as ``ranges_of`` gives; calibrated as the stage does when None. A graph
-            that is absent gets its ranges at run time, as dynamic int8 does.
+        stage: Stage that selects the layers and their style.
+        ranges: Graph -> value -> (low, high), from ``ranges_of``; calibrated as the stage does when None. A missing
+            graph gets its ranges at run time, as in dynamic int8.
         observations: Raw observations, at least one.
-        context: For progress.
-        seconds: No further observation is begun that would not end within them; the first one always is.
+        context: Receiver of progress.
+        seconds: Time limit; no further observation is started that would exceed it, except the first one.
 
     Raises:
         DataError: when there is no observation, or one does not fit the spec.
@@ -95,7 +95,7 @@ def sensitivities(
 
 
 def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, dict[str, Range]]:
-    """Return graph -> value -> (low, high) that the stage quantizes activations over, from its calibration data.
+    """Return graph -> value -> range (low, high) of the stage, from its calibration data.
 
     Raises:
         DataError: when the bundle has no calibration data, or a sample does not fit.
@@ -107,7 +107,7 @@ def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, 
 
 
 class _OutputTape:
-    """What the graphs gave in the float run of an observation, up to the first graph that is now another one."""
+    """Outputs of the graphs in the float run of an observation, reusable up to the first changed graph."""
 
     def __init__(self) -> None:
         self.recorded: list[Mapping[str, Array]] = []
@@ -122,7 +122,7 @@ class _OutputTape:
 
 
 class _SwitchableSession:
-    """A session of a graph with switches; while nothing before it has changed, it gives what it gave before."""
+    """A session of a graph with switches; it replays its outputs while nothing before it has changed."""
 
     def __init__(self, session: Any, flags: Mapping[str, str], tape: _OutputTape) -> None:
         self._session, self._flags, self._tape = session, flags, tape
@@ -131,12 +131,12 @@ class _SwitchableSession:
         self._active = False
 
     def switch(self, layers: Iterable[str]) -> None:
-        """Compute those layers in int8 and all others in float32."""
+        """Switch the given layers to int8 and all others to float32."""
         on = {self._flags[name]: np.array(True) for name in layers}
         self._set, self._active = {**self._off, **on}, bool(on)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run the graph as it is switched."""
+        """Run the graph with its current switches."""
         tape = self._tape
         tape.changed = tape.changed or self._active
         if not tape.changed:
@@ -150,13 +150,13 @@ class _SwitchableSession:
 
 
 class Switchboard:
-    """A float32 policy in which any choice of layers can be computed in int8; a context manager.
+    """A float32 policy in which any combination of layers can be computed in int8; a context manager.
 
     Args:
         bundle: A float32 bundle.
-        stage: Which layers, and how they are written.
-        ranges: As ``ranges_of`` gives.
-        threads: Intra-op threads; the cores that this process may use when None.
+        stage: Stage that selects the layers and their style.
+        ranges: Ranges from ``ranges_of``.
+        threads: Number of intra-op threads; the cores that this process may use when None.
     """
 
     def __init__(
@@ -194,11 +194,11 @@ class Switchboard:
         self._opened.close()
 
     def reference(self, observation: Mapping[str, Any]) -> Action:
-        """Run in float32, and keep what the graphs gave for the ``run`` calls that follow."""
+        """Run in float32, and keep the outputs of the graphs for the following calls of ``run``."""
         return self._infer((), observation, recording=True)
 
     def run(self, layers: Iterable[LayerId], observation: Mapping[str, Any]) -> Action:
-        """Run the observation of the last ``reference`` with those layers in int8."""
+        """Run the observation of the last ``reference`` with the given layers in int8."""
         return self._infer(layers, observation, recording=False)
 
     def _infer(self, layers: Iterable[LayerId], observation: Mapping[str, Any], *, recording: bool) -> Action:
@@ -212,7 +212,7 @@ class Switchboard:
         return self.policy.infer(observation)
 
     def _with_state(self, observations: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-        """Yield observations; until the next one, each run is given what the policy keeps before it."""
+        """Yield observations; until the next one, each run starts from the policy's state before it."""
         if not (self.policy.program.keeps and isinstance(observations, Observations)):
             yield from observations
             return

@@ -1,4 +1,4 @@
-"""Clocks of the processor, and how often an x86 processor throttled because it was hot.
+"""Clocks of the processor, and thermal throttle events of x86 processors.
 
 Sources: ``Documentation/admin-guide/pm/cpufreq.rst`` (``scaling_cur_freq`` in kHz) and
 ``Documentation/admin-guide/thermal/intel_thermal_throttle.rst`` of Linux (``thermal_throttle/*_throttle_count``).
@@ -23,9 +23,8 @@ NO_COUNTS = (
 class CpufreqReader(Reader):
     """Clock of every policy in MHz, as ``cpufreq.policyN``, and throttle events of the cores and of the package.
 
-    On a Jetson ``scaling_cur_freq`` may show the clock that was asked for while the firmware holds a lower one. The
-    events are added up over the logical processors; siblings count the same event, so only whether the sum moved is
-    exact.
+    On a Jetson ``scaling_cur_freq`` may show the requested clock while the firmware enforces a lower one. The events
+    are added up over the logical processors; siblings count the same event, so only whether the sum moved is exact.
     """
 
     name = "cpufreq"

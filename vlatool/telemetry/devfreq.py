@@ -19,7 +19,7 @@ GPU = re.compile(r"\.(gpu|ga10b|gp10b|gv11b)$|^gpu-gpc-\d+$")
 class DevfreqReader(FileReader):
     """Load (share) and clock (MHz) of the GPU, as ``devfreq.gpu.load`` and ``devfreq.gpu.clock``.
 
-    A GPU that is powered off gives none.
+    A GPU that is powered off has none.
     """
 
     name = "devfreq"
@@ -32,4 +32,4 @@ class DevfreqReader(FileReader):
         for index, folder in enumerate(folders):
             files.append(NumberFile(f"devfreq.gpu{index or ''}.load", f"{folder}/device/load", 1e-3, SHARE))
             files.append(NumberFile(f"devfreq.gpu{index or ''}.clock", f"{folder}/cur_freq", 1e-6, MEGAHERTZ))
-        return cls(root, files).or_absent("no GPU has a frequency policy in /sys/class/devfreq: this is no Jetson")
+        return cls(root, files).or_absent("no GPU has a frequency policy in /sys/class/devfreq: this is not a Jetson")

@@ -20,21 +20,21 @@ HWMON = (
     ("sys/bus/i2c/drivers", "ina3221*/*/hwmon/hwmon*"),
     ("sys/bus/i2c/drivers", "ina238*/*/hwmon/hwmon*"),
 )
-"""The first place that has monitors is read: the others show the same chips again."""
+"""Folders of monitors; the first one with monitors is read, since the others show the same chips again."""
 IIO = ("sys/bus/i2c/drivers", "ina3221*/*/iio:device*")
 """JetPack 4: ``rail_name_N`` and ``in_powerN_input`` in mW."""
 CHANNELS = (1, 2, 3)
 NO_RAIL = "NC"
 """The label of a channel that is not connected."""
 REASON = (
-    "no INA3221 or INA238 power monitor is visible: this is no Jetson, or a container hides it "
+    "no INA3221 or INA238 power monitor is visible: this is not a Jetson, or a container hides it "
     "(mount /sys read-only); otherwise measure at the supply"
 )
 
 
 @dataclass(frozen=True)
 class _Rail:
-    """The files of one rail: volts and current (mV, mA), or power with its scale to watts."""
+    """Files of one rail: volts and current (mV, mA), or power with its scale to watts."""
 
     label: str
     power: str
@@ -68,9 +68,7 @@ class InaReader(Reader):
         rails = _with_indexes(_hwmon(root) or list(_iio(root)))
         if not rails:
             return Absent(cls.name, REASON)
-        return cls(root, rails).or_absent(
-            "there are power monitors, but none of their rails can be read; look at dmesg"
-        )
+        return cls(root, rails).or_absent("there are power monitors, but none of their rails can be read; check dmesg")
 
     def read(self) -> list[Reading]:
         """Return the power of the rails in watts."""
@@ -108,7 +106,7 @@ def _chip(root: Path, folder: str) -> Iterator[_Rail]:
 
 
 def _label_of_ina238(root: Path, folder: str) -> str:
-    """Take the label of the chip; the one of an AGX Thor without a label is the input rail (jetson_stats #900)."""
+    """Return the label of the chip; one without a label on an AGX Thor is the input rail (jetson_stats #900)."""
     for name in ("in1_label", "power1_label", "label"):
         if label := read_text(root, f"{folder}/{name}"):
             return label

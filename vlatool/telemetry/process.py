@@ -1,4 +1,4 @@
-"""What this process takes, and what the host of a virtual machine takes away.
+"""Resources of this process, and CPU time stolen by the host of a virtual machine.
 
 Source: ``Documentation/filesystems/proc.rst`` of Linux. Where there is no ``/proc``, psutil is asked if installed.
 """
@@ -32,8 +32,8 @@ class ProcessReader(Reader):
 
     Args:
         root: The root of the file system.
-        process: An object of psutil in the place of ``/proc``.
-        number: Another process that is read in the place of this one; 0 for this one.
+        process: An object of psutil instead of ``/proc``.
+        number: ID of another process to read; 0 for this one.
     """
 
     name = "process"
@@ -51,7 +51,7 @@ class ProcessReader(Reader):
         if not reader.read() and root == ROOT:
             with contextlib.suppress(ImportError):
                 reader = cls(root, importlib.import_module("psutil").Process(number or None))
-        return reader.or_absent("there is no /proc; elsewhere than on Linux: pip install psutil")
+        return reader.or_absent("/proc is missing; on systems other than Linux: pip install psutil")
 
     def read(self) -> list[Reading]:
         """Return the counters of this process and the machine's steal time."""

@@ -19,13 +19,13 @@ UDEV_RULE = (
     'SUBSYSTEM=="powercap", KERNEL=="intel-rapl*", RUN+="/usr/bin/chgrp GROUP /sys/%p/energy_uj", '
     'RUN+="/usr/bin/chmod g+r /sys/%p/energy_uj"'
 )
-"""Lets a group read the counters; without the second part the group may not, because the mode is 0400."""
+"""Rule that lets a group read the counters; the second part is needed because the mode is 0400."""
 
 
 class RaplReader(FileReader):
     """Energy of every processor package in joules, as ``rapl.package-0``.
 
-    The zone ``psys`` is left out: it holds the package again, and how much of the board it covers differs by vendor.
+    The zone ``psys`` is excluded: it includes the package, and how much of the board it covers differs by vendor.
     """
 
     name = "rapl"

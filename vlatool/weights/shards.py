@@ -1,4 +1,4 @@
-"""Weights in safetensors shards, read a part at a time: nothing is mapped, and the page cache is left alone."""
+"""Weights in safetensors shards, read in parts, without memory maps and around the page cache."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import SourceError
 
-READ_FIX = "see that this user may read it, and that its disk is well"
+READ_FIX = "check its permissions and its disk"
 
 Array = NDArray[Any]
 ITEM_BYTES = {
@@ -36,21 +36,21 @@ INDEX = ".safetensors.index.json"
 PAGE = 4096
 MAX_HEADER_BYTES = 100_000_000
 MIN_DIRECT_BYTES = 1 << 20
-"""Bytes from which a read goes past the page cache."""
+"""Smallest read that bypasses the page cache."""
 DOWNLOAD_FIX = "download or copy the weights again"
 
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """Where the bytes of one tensor are.
+    """Location of one tensor.
 
     Args:
         name: Name in the shard, or of the initializer.
-        file: File that holds it; for messages alone when ``array`` is given.
+        file: File that holds it; only for messages when ``array`` is given.
         offset: First byte in the file.
-        dtype: As safetensors calls it: ``BF16``, ``F32`` ...
+        dtype: Safetensors dtype: ``BF16``, ``F32`` ...
         shape: Sizes of the axes.
-        array: The bytes themselves, (bytes,) uint8, for a tensor that is in memory anyway.
+        array: Bytes of a tensor in memory, (bytes,) uint8.
     """
 
     name: str
@@ -77,7 +77,7 @@ class StoredTensor:
 
 
 def stored_array(name: str, array: Array, file: Path) -> StoredTensor:
-    """Return a tensor that is in memory already."""
+    """Return a stored tensor for an array in memory."""
     raw = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
     return StoredTensor(name, file, 0, NUMPY_NAMES[str(array.dtype)], array.shape, raw)
 
@@ -95,10 +95,10 @@ def shard_files(folder: Path, pattern: str) -> list[Path]:
 
 
 def read_shards(folder: Path, pattern: str) -> dict[str, StoredTensor]:
-    """Read the headers of all shards: name -> where the tensor is, in the order of files and offsets.
+    """Read the headers of all shards: name -> location of the tensor, in the order of files and offsets.
 
     Raises:
-        SourceError: when a shard is missing, cut off or not a safetensors file, or a tensor is there twice.
+        SourceError: when a shard is missing, truncated or not a safetensors file, or a tensor occurs twice.
     """
     files = shard_files(folder, pattern)
     _check_indexes(files)
@@ -115,7 +115,7 @@ def read_shards(folder: Path, pattern: str) -> dict[str, StoredTensor]:
 
 
 def _check_indexes(files: list[Path]) -> None:
-    """Every shard that an index beside the shards names must be there and hold what the index says."""
+    """Check that every shard in an index next to the shards exists and holds the tensors of the index."""
     for index in sorted({path for file in files for path in file.parent.glob(f"*{INDEX}")}):
         try:
             weight_map = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
@@ -132,10 +132,10 @@ def _check_indexes(files: list[Path]) -> None:
 
 
 def read_header(file: Path) -> list[StoredTensor]:
-    """Return what a safetensors file holds, reading its header alone.
+    """Return the tensors of a safetensors file from its header.
 
     Raises:
-        SourceError: naming what is wrong with the file.
+        SourceError: with the fault of the file.
     """
     header, start, size = _header_bytes(file)
     try:
@@ -148,7 +148,7 @@ def read_header(file: Path) -> list[StoredTensor]:
 
 
 def _header_bytes(file: Path) -> tuple[bytes, int, int]:
-    """Return the header, where the data starts, and the size of the file."""
+    """Return the header, the offset of the data, and the size of the file."""
     try:
         with file.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
@@ -185,7 +185,7 @@ def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTe
 
 
 def fingerprint(files: list[Path]) -> str:
-    """Return a SHA-256 over name, size, time of change and header of files: it changes when the weights do."""
+    """Return a SHA-256 over name, size, modification time and header of files: it changes with the weights."""
     digest = hashlib.sha256()
     for file in files:
         state = file.stat()
@@ -197,8 +197,8 @@ def fingerprint(files: list[Path]) -> str:
 def sampled_hash(files: list[Path]) -> str:
     """Return a SHA-256 over name, size, header and the first 4 KiB of every tensor of shards.
 
-    It is the same for a copy elsewhere, and other for retrained weights; a change of single numbers deep inside a
-    tensor can escape it, which hashing all of 13 GB would not, for ten times the time.
+    It is the same for a copy, and different for retrained weights; it can miss a change of single elements deep inside
+    a tensor, which hashing all of 13 GB would not, in ten times the time.
     """
     digest = hashlib.sha256()
     for file in files:
@@ -281,7 +281,7 @@ class Reader:
 
 
 def open_direct(file: Path, flags: int) -> int:
-    """Open a file past the page cache, or, where the file system cannot, through it."""
+    """Open a file for direct I/O where the file system supports it."""
     try:
         return os.open(file, flags | getattr(os, "O_DIRECT", 0), 0o666)
     except OSError as error:

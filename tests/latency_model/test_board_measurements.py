@@ -74,10 +74,10 @@ def test_a_bundle_says_the_work_where_the_report_does_not(report: Callable[..., 
 @pytest.mark.parametrize(
     ("settings", "why"),
     [
-        ({"absent": True}, "its rows do not say what they compute"),
-        ({"engine": "ort_tensorrt"}, "it holds no latency of an engine of this board"),
-        ({"origin": "predicted"}, "it holds no latency of an engine of this board"),
-        ({"ms": math.nan}, "it holds no latency of an engine of this board"),
+        ({"absent": True}, "its rows have no workload"),
+        ({"engine": "ort_tensorrt"}, "it has no latency of an engine of this board"),
+        ({"origin": "predicted"}, "it has no latency of an engine of this board"),
+        ({"ms": math.nan}, "it has no latency of an engine of this board"),
     ],
     ids=["no-work", "other-engine", "predicted", "no-number"],
 )
