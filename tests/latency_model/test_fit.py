@@ -122,8 +122,8 @@ def test_intervals_hold_their_share_of_what_was_left_out(sample: Sample, folds: 
     inside = (np.abs(error) / deviation)[cpu] <= found["calibrated"]["cpu"] + 1e-9
     assert inside.mean() >= LEVEL, "three devices, whose figures lie nearer than those of all"
     everywhere = Scores.for_calibrated(sample, folds)
-    assert found["calibrated"]["cpu"] == everywhere.reach(0)
-    whole = np.abs(error) / deviation <= everywhere.reach(3) + 1e-9
+    assert found["calibrated"]["cpu"] == everywhere.quantile(0)
+    whole = np.abs(error) / deviation <= everywhere.quantile(3) + 1e-9
     assert whole.mean() == pytest.approx(LEVEL, abs=0.05), "all of them, by devices"
 
 
@@ -246,10 +246,10 @@ def test_a_unit_of_few_devices_is_drawn_towards_all() -> None:
         "a unit without figures has those of all"
     )
     many = scored(values, np.append(np.arange(50), 50 + others), units)
-    assert many.reach(2) < 0.3
+    assert many.quantile(2) < 0.3
     assert scores.quantile(2, but=0) == pytest.approx((0.1 + SHRINKAGE_COUNT * 2.0) / (1 + SHRINKAGE_COUNT))
     lone = scored(values[:25], scores.groups[:25], units[:25])
-    assert lone.reach(2, but=0) == math.inf, "nothing is left"
+    assert lone.quantile(2, but=0) == math.inf, "nothing is left"
 
 
 def test_figures_of_one_device_are_no_independent_witnesses() -> None:
@@ -257,20 +257,20 @@ def test_figures_of_one_device_are_no_independent_witnesses() -> None:
     values = np.append(np.full(100, 3.0), np.linspace(0.1, 2.0, 80))
     units = np.zeros(180, int)
     together = scored(values, np.append(np.zeros(100), np.arange(1, 81)), units)
-    assert together.reach(0) < 3.0
+    assert together.quantile(0) < 3.0
     apart = scored(values, np.arange(180), units)
-    assert apart.reach(0) == 3.0
+    assert apart.quantile(0) == 3.0
 
 
 def test_few_draws_widen_the_interval() -> None:
     """Of nine draws, each as likely to be the largest, four fifths of the next are below the eighth."""
     values, units = np.arange(1.0, 10.0), np.zeros(9, int)
-    assert scored(values, np.arange(9), units).reach(0) == 8
+    assert scored(values, np.arange(9), units).quantile(0) == 8
     assert Scores(values, np.arange(9), units, np.arange(9) + 0.0).quantile(0) == 8
     many = Scores(np.repeat(values, 50), np.repeat(np.arange(9), 50), np.zeros(450, int), np.arange(450))
-    assert many.reach(0) == 8
+    assert many.quantile(0) == 8
     plain = Scores(np.arange(1.0, 101.0), np.arange(100), np.zeros(100, int), np.arange(100))
-    assert plain.reach(0) == 81
+    assert plain.quantile(0) == 81
 
 
 @pytest.mark.parametrize("text", ["mine", "[]", '{"about": 1}', None])

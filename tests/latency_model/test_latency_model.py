@@ -153,7 +153,7 @@ def test_a_runtime_with_very_many_figures_counts_where_it_is_asked_about(
     crowded, other = ask(place=orin, runtime="tensorrt", precision="float16"), ask()
     with_all = {each: model.predict([each])[0].ms for each in (crowded, other)}
     assert crowded_runtimes(known.rows) == set()
-    monkeypatch.setattr(module, "CROWD", 17)  # three devices with TensorRT have 18 figures
+    monkeypatch.setattr(module, "MAX_IDLE_FIGURES", 17)  # three devices with TensorRT have 18 figures
     (crowd,) = crowded_runtimes(known.rows)
     assert len(known.process_without([]).rows) == 42
     assert len(known.process_without([crowd]).rows) == 42 - 18

@@ -187,9 +187,9 @@ def test_fewer_threads_are_fewer_cores(one: Callable[..., Point]) -> None:
     whole, half = one().question, one(runtime="ncnn 2t").question
     assert whole is not None
     assert half is not None
-    assert (whole.place.cores, half.place.cores) == (4, 2)
-    assert half.place.peaks["float32"] == pytest.approx(whole.place.peaks["float32"] / 2)
-    assert half.place.setting == "2t 1"
+    assert (whole.compute_unit.cores, half.compute_unit.cores) == (4, 2)
+    assert half.compute_unit.peaks["float32"] == pytest.approx(whole.compute_unit.peaks["float32"] / 2)
+    assert half.compute_unit.setting == "2t 1"
 
 
 def test_int8_of_ncnns_vulkan_is_computed_by_the_processor(one: Callable[..., Point]) -> None:

@@ -19,7 +19,7 @@ Written = Callable[[list[dict[str, str]]], Path]
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch, model: LatencyModel) -> None:
     """The shipped model is the small one, which takes no seconds to read."""
-    monkeypatch.setattr(score, "shipped", lambda: model)
+    monkeypatch.setattr(score, "load_model", lambda: model)
 
 
 def finite(value: object) -> bool:
@@ -140,6 +140,6 @@ def test_a_model_without_a_kind_of_unit_says_so(
     points_file: Path, model: LatencyModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parts = {"processors": model.parts["processors"]}
-    monkeypatch.setattr(score, "shipped", lambda: replace(model, parts=parts))
+    monkeypatch.setattr(score, "load_model", lambda: replace(model, parts=parts))
     with pytest.raises(DataError, match="The latency model has no figures of npu"):
         score_points(points_file, "models")

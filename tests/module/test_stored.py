@@ -141,7 +141,7 @@ def test_weight_only_quantizes_the_blocks_that_are_kept(whole: Bundle, pruned: B
 
 def test_a_choice_without_a_run_reads_nothing(whole: Bundle, tmp_path, monkeypatch):
     held = Held(monkeypatch)
-    monkeypatch.setattr(stage, "RUN_BELOW", 0)
+    monkeypatch.setattr(stage, "MAX_RUN_BYTES", 0)
     (tmp_path / "even").mkdir()
     made = Depth(rank="even", include=STACK).run(whole, tmp_path / "even", Context())
     assert [edit.keep for edit in read_edits(made)] == [(0, 2, 4)]
@@ -259,7 +259,7 @@ def test_modules_of_every_kind_run_from_shards(odd: Bundle, tmp_path):
 
 @pytest.mark.parametrize("limit", [0, 1 << 30])
 def test_stacks_that_go_together_must_be_cut_together(odd: Bundle, tmp_path, monkeypatch, limit):
-    monkeypatch.setattr(stage, "RUN_BELOW", limit)
+    monkeypatch.setattr(stage, "MAX_RUN_BYTES", limit)
     (tmp_path / "out").mkdir()
     with pytest.raises(SourceError, match="IndexError: list index out of range"):
         Depth(keep=(0, 1), include=("first",)).run(odd, tmp_path / "out", Context())

@@ -91,7 +91,7 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
     assert of_parts.protects("trunk2")
     assert of_parts.protects("trunk2.blocks")
     assert not of_parts.protects("trunk3")
-    assert not of_parts.has(("trunk2.blocks",))
+    assert not of_parts.selects(("trunk2.blocks",))
     assert Selection(("trunk2.blocks",), (), PROTECTED, of_parts.parts).selects(("trunk2.blocks",))
     protects = Selection((), (), PROTECTED).protects
     assert protects("model.lm_expert.layers")

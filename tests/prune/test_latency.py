@@ -70,7 +70,7 @@ def deep(policy_dir: Path, tmp_path: Path) -> Bundle:
 
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(latency, "Clock", Counted)
+    monkeypatch.setattr(latency, "LatencyMeter", Counted)
     monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
 
 
@@ -85,7 +85,7 @@ def test_the_target_is_met_and_made_again_without_measuring(
     assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
     assert json.loads(pruned.manifest.made_by["options"]["chosen"])
     exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context())
-    monkeypatch.setattr(latency, "Clock", None)
+    monkeypatch.setattr(latency, "LatencyMeter", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 
 
@@ -120,7 +120,7 @@ def test_a_latency_that_jumps_is_not_called_met(
             whole, others = super().times(pruned)
             return whole, others if self.runs == 1 else [ms * (2.0 if self.runs % 2 else 0.5) for ms in others]
 
-    monkeypatch.setattr(latency, "Clock", Jumping)
+    monkeypatch.setattr(latency, "LatencyMeter", Jumping)
     target = 0.7 * Counted(deep).ms(())
     with pytest.raises(DataError, match="was not met within 4%; measured: "):
         run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "out", Context())
@@ -135,7 +135,7 @@ def test_other_programs_that_slow_all_down_do_not_move_the_target(
             slower = (1.0, 3.0, 1.4, 2.2, 1.8)[(self.runs - 1) % 5]
             return slower * whole, [slower * ms for ms in others]
 
-    monkeypatch.setattr(latency, "Clock", Disturbed)
+    monkeypatch.setattr(latency, "LatencyMeter", Disturbed)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
     pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
@@ -151,7 +151,7 @@ def test_the_luckiest_run_of_the_whole_policy_is_not_what_it_takes(
             drift = [1.02, 0.95, 1.0, 1.01, 1.02][self.runs % 5]
             return drift * whole, [drift * ms for ms in others]
 
-    monkeypatch.setattr(latency, "Clock", Drifting)
+    monkeypatch.setattr(latency, "LatencyMeter", Drifting)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
     pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
@@ -168,7 +168,7 @@ def test_kernels_that_like_some_widths_better_do_not_end_the_search(
             kept = sum(len(edit.keep) for edit in edits)
             return super().ms(edits) * (1.06 if kept % 2 else 1.0)
 
-    monkeypatch.setattr(latency, "Clock", Choosy)
+    monkeypatch.setattr(latency, "LatencyMeter", Choosy)
     clock = Choosy(deep)
     for share in small_or_full((0.65, 0.75), (0.6, 0.65, 0.7, 0.75, 0.8)):
         target = share * clock.ms(())
@@ -191,7 +191,7 @@ def test_one_round_that_was_held_up_is_corrected_by_the_next(
             whole, others = super().times(pruned)
             return whole, [ms * (10.0 if self.runs == 2 else 1.0) for ms in others]
 
-    monkeypatch.setattr(latency, "Clock", HeldUp)
+    monkeypatch.setattr(latency, "LatencyMeter", HeldUp)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
     pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
@@ -294,8 +294,8 @@ def test_the_command_line_predicts_for_a_board_in_a_child(
 def test_a_target_that_a_board_meets_is_refused_before_the_ranking(
     counted: None, deep: Bundle, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(latency, "BoardClock", lambda _, *of: Counted(*of))
-    monkeypatch.setattr(latency, "walks_of", None)
+    monkeypatch.setattr(latency, "LatencyPredictor", lambda _, *of: Counted(*of))
+    monkeypatch.setattr(latency, "trace_walks", None)
     stage = LatencyPruning(target_ms=1e5, board="pi5", **FINE)
     with pytest.raises(RecipeError, match=r"is predicted to take \d.* ms on pi5 already; asked for 100000 ms"):
         stage.change(load_modules(deep), deep, Context())
@@ -304,8 +304,8 @@ def test_a_target_that_a_board_meets_is_refused_before_the_ranking(
 def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     counted: None, deep: Bundle, policy_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(latency, "BoardClock", lambda profile, *of: Counted(*of) if "nuc" in profile.name else None)
-    monkeypatch.setattr(latency, "Clock", None)
+    monkeypatch.setattr(latency, "LatencyPredictor", lambda profile, *of: Counted(*of) if "nuc" in profile.name else None)
+    monkeypatch.setattr(latency, "LatencyMeter", None)
     target = 0.7 * Counted(deep).ms(())
     stage = build_stage("prune.latency", {"target_ms": target, "board": "nuc13", **FINE})
     pruned = run_transform(stage, deep, tmp_path / "out", Context())
@@ -316,7 +316,7 @@ def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     (told,) = predicted_for(exported)
     assert told.startswith("prune.latency chose what stays by predictions for intel-nuc-13-pro (target ")
     assert predicted_for(deep) == ()
-    monkeypatch.setattr(latency, "BoardClock", None)
+    monkeypatch.setattr(latency, "LatencyPredictor", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 
 

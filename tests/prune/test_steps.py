@@ -107,7 +107,7 @@ def test_weights_in_large_shards_are_not_read(sharded: Bundle, tmp_path: Path, m
     read = list[str]()
     monkeypatch.setattr(stored, "read_tensor", lambda _reader, tensor, _dtype: read.append(tensor.name))
     monkeypatch.setattr("vlatool.module.torch_policy.shard_files", lambda *_: read.append("all") or [])
-    monkeypatch.setattr(stage, "RUN_BELOW", 0)
+    monkeypatch.setattr(stage, "MAX_RUN_BYTES", 0)
     (tmp_path / "out").mkdir()
     made = Steps(to=2).run(sharded, tmp_path / "out", Context())
     assert made.manifest.program[1].repeat == 2

@@ -66,7 +66,7 @@ def test_products_of_many_rows_may_be_convolutions(
     operators: Callable[[Bundle], dict[str, int]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(convolutions, "FEWEST", 4)
+    monkeypatch.setattr(convolutions, "MIN_ROWS", 4)
     written = quantized(Bfloat16(convolutions=True))
     assert operators(written)["Conv"] > operators(halved)["Conv"]
     assert drift(written, halved) < drift(halved)

@@ -202,7 +202,7 @@ def test_where_openvino_saturates_the_stage_says_so_and_the_bundle_is_refused(qu
 
 
 def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operators, monkeypatch):
-    monkeypatch.setattr(convolutions, "FEWEST", 4)
+    monkeypatch.setattr(convolutions, "MIN_ROWS", 4)
     options = {"layout": "openvino", "samples": 8, **full_range_or_less()}
     plain = quantized(StaticInt8(**options, activations="uint8"))
     written = quantized(StaticInt8(**options, convolutions=True))

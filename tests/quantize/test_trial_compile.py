@@ -25,7 +25,7 @@ def test_a_file_that_is_refused_is_left_to_the_engine(tmp_path: Path) -> None:
 
 
 def test_a_child_that_is_killed_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_trial_compile, "CODE", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    monkeypatch.setattr(_trial_compile, "CHILD_CODE", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     for engine, title in (("openvino", "OpenVINO"), ("", "ONNX Runtime")):
         with pytest.raises(GraphError, match=f"{title} crashes \\(signal 11\\)") as caught:
             open_in_child(tmp_path / "g.onnx", engine, "int8", "quantize fewer")

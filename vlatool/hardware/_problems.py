@@ -1,4 +1,4 @@
-"""What is wrong in a profile: one line for each field, in words."""
+"""Problems of a profile: one line for each field."""
 
 from __future__ import annotations
 

@@ -163,12 +163,12 @@ class Profile(Strict):
     Args:
         name: As on the command line; lower case, digits and hyphens.
         aliases: Other names that people type for it.
-        model_strings: What the board's firmware or processor calls itself (see ``vlatool.machine.host.matches``).
+        model_strings: Names of the board in its firmware or processor (see ``vlatool.machine.host.matches``).
         memory_gb: Memory in GB (10^9 bytes), shared by CPU and GPU where ``unified``.
-        usable_memory_gb: What is left for a policy beside system, desktop and drivers.
+        usable_memory_gb: Memory left for a policy besides system, desktop and drivers.
         bandwidth_gb_s: Peak memory bandwidth.
         power_w: The most that the board draws.
-        idle_w: What it draws when it does nothing.
+        idle_w: Idle power.
         price_usd: What the board costs, or what it costs to have one of its kind installed (see the note).
         price_usd_per_hour: What an hour of it costs where it is rented: it then is a cloud machine, no board.
         storage: Storage that was tested to boot and to hold a policy.
@@ -177,7 +177,7 @@ class Profile(Strict):
         engines: Engine -> how well it does here, the preferred one first.
         modes: Name -> power mode.
         default_mode: The mode in which the board starts.
-        caveats: What a person should know before trusting a plan for this board.
+        caveats: Caveats of plans for this board.
         sources: Key -> public reference.
     """
 

@@ -69,8 +69,8 @@ class Feedforward(nn.Module):
     """Linear, GELU, linear.
 
     Args:
-        width: Of input and output.
-        hidden: Of the layer between.
+        width: Width of input and output.
+        hidden: Width of the hidden layer.
         approximate: ``"none"`` (exact) or ``"tanh"``.
     """
 
@@ -133,10 +133,10 @@ class EncoderBlock(nn.Module):
     """Pre-norm transformer block: self-attention and a GELU feed-forward, each with a residual.
 
     Args:
-        width: Of the tokens.
-        heads: Of the attention.
-        hidden: Of the feed-forward.
-        approximate: Of the GELU.
+        width: Width of the tokens.
+        heads: Number of attention heads.
+        hidden: Hidden width of the feed-forward.
+        approximate: Approximation of the GELU.
         gains: Whether each branch ends in a learned gain, as in DINOv2.
     """
 

@@ -32,7 +32,7 @@ class Percentile:
     Args:
         percent: 0-100.
         value: The order statistic; NaN when the series is too short to say anything of this percentile.
-        bound: What the percentile of all calls does not exceed, at ``confidence``; NaN as above.
+        bound: Upper bound of the percentile of all calls, at ``confidence``; NaN as above.
         needed: Independent calls from which there is a bound.
         effective_sample_size: Independent calls that the series is worth.
     """
@@ -68,11 +68,11 @@ def percentile(
         samples: In the order in which they were taken, any unit.
         processes: Which process each call was made in; all in one when None.
         percent: Above 0 and below 100.
-        confidence: Of the bound, one-sided.
+        confidence: One-sided confidence of the bound.
         most: Independent calls that the series is worth at most, where something else than the order tells.
 
     Raises:
-        ValueError: when there is no sample, one is not finite, or the percentage is none.
+        ValueError: when there is no sample, one is not finite, or the percentage is invalid.
 
     Example:
         >>> percentile([1.0] * 64, 90).known, percentile([1.0] * 40, 90).known
@@ -103,7 +103,7 @@ def proven_above(
     confidence: float = CONFIDENCE,
     processes: Sequence[int] | None = None,
 ) -> bool:
-    """Say whether a percentile of all calls is above a limit, with confidence: too many of these calls were.
+    """Return whether a percentile of all calls is above a limit, with confidence: too many of these calls were.
 
     Example:
         >>> proven_above([9.0] * 5 + [1.0] * 60, 99, 5.0), proven_above([9.0] * 1 + [1.0] * 60, 99, 5.0)

@@ -30,12 +30,12 @@ DRAWS = 1000
 
 @dataclass(frozen=True)
 class Decision:
-    """What the processes say.
+    """Decision from the processes.
 
     Args:
         verdict: ``pass``, ``fail`` or ``inconclusive``.
         ratio: Candidate over baseline, Hodges-Lehmann centre; 1.1 is a tenth slower.
-        low, high: What it lies between, each bound at the error of one analysis.
+        low, high: Bounds of the ratio, each at the error of one analysis.
         margin: The largest slowdown that passes, a share.
         processes: How many were measured.
         spread: Standard deviation of the log ratios of single processes.
@@ -91,14 +91,14 @@ def judge(
     """Judge the processes that there are.
 
     Args:
-        log_ratios: Of each process, natural logarithm of candidate over baseline.
+        log_ratios: Natural logarithm of candidate over baseline of each process.
         margin: The largest slowdown that passes, a share above -1.
         alpha: Chance of a false verdict of this analysis, on either side.
         sharing: Statistics of which one alone makes a gate fail, while all of them must pass: they share the error of a
             failure, and each may keep that of a pass.
 
     Raises:
-        ValueError: when there is no ratio or one is not finite, or the margin is none.
+        ValueError: when there is no ratio or one is not finite, or the margin is invalid.
     """
     if not margin > -1:
         raise ValueError(f"the margin is {margin}; allowed: above -1")

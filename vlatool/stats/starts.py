@@ -44,7 +44,7 @@ def reduce_counts(lost: int, won: int, pairs: int, size: int) -> tuple[Counts, C
     """Return the counts of ``pairs`` pairs as those of ``size``: with the least drop, and with the largest.
 
     Args:
-        lost, won, pairs: What was seen.
+        lost, won, pairs: Observed counts.
         size: Independent pairs that they are worth, at most ``pairs``.
 
     Example:

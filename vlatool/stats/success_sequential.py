@@ -61,14 +61,14 @@ _GRID = 801
 
 @dataclass(frozen=True)
 class Decision:
-    """What the pairs say.
+    """Decision from the pairs.
 
     Args:
         verdict: ``pass``, ``fail``, ``inconclusive`` or, while more pairs may decide, ``go on``.
         drop: Seen, a share; positive is worse than the baseline. One that ended a comparison early tends to overstate.
-        low, high: What it lies between, each bound with confidence ``1 - alpha`` over all interim analyses.
+        low, high: Bounds of the drop, each with confidence ``1 - alpha`` over all interim analyses.
         limit: The largest drop that passes, a share.
-        lost, won, pairs: What was seen.
+        lost, won, pairs: Observed counts.
         most: Pairs that would have been played without interim analyses.
     """
 
@@ -139,7 +139,7 @@ class Plan:
         """Return ``pass``, ``fail``, ``inconclusive`` or ``go on``, without the interval; see ``judge``.
 
         Raises:
-            ValueError: when no interim analysis has so many pairs, or the counts are none.
+            ValueError: when no interim analysis has so many pairs, or the counts are invalid.
         """
         level = self._level(lost, won, pairs)
         least, largest = reduce_counts(lost, won, pairs, size or pairs)
@@ -159,7 +159,7 @@ class Plan:
             size: Independent pairs that they are worth (``starts.independent``); all of them when None.
 
         Raises:
-            ValueError: when no interim analysis has so many pairs, or the counts are none.
+            ValueError: when no interim analysis has so many pairs, or the counts are invalid.
 
         Example:
             >>> comparison = plan(limit=0.03, most=1000)
@@ -179,7 +179,7 @@ class Plan:
         wherever the comparison ended. It agrees with the verdict: above the limit is fail, not above it is pass.
 
         Raises:
-            ValueError: when no interim analysis has so many pairs, or the counts are none.
+            ValueError: when no interim analysis has so many pairs, or the counts are invalid.
         """
         level = self._level(lost, won, pairs)
         least, largest = reduce_counts(lost, won, pairs, size or pairs)
@@ -227,7 +227,7 @@ def plan(
         futile: Chance of a verdict below which the comparison ends as inconclusive; 0 plays all pairs.
 
     Raises:
-        ValueError: when one of them is none.
+        ValueError: when one of them is invalid.
 
     Example:
         >>> plan(limit=0.01, most=500, tasks=8, analyses=4).interim_analyses
@@ -284,7 +284,7 @@ def exact_p(lost: int, won: int, pairs: int, drop: float) -> float:
     See the head of the module. That of one as small is ``exact_p(won, lost, pairs, -drop)``.
 
     Args:
-        lost, won, pairs: What was seen.
+        lost, won, pairs: Observed counts.
         drop: A share above -1 and below 1.
 
     Example:
@@ -379,7 +379,7 @@ def exact_drop(
 
     Args:
         lost, won, pairs: Counts; pairs from 1.
-        confidence: Of the interval.
+        confidence: Confidence of the interval.
         size: Independent pairs that they are worth (``starts.independent``); all of them when None.
 
     Example:

@@ -159,8 +159,8 @@ def test_gptq_and_awq_lose_less_of_the_product(form, inputs):
     by_error, by_activation = (method(weight, seen, form, METHODS["rtn"]) for method in (gptq, awq))
     assert lost(by_error) < 0.75 * lost(plain)
     assert lost(by_activation) < 0.9 * lost(plain)
-    assert by_activation.inputs is not None
-    assert by_activation.inputs.shape == (inputs,)
+    assert by_activation.input_scale is not None
+    assert by_activation.input_scale.shape == (inputs,)
 
 
 def test_gptq_keeps_the_weights_it_was_given_and_those_of_dead_inputs():
