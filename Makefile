@@ -62,7 +62,7 @@ metaworld: $(BIN)/vlatool  ## install what the sample policies vla-metaworld and
 	@ldconfig -p | grep -q libEGL.so.1 || apt-get install -y -qq $(SYSTEM_PACKAGES) || \
 	  echo "headless rendering needs the system packages $(SYSTEM_PACKAGES)"
 
-test: $(VENV)/.dev  ## run the tests (SET=avx2: as on a processor with AVX2 alone; docs/processors.md)
+test: $(VENV)/.dev  ## run the tests (SET=avx2: as on a processor with AVX2 alone; docs/concepts/processors.md)
 	$(call confine,$(VENV))
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
@@ -72,11 +72,14 @@ soak: $(VENV)/.dev  ## run the tests in their full form: every draw, kill and ca
 coverage: $(VENV)/.dev  ## run the tests with coverage, in about twice the time; below 90 % fails
 	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n auto --dist worksteal
 
-check: $(VENV)/.dev  ## lint, format, types, layers, docs that match the code
+check: $(VENV)/.dev  ## lint, format, types, layers, names, docs that match the code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tests/structure/words.py
+	$(BIN)/python tests/structure/count.py --check
+	$(BIN)/python tests/structure/rooms.py --check
 	$(BIN)/python docs/generate.py --check
 	$(BIN)/python docs/check.py
 
@@ -133,8 +136,10 @@ $(OUT)/foreign/lerobot/.made: tests/validation/foreign/lerobot.txt pyproject.tom
 foreign: $(OUT)/foreign/common/.made $(OUT)/foreign/lerobot/.made  ## seven policies of others through every command, and the guides as written (hours, 15 GB; FOREIGN="--only ppo_mlp")
 	$(PYTHON) tests/validation/foreign/table.py --common $(OUT)/foreign/common --lerobot $(OUT)/foreign/lerobot -o $(OUT)/foreign/made $(FOREIGN)
 
-docs: $(VENV)/.dev  ## write docs/reference from the code
+docs: $(VENV)/.dev  ## write docs/reference, the picture of the rooms and the counts from the code
 	$(BIN)/python docs/generate.py
+	$(BIN)/python tests/structure/rooms.py
+	$(BIN)/python tests/structure/count.py --write
 
 format: $(VENV)/.dev  ## format the code
 	$(BIN)/ruff check --fix .

@@ -18,7 +18,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 PLACES = ("", "vlatool", "tests", "docs")
 """Folders that a path on a page may start from, beside the page's own."""
-GROUPS = {"engines", "profiles", "commands", "sections", "videos"}
+GROUPS = {"control", "engines", "profiles", "commands", "sections", "videos"}
 """Entry point groups that are not packages of vlatool."""
 EVERYWHERE = ("--help", "--trust")
 """Options that every command takes, whether its help lists them or not."""
@@ -89,7 +89,8 @@ def main() -> None:
 def page_paths(root: Path) -> list[Path]:
     """Return the pages that people write; ``docs/reference`` is generated."""
     pages = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "sample_models").glob("*/README.md")]
-    return sorted(page for page in pages if page.parent.name != "reference")
+    validation = (root / "tests/validation").glob("*.md")
+    return sorted(page for page in (*pages, *validation) if page.parent.name != "reference")
 
 
 def pages_named_by_code(root: Path) -> list[str]:

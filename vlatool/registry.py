@@ -23,13 +23,13 @@ PACKAGES = {
     "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
     "sections": "vlatool.render.sections", "losses": "vlatool.training.losses",
     "hints": "vlatool.training.hints", "motion": "vlatool.motion.metrics",
-    "videos": "vlatool.render.videos"}  # fmt: skip
+    "videos": "vlatool.render.videos", "control": "vlatool.runtime.control"}  # fmt: skip
 """Kind -> the package that holds its files, where that has another name."""
 NOUNS = {
     "quantize": "quantization method", "prune": "pruning method", "distill": "distillation method",
     "evaluate": "evaluation", "export": "export target", "sources": "kind of source", "data": "format of recordings",
     "render": "report format", "motion": "metric of motion", "videos": "format of videos",
-    "workers": "launcher of workers",
+    "workers": "launcher of workers", "control": "controller",
 }  # fmt: skip
 _FOREIGN: dict[type, str] = {}
 """Class of another package -> ``kind.name``, once it was loaded."""

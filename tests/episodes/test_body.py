@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.episodes.body import Body, alike, gripper_of
+from vlatool.episodes.body import Body, alike
 from vlatool.motion.measure import measure_episode
 
 ACTION = TensorSpec("action", (1, 2, 4), unit=("m", "m", "m", "1"), labels=("x", "y", "z", "gripper"))
@@ -133,5 +133,5 @@ def test_elements_of_an_action_that_share_a_unit():
     assert alike(TensorSpec("a", (1, 1, 3), unit="rad")) == (0, 1, 2)
     assert alike(TensorSpec("a", (1, 1, 4), unit=("m", "rad", "rad", "1"))) == (1, 2)
     assert alike(TensorSpec("a", (1, 2), kind="discrete", labels=("l", "r"))) == ()
-    assert gripper_of(TensorSpec("a", (1, 1, 2), labels=("x", "Gripper effort"))) == 1
-    assert gripper_of(TensorSpec("a", (1, 1, 2), labels=("left_gripper", "right_gripper"))) is None
+    assert TensorSpec("a", (1, 1, 2), labels=("x", "Gripper effort")).gripper == 1
+    assert TensorSpec("a", (1, 1, 2), labels=("left_gripper", "right_gripper")).gripper is None

@@ -6,9 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
+from _policies import EchoController
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.episodes.disturbed import Seen
+from vlatool.episodes.disturbed import DisturbedController
 
 
 def spec(hz: float) -> PolicySpec:
@@ -16,12 +17,13 @@ def spec(hz: float) -> PolicySpec:
 
 
 def seen(kind: str, strength: float, seed: int = 3, hz: float = 20.0, steps: int = 200) -> list[int]:
-    through = Seen(spec(hz), kind, strength, seed)
+    acting = DisturbedController(EchoController("state"), spec(hz), kind, strength)
+    acting.reset(seed)
     state = np.zeros(1)
     times = []
     for step in range(steps):
         state[0] = step  # an environment may use its arrays again
-        times.append(int(through({"state": state, "further": object()})["state"][0]))
+        times.append(int(acting.act({"state": state, "further": object()})[0]))
     return times
 
 
@@ -42,6 +44,8 @@ def test_dropped_frames_show_the_last_one_again():
 
 @pytest.mark.parametrize("kind", ["delay", "dropped_frames", "light", ""])
 def test_nothing_is_changed_at_strength_0_and_by_other_disturbances(kind: str):
-    through = Seen(spec(20.0), kind, 0.0 if kind in ("delay", "dropped_frames") else 2.0, 1)
+    inner = EchoController("state")
+    acting = DisturbedController(inner, spec(20.0), kind, 0.0 if kind in ("delay", "dropped_frames") else 2.0)
     observation = {"state": np.ones(1)}
-    assert through(observation) is observation
+    acting.act(observation)
+    assert inner.observations[0] is observation

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from _policies import EchoController, NumberedPolicy
 
 from tests._reach import TREMBLES, bundle_of
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.episodes.body import Body
-from vlatool.episodes.disturbed import DELAY, Seen
+from vlatool.episodes.disturbed import DELAY, DisturbedController
 from vlatool.episodes.environment import World
 from vlatool.episodes.jobs import run_jobs
-from vlatool.episodes.late import Late
 from vlatool.episodes.play import EpisodesJob
+from vlatool.runtime.control.late import LateController
 from vlatool.stage.base import Context
 
 STEP = "    def step(self, action):\n"
@@ -71,35 +71,23 @@ def test_an_action_that_is_repeated_is_the_one_that_was_commanded():
             action[:] = 0
             return np.zeros(2), 0.0, False, False, {}
 
-    class Fives:
-        def __init__(self):
-            self.spec = spec
-
-        def infer(self, observation):
-            return SimpleNamespace(chunk=np.full((1, 2), 5.0, np.float32))
-
-        def stopped_after(self, seconds):
-            return pytest.MonkeyPatch.context()
-
-        def reset(self, seed=None):
-            pass
-
-    world, actor, body = World(Eats(), "any", spec), Late(SimpleNamespace(policy=Fives(), execute=1), 3), Body(spec)
+    acting, body = LateController(NumberedPolicy(spec), delay=3), Body(spec)
+    world = World(Eats(), "any", spec)
     body.look({})
     for _ in range(4):
-        action = actor.act({"state": np.zeros(2)})
+        action = acting.act({"t": 5})
         world.step(action)
-        body.acted(action, actor.fresh)
+        body.acted(action, acting.fresh)
         body.look({})
-    np.testing.assert_array_equal(body.track().actions, np.full((4, 2), 5.0))
+    np.testing.assert_array_equal(body.track().actions, [[500, 500.5]] * 4)
 
 
 @pytest.mark.parametrize("buffer", [np.zeros(2), [0.0, 0.0]], ids=["array", "list"])
 def test_an_observation_that_comes_late_is_as_it_was(buffer):
     spec = PolicySpec((TensorSpec("state", (1, 2)),), (TensorSpec("a", (1, 1, 2)),), 20.0, 1)
-    seen = Seen(spec, DELAY, 1.0, 0)
-    told = []
+    acting = DisturbedController(EchoController("state"), spec, DELAY, 1.0)
+    times = []
     for step in range(3):
         buffer[0] = float(step)
-        told.append(float(np.asarray(seen({"state": buffer})["state"])[0]))
-    assert told == [0.0, 0.0, 1.0]
+        times.append(float(acting.act({"state": buffer})[0]))
+    assert times == [0.0, 0.0, 1.0]

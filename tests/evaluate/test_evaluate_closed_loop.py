@@ -9,7 +9,7 @@ import pytest
 
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.data import observations_for
-from vlatool.episodes import controls, play
+from vlatool.episodes import play
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, GraphError, MissingExtra, SourceError, UsageError
@@ -209,16 +209,16 @@ def test_a_worker_that_dies_is_said(int8_bundle, world):
 
 
 def test_an_inference_that_takes_too_long_is_stopped(int8_bundle, monkeypatch):
-    worker = play.Worker(str(int8_bundle.path), "")
     observation = observations_for(int8_bundle, 1)[0]
-    assert worker.queue.act(observation).shape == (2,)
-    worker.queue.reset()
+    jobs = [play.EpisodesJob("", "", "", (), **options) for options in ({}, {"latency_ms": 1e3})]
+    assert [play.Worker(str(int8_bundle.path), "").controller(job).act(observation).shape for job in jobs] == [(2,)] * 2
     monkeypatch.setattr(play, "FIRST_RUN_S", -1.0)
-    monkeypatch.setattr(controls, "FIRST_RUN_S", -1.0)
+    worker = play.Worker(str(int8_bundle.path), "")
+    for job in jobs:
+        with pytest.raises(GraphError, match="takes longer than -1 s, so it was stopped"):
+            worker.controller(job).act(observation)
     with pytest.raises(GraphError, match="takes longer than -1 s, so it was stopped"):
-        worker.queue.act(observation)
-    with pytest.raises(GraphError, match="takes longer than -1 s, so it was stopped"):
-        controls.answers_of(worker.queue.policy)
+        worker.controller(play.EpisodesJob("", "", "", (), control="random"))
 
 
 def test_one_environment_is_open_at_a_time(float_bundle, int8_bundle, world):

@@ -46,6 +46,10 @@ acme = acme_robotics.section
 
 [vlatool.videos]
 strip = acme_robotics.strip
+
+[vlatool.control]
+every-step = acme_robotics.every_step
+halved = acme_robotics.halved
 """
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -123,6 +127,31 @@ def test_its_format_of_videos_is_found_by_the_suffix(run: Run, float_bundle: Bun
     assert "known: gif, mp4, strip" in run(*line, "--video", str(tmp_path / "worst.avi")).stderr
 
 
+def test_its_controller_and_its_wrapper_of_policies_play_episodes(run: Run, float_bundle: Bundle, policy_dir: Path):
+    line = ["evaluate", "closed-loop", str(float_bundle.path), "--policy", str(policy_dir), "--episodes", "2"]
+    told = ok(run(*line, "--controller", "every-step,halved")).replace("\n", " ")
+    assert "with the controller every-step,halved" in told
+    assert "did you mean 'every_step'" in run(*line, "--controller", "every-stop").stderr
+    late = run(*line, "--controller", "every-step", "--latency-in-the-loop")
+    assert (late.returncode, "every-step waits for each inference" in late.stderr) == (2, True)
+
+
+def test_its_controller_acts_as_it_says(run: Run, float_bundle: Bundle):
+    code = (
+        "from vlatool.episodes.play import EpisodesJob, Worker; from vlatool.data import observations_for; "
+        "from vlatool.bundle.bundle import Bundle; "
+        f"path = {str(float_bundle.path)!r}; worker = Worker(path, ''); "
+        "seen = observations_for(Bundle.open(path), 1)[0]; "
+        "made = [worker.controller(EpisodesJob('', '', '', (), controller=names)) for names in "
+        "[(), ('halved',), ('every-step',), ('every-step', 'halved')]]; "
+        "print([[each.act(seen).tolist() for _ in range(2)] for each in made])"
+    )
+    plain, halved, first, both = json.loads(ok(run(code=code)))
+    np.testing.assert_array_equal(halved, np.array(plain) / 2)
+    np.testing.assert_array_equal(first, [plain[0]] * 2)
+    np.testing.assert_array_equal(both, [halved[0]] * 2)
+
+
 def test_optimize_chooses_its_method(run: Run, policy_dir: Path, tmp_path: Path):
     recipe = {"schema": 1, "candidates": {"theirs": [{"quantize.rounded": {"bits": 12}}]}, "search": False}
     (tmp_path / "recipe.yaml").write_text(json.dumps(recipe))
@@ -195,5 +224,5 @@ def test_it_replaces_nothing_of_vlatools_own(run: Run):
 
 def test_the_guide_shows_these_files():
     guide = (ROOT / "docs/guides/add-a-method.md").read_text()
-    for name in ("rounded", "engine", "source", "section"):
+    for name in ("rounded", "engine", "source", "section", "every_step", "halved"):
         assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide

@@ -304,7 +304,9 @@ def test_a_target_that_a_board_meets_is_refused_before_the_ranking(
 def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     counted: None, deep: Bundle, policy_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(latency, "LatencyPredictor", lambda profile, *of: Counted(*of) if "nuc" in profile.name else None)
+    monkeypatch.setattr(
+        latency, "LatencyPredictor", lambda profile, *of: Counted(*of) if "nuc" in profile.name else None
+    )
     monkeypatch.setattr(latency, "LatencyMeter", None)
     target = 0.7 * Counted(deep).ms(())
     stage = build_stage("prune.latency", {"target_ms": target, "board": "nuc13", **FINE})

@@ -1,9 +1,9 @@
-"""What a robot controller does, with nothing but numpy and one engine: load a bundle, act once, say what it cost.
+"""What a robot does, with nothing but numpy and one engine: load a bundle, act once, say what it cost, act late.
 
 Usage: python tests/robot/controller.py BUNDLE [--max-ms 400] [--max-mb 130]
 
-Every package that a robot does not have is blocked, so that an import of one would fail. Prints one line and exits 1
-when a limit is broken.
+Every package that a robot does not have is blocked, so that an import of one would fail. Prints two lines and exits 1
+when a limit is broken, or the controller ``late``, found by its name, does not act as it says.
 """
 
 from __future__ import annotations
@@ -79,6 +79,31 @@ def main() -> None:
     )
     if total_ms > given.max_ms or peak_mb() > given.max_mb:
         sys.exit(f"a limit is broken: {given.max_ms:g} ms, {given.max_mb:g} MB")
+    print(drive_late(policy, golden[0]))
+
+
+def drive_late(policy: Any, observation: Any) -> str:
+    """Act with ``late`` through three chunks, each of an inference that takes two control steps."""
+    import numpy as np
+
+    from vlatool.runtime.control import controller
+    from vlatool.runtime.interface import Controller, Policy
+
+    spec, delay = policy.spec, 2
+    executed = spec.execute or spec.chunk
+    late = controller(policy, ["late"], delay)
+    assert isinstance(policy, Policy)
+    assert isinstance(late, Controller)
+    policy.reset(3)
+    chunks = [policy.infer(observation).chunk for _ in range(3)]
+    late.reset(3)
+    acted = [(late.act(observation), late.fresh) for _ in range(2 * (executed + delay) + 1)]
+    begins = [step for step, (_, fresh) in enumerate(acted) if fresh]
+    assert begins == [0, executed + delay, 2 * (executed + delay)], begins
+    left_out = min(delay, spec.chunk - executed)
+    for step, chunk, first in zip(begins, chunks, (0, left_out, left_out)):  # noqa: B905
+        np.testing.assert_array_equal(acted[step][0], chunk[first])
+    return f"late: {len(acted)} control steps, chunks from {begins}, {sys.modules[type(late).__module__].__file__}"
 
 
 if __name__ == "__main__":

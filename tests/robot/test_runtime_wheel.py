@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import re
@@ -15,6 +16,7 @@ from pathlib import Path
 import pytest
 import tomllib
 
+from vlatool.episodes.play import EpisodesJob, Worker
 from vlatool.errors import InstallationError, install, refuse_two_distributions
 
 ROOT = Path(__file__).parents[2]
@@ -116,11 +118,22 @@ def test_its_files_are_those_of_the_whole_wheel(wheels: dict[str, Path]):
         assert not any("cli" in name for name in names)
 
 
+def test_the_evaluation_plays_with_files_of_the_robots_wheel(wheels: dict[str, Path], float_bundle):
+    worker = Worker(str(float_bundle.path), "")
+    jobs = [EpisodesJob("", "", "", (), latency_ms=latency) for latency in (0.0, 1e3)]
+    played = [inspect.getfile(type(worker.controller(job))) for job in jobs]
+    with zipfile.ZipFile(wheels["vlatool_runtime"]) as wheel:
+        shipped = [wheel.read(Path(file).relative_to(ROOT).as_posix()) for file in played]
+    assert [Path(file).name for file in played] == ["chunked.py", "late.py"]
+    assert shipped == [Path(file).read_bytes() for file in played]
+
+
 @pytest.mark.soak("make robot, which .ci/run calls, does the same")
 def test_a_fresh_python_310_loads_a_bundle_and_acts(robot: Path, int8_bundle):
     done = run(robot, str(ROOT / "tests/robot/controller.py"), str(int8_bundle.path))
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("python 3.10")
+    assert f"{robot.parents[1]}/lib/python3.10/site-packages/vlatool/runtime/control/late.py" in done.stdout
     done = run(robot, "-W", "error", str(ROOT / "tests/robot/alone.py"), str(int8_bundle.path))
     assert done.returncode == 0, done.stderr
     assert str(robot.parents[1]) in done.stdout

@@ -4,15 +4,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from _policies import NumberedPolicy, spec_of
 from _written import MEMORY, SUM, written
 
 from vlatool.errors import UsageError
-from vlatool.runtime import ChunkQueue, Policy, load
+from vlatool.runtime import Action, ChunkQueue, Policy, load
 from vlatool.runtime.program import Program
 
 THREADS, CALLS = 8, 250
@@ -139,12 +139,13 @@ def test_steps_of_a_queue_that_overlap_are_refused(tmp_path: Path):
 def test_every_action_of_a_queue_is_given_once():
     chunks = iter(range(10**6))
 
-    def infer(_: Any) -> Any:
+    def infer(_: Any, *, noise: Any = None) -> Any:
         time.sleep(0)
         first = next(chunks) * 5
-        return SimpleNamespace(chunk=np.arange(first, first + 5, dtype=np.float32)[:, None])
+        return Action(np.arange(first, first + 5, dtype=np.float32)[:, None], (), 0.0, 0, {})
 
-    policy: Any = SimpleNamespace(spec=SimpleNamespace(chunk=5, execute=0), infer=infer, reset=lambda: None)
+    policy = NumberedPolicy(spec_of(chunk=5))
+    policy.infer = infer  # type: ignore[method-assign]
     queue = ChunkQueue(policy)
 
     def act(_: int) -> list[float]:

@@ -151,6 +151,12 @@ class TensorSpec:
         """Return one unit for each element of the last axis."""
         return self.unit if isinstance(self.unit, tuple) else (self.unit,) * self.width
 
+    @property
+    def gripper(self) -> int | None:
+        """The element of an action that is called a gripper, None when there is none, or several."""
+        found = [index for index, label in enumerate(self.labels) if "grip" in label.lower()]
+        return found[0] if len(found) == 1 and self.kind != "discrete" else None
+
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TensorSpec:
         """Build from a mapping as in ``manifest.json`` or ``policy.yaml``.

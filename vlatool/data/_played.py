@@ -12,6 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import DataError
 from vlatool.files.npz import open_npz
+from vlatool.runtime.observation import EncodedObservation
 
 Array = NDArray[Any]
 PLAYED = "data/played.npz"
@@ -24,7 +25,7 @@ BYTES = 64 << 20
 """Of observations beyond ``LEAST``, before they are compressed: large images are kept fewer."""
 
 
-class Encoded(dict[str, Array]):
+class Encoded(EncodedObservation):
     """An observation as the graphs take it, name -> (1, ...): normalised, text as ids."""
 
     begins = True

@@ -32,7 +32,7 @@ class Body:
 
     def __init__(self, spec: PolicySpec) -> None:
         self._hz = float(spec.control_hz)
-        self._alike, self._grip = alike(spec.action), gripper_of(spec.action)
+        self._alike, self._grip = alike(spec.action), spec.action.gripper
         self._told: dict[str, list[Array]] = {name: [] for name in SERIES}
         self._times: list[float] = []
         self._shortest: float | None = None
@@ -156,15 +156,9 @@ def alike(action: TensorSpec) -> tuple[int, ...]:
     """Return the elements of a continuous action that share its most frequent unit, the gripper apart."""
     if action.kind == "discrete":
         return ()
-    grip, units = gripper_of(action), action.units()
+    grip, units = action.gripper, action.units()
     movers = [index for index in range(len(units)) if index != grip]
     if not movers:
         return ()
     most = max((units[index] for index in movers), key=lambda unit: sum(units[index] == unit for index in movers))
     return tuple(index for index in movers if units[index] == most)
-
-
-def gripper_of(action: TensorSpec) -> int | None:
-    """Return the element of an action that is called a gripper, None when there is none, or several."""
-    found = [index for index, label in enumerate(action.labels) if "grip" in label.lower()]
-    return found[0] if len(found) == 1 and action.kind != "discrete" else None

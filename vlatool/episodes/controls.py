@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data import observations_for
-from vlatool.runtime.policy import FIRST_RUN_S, Policy
+from vlatool.runtime.interface import Policy
 
 Array = NDArray[Any]
 CONTROLS = ("random", "constant")
@@ -18,34 +17,30 @@ ASKED = 32
 """Observations that a policy is asked for the actions that its controls play."""
 
 
-def answers_of(policy: Policy) -> Array:
-    """Return the actions that a policy gives on recorded (or synthetic) observations: (M, A) float32, or (M,) int64."""
+def answers_of(policy: Policy, observations: Iterable[Mapping[str, Any]]) -> Array:
+    """Return the actions that a policy gives on observations, all of their chunks: (M, A) float32, or (M,) int64."""
     policy.reset()
-    chunks = []
-    for observation in observations_for(policy.bundle, ASKED):
-        with policy.stopped_after(FIRST_RUN_S):
-            chunks.append(policy.infer(observation).chunk)
+    chunks = [policy.infer(observation).chunk for observation in observations]
     policy.reset()
     return np.concatenate(chunks)
 
 
 class Blind:
-    """Acts as a policy would that sees nothing.
+    """A controller that acts as a policy would that sees nothing.
 
     Args:
         control: ``random``: actions drawn from those that the policy gives (discrete: from all labels);
             ``constant``: always the mean of them (discrete: the most frequent one).
         action: The action of the spec.
         answers: Actions that the policy gives, (M, A) or (M,).
-        seed: Of the draws: that of the episode.
     """
 
-    def __init__(self, control: str, action: TensorSpec, answers: Array, seed: int) -> None:
+    def __init__(self, control: str, action: TensorSpec, answers: Array) -> None:
         self.fresh = True
         self._labels = len(action.labels) if action.kind == "discrete" else 0
         self._answers = answers
         self._constant = self._middle() if control == "constant" else None
-        self._random = np.random.default_rng((seed, 20))
+        self.reset()
 
     def _middle(self) -> Array:
         if self._labels:
@@ -61,4 +56,5 @@ class Blind:
         return np.array(self._answers[self._random.integers(len(self._answers))])
 
     def reset(self, seed: int | None = None) -> None:
-        """Nothing is carried from episode to episode."""
+        """Start a new episode, with draws of this seed."""
+        self._random = np.random.default_rng((seed or 0, 20))

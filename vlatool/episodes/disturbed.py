@@ -1,4 +1,4 @@
-"""Disturbances that the evaluation makes itself, for any environment: observations that come late, or not at all."""
+"""Disturbances that the evaluation makes itself, for any environment: observations arrive late, or not at all."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec
+from vlatool.runtime.interface import Controller
 
 DELAY, DROPPED = "delay", "dropped_frames"
 OWN = (DELAY, DROPPED)
@@ -19,34 +21,43 @@ DROPPED_SHARE, MOST_DROPPED = 0.1, 0.9
 """How many observations are lost at strength 1, and at most."""
 
 
-class Seen:
-    """What of an episode's observations reaches the policy.
+class DisturbedController:
+    """A controller whose observations arrive late, or not at all.
 
     ``delay`` gives each observation some control steps late, the first one until then; ``dropped_frames`` loses each
     with a probability, so that the last one that came is seen again.
 
     Args:
+        controller: The controller that acts.
         spec: Names the inputs and the control rate.
         kind: ``delay``, ``dropped_frames``, or another, which changes nothing here.
         strength: 1 is 50 ms, or a tenth of the observations; 0 nothing.
-        seed: Of the episode, so that every policy loses the same observations.
     """
 
-    def __init__(self, spec: PolicySpec, kind: str, strength: float, seed: int) -> None:
+    def __init__(self, controller: Controller, spec: PolicySpec, kind: str, strength: float) -> None:
+        self._controller, self.fresh = controller, False
         self._names = [tensor.name for tensor in spec.inputs]
-        self._random = np.random.default_rng((seed, 31))
-        late = max(1, round(DELAY_S * strength * spec.control_hz)) if kind == DELAY and strength else 0
+        self._delay = max(1, round(DELAY_S * strength * spec.control_hz)) if kind == DELAY and strength else 0
         self._lost = min(MOST_DROPPED, DROPPED_SHARE * strength) if kind == DROPPED else 0.0
-        self._kept: deque[Mapping[str, Any]] = deque(maxlen=late + 1)
-        self._changes = bool(late or self._lost)
+        self._forget(None)
 
-    def __call__(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return what the policy sees at the step at which this was observed."""
-        if not self._changes:
-            return observation
-        if not self._kept or self._random.random() >= self._lost:
-            self._kept.append({name: _copy(observation[name]) for name in self._names if name in observation})
-        return self._kept[0]
+    def _forget(self, seed: int | None) -> None:
+        self._random = np.random.default_rng((seed or 0, 31))
+        self._observed: deque[Mapping[str, Any]] = deque(maxlen=self._delay + 1)
+
+    def act(self, observation: Mapping[str, Any]) -> NDArray[Any]:
+        """Return the action of the controller for what it is given at the step at which this was observed."""
+        if self._delay or self._lost:
+            if not self._observed or self._random.random() >= self._lost:
+                self._observed.append({name: _copy(observation[name]) for name in self._names if name in observation})
+            observation = self._observed[0]
+        action, self.fresh = self._controller.act(observation), self._controller.fresh
+        return action
+
+    def reset(self, seed: int | None = None) -> None:
+        """Start a new episode; all policies lose the same observations of the same seed."""
+        self._forget(seed)
+        self._controller.reset(seed)
 
 
 def _copy(value: Any) -> Any:

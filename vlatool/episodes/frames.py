@@ -1,4 +1,4 @@
-"""What a policy was given in episodes, kept to train on, and the noise that makes episodes worth training on."""
+"""Recorded inputs of a policy, to train on, and the noise that makes episodes worth training on."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import BEGINS
-from vlatool.runtime.chunks import ChunkQueue
+from vlatool.runtime.interface import Action, Controller, Policy
 from vlatool.runtime.observation import ObservationEncoder
 
 Array = NDArray[Any]
@@ -23,79 +24,77 @@ def file_of(folder: Path, name: str) -> Path:
     return folder / f"{quote(name, safe='')}.npy"
 
 
-class KeepingEncoder(ObservationEncoder):
-    """An encoder that keeps what it encodes, when asked.
+class FrameRecorder:
+    """A policy that records what another one is given, as the graphs take it, when asked.
 
     Args:
-        encode: The policy's own.
+        policy: The policy that infers.
+        encode: The encoder of its observations.
     """
 
-    def __init__(self, encode: ObservationEncoder) -> None:
-        self.names = encode.names
-        self._encode = encode
-        self._kept: list[dict[str, Array]] | None = None
+    def __init__(self, policy: Policy, encode: ObservationEncoder) -> None:
+        self.spec: PolicySpec = policy.spec
+        self._policy, self._encode = policy, encode
+        self._frames: list[dict[str, Array]] | None = None
         self._begins: list[bool] = []
         self._new = True
 
-    def begin(self) -> None:
-        """Note that an episode begins with what is encoded next."""
-        self._new = True
-
-    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Array]:
-        """Encode an observation, as ``ObservationEncoder`` does."""
-        values = self._encode(observation)
-        if self._kept is not None:
-            self._kept.append({name: np.array(value) for name, value in values.items()})
+    def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
+        """Return the next action chunk, as the policy does."""
+        if self._frames is not None:
+            observation = self._encode(observation)
+            self._frames.append({name: np.array(value) for name, value in observation.items()})
             self._begins.append(self._new)
             self._new = False
-        return values
+        return self._policy.infer(observation, noise=noise)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Start a new episode: it begins with the frame that is recorded next."""
+        self._new = True
+        self._policy.reset(seed)
 
     @contextlib.contextmanager
-    def kept(self, folder: Path) -> Iterator[None]:
-        """Keep what is encoded in this block as ``folder/NAME.npy``, (N, ...), and in which rows episodes begin."""
-        self._kept, self._begins = [], []
+    def recording(self, folder: Path) -> Iterator[None]:
+        """Record the inferences of this block as ``folder/NAME.npy``, (N, ...), and in which rows episodes begin."""
+        self._frames, self._begins = [], []
         try:
             yield
             folder.mkdir(parents=True, exist_ok=True)
-            if self._kept:
+            if self._frames:
                 np.save(folder / f"{BEGINS}.npy", np.array(self._begins))
-            for name in self.names if self._kept else ():
-                np.save(file_of(folder, name), np.concatenate([values[name] for values in self._kept]))
+            for name in self._encode.names if self._frames else ():
+                np.save(file_of(folder, name), np.concatenate([frame[name] for frame in self._frames]))
         finally:
-            self._kept = None
+            self._frames = None
 
 
 class Noisy:
-    """Acts as a policy does whose actions are disturbed.
+    """A controller that adds noise to the actions of another one.
 
     Args:
-        queue: Asks the policy.
+        controller: The controller that acts.
+        action: The action of the spec.
         noise: Share of the standard deviation of each element of the action that is added, normally distributed; for
             discrete actions the probability of one drawn from all labels.
         answers: Actions that the policy gives, (M, A) or (M,).
-        seed: Of the draws: that of the episode.
     """
 
-    def __init__(self, queue: ChunkQueue, noise: float, answers: Array, seed: int) -> None:
-        action = queue.policy.spec.action
-        self._queue, self._noise = queue, noise
+    def __init__(self, controller: Controller, action: TensorSpec, noise: float, answers: Array) -> None:
+        self._controller, self._noise = controller, noise
         self._labels = len(action.labels) if action.kind == "discrete" else 0
         self._spread = answers.std(axis=0) * noise
-        self._random = np.random.default_rng((seed, 21))
-
-    @property
-    def fresh(self) -> bool:
-        """Whether the last action was the first of a chunk."""
-        return self._queue.fresh
+        self._random = np.random.default_rng((0, 21))
+        self.fresh = False
 
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the next action: (A,) float32, or a 0-d int64 index."""
-        action = self._queue.act(observation)
+        action, self.fresh = self._controller.act(observation), self._controller.fresh
         if self._labels:
             random = self._random.integers(self._labels)
             return np.asarray(random) if self._random.random() < self._noise else action
         return np.asarray(action + self._random.standard_normal(action.shape) * self._spread, action.dtype)
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin an episode, with noise of this seed."""
-        self._queue.reset(seed)
+        """Start a new episode, with noise of this seed."""
+        self._random = np.random.default_rng((seed or 0, 21))
+        self._controller.reset(seed)

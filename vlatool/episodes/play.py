@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,21 +21,22 @@ from vlatool.accuracy.paired import Outcome
 from vlatool.accuracy.success import Success
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
+from vlatool.data import observations_for
 from vlatool.episodes.body import Body, series_of
-from vlatool.episodes.controls import Array, Blind, answers_of
-from vlatool.episodes.disturbed import OWN, Seen
+from vlatool.episodes.controls import ASKED, Array, Blind, answers_of
+from vlatool.episodes.disturbed import OWN, DisturbedController
 from vlatool.episodes.environment import GUIDE, World, limited
 from vlatool.episodes.faults import named, under_way
 from vlatool.episodes.film import world_of
-from vlatool.episodes.frames import KeepingEncoder, Noisy
-from vlatool.episodes.late import Late
+from vlatool.episodes.frames import FrameRecorder, Noisy
 from vlatool.errors import DataError, require
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
 from vlatool.module.factory import call_factory
 from vlatool.motion.measure import measure_episode
-from vlatool.runtime.chunks import ChunkQueue
-from vlatool.runtime.policy import FIRST_RUN_S, Policy
+from vlatool.runtime.control import controller
+from vlatool.runtime.interface import Controller
+from vlatool.runtime.policy import FIRST_RUN_S, BundlePolicy
 
 ENDED = "ended: "
 """How the progress begins that says how an episode ended: what comes after it in its job may never end."""
@@ -70,6 +71,7 @@ class EpisodesJob:
         disturb: Disturbance of the environment, or of what the policy sees (``episodes/disturbed.py``).
         strength: Of the disturbance; 1 is what an ordinary day brings.
         latency_ms: How late actions come; 0 for at once.
+        controller: Names of the controller and of wrappers; vlatool's own when empty (``vlatool.runtime.control``).
         show: Whether the outcomes hold the path and the actions of each step.
         film: Folder for pictures of the episode, of which there is one then; none are taken when empty.
         timeout_s: Seconds that a call of the environment may take; the limit ``environment_seconds`` when 0.
@@ -86,6 +88,7 @@ class EpisodesJob:
     disturb: str = ""
     strength: float = 1.0
     latency_ms: float = 0.0
+    controller: tuple[str, ...] = ()
     show: bool = False
     film: str = ""
     timeout_s: float = 0.0
@@ -126,41 +129,13 @@ def jobs_for(job: EpisodesJob, tasks: Sequence[str], episodes: int, first_seed: 
     ]
 
 
-class Actor(Protocol):
-    """Who acts in an episode."""
-
-    @property
-    def fresh(self) -> bool:
-        """Whether the last action was the first of a chunk."""
-
-    def act(self, observation: Mapping[str, Any]) -> Array:
-        """Return the action of this control step: (A,) float32, or a 0-d int64 index."""
-
-    def reset(self, seed: int | None = None) -> None:
-        """Begin an episode, with noise of this seed."""
-
-
-class BoundedQueue(ChunkQueue):
-    """A queue whose policy is stopped when an inference takes longer than any that a robot could use."""
-
-    def act(self, observation: Mapping[str, Any]) -> Array:
-        """Return the action of this control step.
-
-        Raises:
-            UsageError, DataError, GraphError: as ``ChunkQueue.act`` does, and when an inference takes too long.
-        """
-        with self.policy.stopped_after(FIRST_RUN_S):
-            return super().act(observation)
-
-
 class Worker:
     """What a child process keeps between jobs: the policy and the environment of the current task."""
 
     def __init__(self, path: str, engine: str) -> None:
-        policy = _opened(Bundle.described(path), engine)
-        self._frames = KeepingEncoder(policy.encode)
-        policy.encode = self._frames
-        self.queue = BoundedQueue(policy)
+        self._bundle = Bundle.described(path)
+        policy = _opened(self._bundle, engine)
+        self.policy = FrameRecorder(policy, policy.encode)
         self._answers: Array | None = None
         self._key: tuple[str, ...] = ()
         self._environment: Any = None
@@ -181,35 +156,36 @@ class Worker:
 
     def play(self, job: EpisodesJob, limit: int = STEP_LIMIT, tell: Tell = lambda *_: None) -> list[Outcome]:
         """Play the episodes of a job; tell of each that it begins."""
-        spec = self.queue.policy.spec
+        spec = self.policy.spec
         os.chdir(self._home)  # an environment before may have changed it, and the next one's file is named from here
-        if job.control or job.noise:
-            self._ask()
+        acting = self.controller(job)
         world = world_of(self.environment(job), job.task, spec, job.film, job.timeout_s)
         self._job = job
-        with self._frames.kept(Path(job.record)) if job.record else contextlib.nullcontext():
+        with self.policy.recording(Path(job.record)) if job.record else contextlib.nullcontext():
             outcomes = []
             for seed in job.seeds:
                 tell(under_way(job.task, seed), None)
-                self._frames.begin()
-                outcomes.append(_episode(world, self._actor(job, seed), spec, job, seed, limit))
+                outcomes.append(_episode(world, acting, spec, job, seed, limit))
                 if len(job.seeds) > 1 and not job.show:
                     tell(f"{ENDED}{json.dumps(to_json(outcomes[-1]))}", None)
             return outcomes
 
-    def _actor(self, job: EpisodesJob, seed: int) -> Actor:
-        """Return who acts: the policy, the policy with noise, or a control that does not look."""
-        if not job.control and not job.noise:
-            late = int(job.latency_ms * self.queue.policy.spec.control_hz / 1e3)
-            return Late(self.queue, late) if late else self.queue
+    def controller(self, job: EpisodesJob) -> Controller:
+        """Return who acts in the episodes of a job: the policy, its actions with noise, or actions that do not look."""
+        spec = self.policy.spec
+        acting: Controller
+        if job.control:
+            acting = Blind(job.control, spec.action, self._policy_answers())
+        else:
+            acting = controller(self.policy, job.controller, int(job.latency_ms * spec.control_hz / 1e3))
         if job.noise:
-            return Noisy(self.queue, job.noise, self._ask(), seed)
-        return Blind(job.control, self.queue.policy.spec.action, self._ask(), seed)
+            acting = Noisy(acting, spec.action, job.noise, self._policy_answers())
+        return DisturbedController(acting, spec, job.disturb, job.strength) if job.disturb in OWN else acting
 
-    def _ask(self) -> Array:
-        """Return what the policy answers to recorded observations; asked once, and before episodes are kept."""
+    def _policy_answers(self) -> Array:
+        """Return what the policy answers to recorded observations; asked once, and before frames are recorded."""
         if self._answers is None:
-            self._answers = answers_of(self.queue.policy)
+            self._answers = answers_of(self.policy, observations_for(self._bundle, ASKED))
         return self._answers
 
     def close(self) -> None:
@@ -219,12 +195,16 @@ class Worker:
             _close(environment, self._job)
 
 
-def _opened(bundle: Bundle, engine: str) -> Policy:
-    """Verify and open a bundle, without its recordings; one that is not exported yet runs in torch."""
+def _opened(bundle: Bundle, engine: str) -> BundlePolicy:
+    """Verify and open a bundle, without its recordings; one that is not exported yet runs in torch.
+
+    An inference that takes longer than any that a robot could use is stopped.
+    """
     bundle.verify(but=RECORDINGS)
     if bundle.manifest.graphs:
-        policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
+        policy = BundlePolicy.open(bundle, engine=engine, threads=1, seed=0)
         policy.warm_up(1)
+        policy.limit_s = FIRST_RUN_S
         return policy
     from vlatool.module.torch_policy import torch_policy
 
@@ -283,32 +263,32 @@ def close(_request: Mapping[str, Any], _tell: Tell) -> None:
     _worker = None
 
 
-def _episode(world: World, queue: Actor, spec: PolicySpec, job: EpisodesJob, seed: int, limit: int) -> Outcome:
+def _episode(world: World, acting: Controller, spec: PolicySpec, job: EpisodesJob, seed: int, limit: int) -> Outcome:
     task = job.task
     with named(task, seed, (job.disturb, job.strength) if job.disturb else None):
         if job.disturb and job.disturb not in OWN:
             world.disturb(job.disturb, job.strength, seed)
         observation, info = world.reset(seed)
-        queue.reset(seed)
-        success, body, seen = Success(), Body(spec), Seen(spec, job.disturb, job.strength, seed)
+        acting.reset(seed)
+        success, body = Success(), Body(spec)
         body.look(info)
-        told, start = told_to(observation, spec), start_of(observation, spec)
+        instruction, start = instruction_of(observation, spec), start_of(observation, spec)
         for step in range(1, limit):
-            action = _acted(queue, seen(observation), f"task '{task}' at seed {seed}, step {step},")
+            action = _action(acting, observation, f"task '{task}' at seed {seed}, step {step},")
             observation, over, info = world.step(action.item() if action.ndim == 0 else action)
             success.look(info)
-            body.acted(action, queue.fresh)
+            body.acted(action, acting.fresh)
             body.look(info)
             if over:
                 track = body.track()
                 series = series_of(track, spec.action) if job.show else {}
                 won = success.at_the_end(task, seed)
-                return Outcome(task, seed, won, step, told, measure_episode(track), body.refused, series, start)
+                return Outcome(task, seed, won, step, instruction, measure_episode(track), body.refused, series, start)
         raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.",
                         "let step() return truncated=True after as many steps as an episode may take")  # fmt: skip
 
 
-def told_to(observation: Mapping[str, Any], spec: PolicySpec) -> str:
+def instruction_of(observation: Mapping[str, Any], spec: PolicySpec) -> str:
     """Return the instruction of an observation; empty for a policy that takes no text, or several."""
     texts = [tensor.name for tensor in spec.inputs if tensor.kind == "text"]
     value = observation[texts[0]] if len(texts) == 1 and texts[0] in observation else ""
@@ -326,10 +306,10 @@ def start_of(observation: Mapping[str, Any], spec: PolicySpec) -> str:
     return digest.hexdigest()[:16]
 
 
-def _acted(queue: Actor, observation: Mapping[str, Any], where: str) -> Array:
+def _action(acting: Controller, observation: Mapping[str, Any], where: str) -> Array:
     """Return the action; an observation that the policy does not take is the environment's."""
     try:
-        return queue.act(observation)
+        return acting.act(observation)
     except DataError as error:
         raise DataError(
             f"The environment, in {where} gives what the policy does not take: {error.message}",

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from vlatool.accuracy.disturbed import worst_record
 from vlatool.accuracy.moved import ADDED, RATIO, STEPS, WORST, pairs_above_none
-from vlatool.evaluate._late import LATE
+from vlatool.evaluate._loop_latency import LOOP_LATENCY
 from vlatool.report import Measurement, Row
 
 LEAST = 1.005
@@ -35,7 +35,7 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
     if steps and _is_more(steps):
         yield f"Over all episodes, it needs {_times(steps.value)} the steps."
     yield from _disturbed(row)
-    latencies = {one.name: item.value for one in rows for item in one.measurements if item.name == LATE}
+    latencies = {one.name: item.value for one in rows for item in one.measurements if item.name == LOOP_LATENCY}
     if latencies:
         late = ", ".join(f"{name} {ms:.3g} ms" for name, ms in latencies.items())
         where = f"predicted for {board}" if board else "measured here"

@@ -23,7 +23,7 @@ from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
 from vlatool.errors import DataError, SourceError, UsageError, instead, nearest
 from vlatool.evaluate._findings import found_wrong
-from vlatool.evaluate._late import late, latency_of
+from vlatool.evaluate._loop_latency import loop_latency, with_latency
 from vlatool.evaluate._names import BASELINE, names_of
 from vlatool.evaluate._player import Player
 from vlatool.evaluate._seen import FIX, seen_in_training
@@ -35,6 +35,7 @@ from vlatool.machine.host import cache_directory, fingerprint
 from vlatool.module.description import read_description
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.report import Report, Row
+from vlatool.runtime.control import layers
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.cache import STREAMS
 from vlatool.stats.starts import distinct_starts
@@ -94,12 +95,17 @@ class ClosedLoop(Measure):
         le=1e6,
         description="seconds that a call of the environment may take; when 0, what policy.yaml says, or 300",
     )
+    controller: tuple[str, ...] = Field(
+        (),
+        description="controller that plays the chunks, and wrappers: chunked, late, or those of other packages, such "
+        "as smooth,late; when not given, late with --latency-in-the-loop, and chunked without",
+    )
     board: str = Field(
         "",
         description="profile whose predicted latency that is; --profile sets it; measured here when empty",
     )
 
-    @field_validator("disturb", mode="before")
+    @field_validator("disturb", "controller", mode="before")
     @classmethod
     def _named(cls, value: Any) -> Any:
         """Names may follow each other with commas, as strengths do."""
@@ -148,11 +154,11 @@ class ClosedLoop(Measure):
             raise UsageError("--limit is the largest drop against a baseline, and none is named.", "add --baseline DIR")
         if self.board and not self.latency_in_the_loop:
             raise UsageError("--board says whose latency counts, and none does.", "add --latency-in-the-loop")
-        if self.control and self.latency_in_the_loop:
-            raise UsageError(
-                f"--latency-in-the-loop is of inferences, and {self.control} actions need none.",
-                "leave --latency-in-the-loop or --control out",
-            )
+        needless = [name for name in ("latency_in_the_loop", "controller") if self.control and getattr(self, name)]
+        for option in (f"--{name.replace('_', '-')}" for name in needless):
+            message = f"{option} is of inferences, and {self.control} actions need none."
+            raise UsageError(message, f"leave {option} or --control out")
+        layers(self.controller, delayed=self.latency_in_the_loop)
         if "strength" in self.options() and not self.disturb:
             raise UsageError("--strength is of disturbances, and none is named.", "add --disturb all")
         jobs = self._jobs(source)
@@ -192,13 +198,13 @@ class ClosedLoop(Measure):
         check_video_of(bundles, jobs[0], context)
         if self.baseline:
             check_opens(bundles, jobs[0], self.engine, context)
-        waits = [latency_of(one, self.board, self.engine, context) if self.latency_in_the_loop else None
-                 for one in bundles]  # fmt: skip
+        latencies = [loop_latency(one, self.board, self.engine, context) if self.latency_in_the_loop else None
+                     for one in bundles]  # fmt: skip
         plays: list[Player] = []
         told_by = [context.about(whose) for whose in self._whose(names)]
-        for one, wait, teller in zip(bundles, waits, told_by, strict=True):
+        for one, latency, teller in zip(bundles, latencies, told_by, strict=True):
             most = sum(len(job.seeds) for job in jobs)
-            plays.append(Player(one, wait, self.engine, teller, most, plays[0] if plays else None))
+            plays.append(Player(one, latency, self.engine, teller, most, plays[0] if plays else None))
         rows: list[Row] = []
         believed, decision = Credibility("unknown"), None
         if self.baseline and self.limit is not None:
@@ -214,20 +220,21 @@ class ClosedLoop(Measure):
         row = compare_success(rows[0], row) if rows else row
         row = with_decision(row, decision) if decision else row
         if kinds:
-            played = [self._disturbed(kinds, late(jobs, wait), one, context, whose)
-                      for one, wait, whose in zip(bundles, waits, self._whose(names), strict=True)]  # fmt: skip
+            played = [self._disturbed(kinds, with_latency(jobs, latency), one, context, whose)
+                      for one, latency, whose in zip(bundles, latencies, self._whose(names), strict=True)]  # fmt: skip
             row = with_disturbed(row, played[-1], played[0] if self.baseline else None)
             context.notes.extend(without_effect(names[-1], played[-1], outcomes))
         again = played_again(jobs[0], [*reference, outcomes], plays, bundles, context)
         if again.outcomes:
             rows, row = [with_episode(rows[0], again.outcomes[0])], with_episode(row, again.outcomes[1])
-        rows = [replace(row, measurements=(*row.measurements, wait)) if wait else row
-                for row, wait in zip([*rows, row], waits, strict=True)]  # fmt: skip
+        rows = [replace(row, measurements=(*row.measurements, latency)) if latency else row
+                for row, latency in zip([*rows, row], latencies, strict=True)]  # fmt: skip
         row = rows[-1]
         count = len(outcomes)
         how = "" if self.instruction == "right" else " told the wrong instruction"
         title = f"{source.manifest.name}{how} in {count} closed-loop episodes"
         how = f" with {self.control} actions in the place of the policy's" if self.control else how
+        how += f" with the controller {','.join(self.controller)}" if self.controller else ""
         text = f"{row.value('success'):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
         decided = (sentence(decision, distinct_starts(row.raw[START])),) if decision else ()
@@ -287,7 +294,8 @@ class ClosedLoop(Measure):
 
     def controls(self) -> list[ClosedLoop]:
         """Return the evaluations that show what succeeds by chance, on the first of the same seeds."""
-        less = {"episodes": self._few(), "baseline": None, "disturb": (), "latency_in_the_loop": False, "limit": None}
+        less = {"episodes": self._few(), "baseline": None, "disturb": (), "latency_in_the_loop": False, "limit": None,
+                "controller": ()}  # fmt: skip
         return [self.model_copy(update={"control": control, **less}) for control in CONTROLS]
 
     def told_wrong(self) -> ClosedLoop:
@@ -361,5 +369,6 @@ class ClosedLoop(Measure):
             if known and task not in known and not self.environment:
                 raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.", instead(task, known))
         timeout = self.environment_timeout or timeout_of(named)
-        job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control, timeout_s=timeout)
+        job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control,
+                          controller=self.controller, timeout_s=timeout)  # fmt: skip
         return jobs_for(job, tasks, self.episodes, self.first_seed)

@@ -157,6 +157,7 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
     try_out(bundle, engine)
     policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
     policy.warm_up(1)
+    policy.limit_s = FIRST_RUN_S
     chunks: list[Array] = []
     for moment in moments_of(recording, indices, keeps=keeps_values(bundle.manifest.program)):
         if len(chunks) % 16 == 0:
@@ -164,7 +165,7 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
         if moment.begins:
             policy.reset()
         answered = off_the_robot(f"sample {moment.number} of {recording.path}", MAKE_OTHERWISE)
-        with answered, policy.stopped_after(FIRST_RUN_S):
+        with answered:
             chunk = policy.infer(moment.observation).chunk
         chunks += [chunk] if moment.counts else []
     return np.stack(chunks)

@@ -1,1 +1,1 @@
-"""Files and directories: read with limits, written whole, never somebody else's."""
+"""Files and directories: bounded reads, atomic writes, and no change to files of other owners."""

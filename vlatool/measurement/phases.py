@@ -41,22 +41,16 @@ def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], secon
     """
     sessions = {name: _Timed(session) for name, session in policy.program.sessions.items()}
     timed = Policy(policy.bundle, Program(policy.program.steps, sessions, seed=0), policy.engine)
-    encode, encoded = timed.encode, []
-
-    def noted(observation: Mapping[str, Any]) -> dict[str, Any]:
-        start = time.perf_counter_ns()
-        values = encode(observation)
-        encoded.append((time.perf_counter_ns() - start) / 1e6)
-        return values
-
-    timed.encode = noted  # type: ignore[assignment]
+    encoded: list[float] = []
     whole: list[float] = []
     end = time.monotonic() + seconds
     for number in range(ACTIONS):
         if number >= FEWEST and time.monotonic() > end:
             break
         start = time.perf_counter_ns()
-        timed.infer(observations[number % len(observations)])
+        values = timed.encode(observations[number % len(observations)])
+        encoded.append((time.perf_counter_ns() - start) / 1e6)
+        timed.infer(values)
         whole.append((time.perf_counter_ns() - start) / 1e6)
     return _phases(whole, encoded, {name: session.taken for name, session in sessions.items()})
 

@@ -10,8 +10,9 @@ from collections.abc import Iterable
 
 from vlatool.errors import refuse_two_distributions
 from vlatool.runtime.arguments import check_load
-from vlatool.runtime.chunks import ChunkQueue
-from vlatool.runtime.policy import FIRST_RUN_S, Action, Policy, refuse_findings
+from vlatool.runtime.control.chunked import ChunkQueue
+from vlatool.runtime.interface import Action
+from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 

@@ -25,6 +25,10 @@ Array = NDArray[Any]
 Encoder = Callable[[Any], Array]
 
 
+class EncodedObservation(dict[str, Array]):
+    """An observation as the graphs take it, name -> (1, ...): normalised, text as ids. ``infer`` takes it as it is."""
+
+
 class ObservationEncoder:
     """Checks an observation against the spec, normalises it and turns text into ids.
 
@@ -41,8 +45,8 @@ class ObservationEncoder:
         self._encoders = [(tensor.name, _encoder(tensor, assets)) for tensor in spec.inputs]
         self._dtypes = {tensor.name: tensor.dtype for tensor in spec.inputs}
 
-    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Array]:
-        """Return one array with a batch axis for each input of the spec.
+    def __call__(self, observation: Mapping[str, Any]) -> EncodedObservation:
+        """Return one array with a batch axis for each input of the spec; those of an encoded observation as they are.
 
         Args:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
@@ -51,7 +55,9 @@ class ObservationEncoder:
             DataError: when an input is missing or has another shape or dtype, or holds what its dtype cannot hold, or
                 NaN or infinity where its spec does not say ``finite: false``.
         """
-        values = {}
+        if isinstance(observation, EncodedObservation):
+            return EncodedObservation(observation)
+        values = EncodedObservation()
         with np.errstate(over="raise"):
             for name, encode in self._encoders:
                 try:

@@ -1,4 +1,4 @@
-"""The policy that a controller holds: ``infer`` and ``reset``."""
+"""An open bundle as a policy: ``infer`` and ``reset``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
 from vlatool.runtime.golden import GOLDEN_STEPS, golden_arrays, golden_chunks, golden_steps
 from vlatool.runtime.graph_files import open_graph
+from vlatool.runtime.interface import Action
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import Program, Session
 
@@ -35,25 +36,7 @@ FIRST_RUN_S = 60.0
 Array = NDArray[Any]
 
 
-class Action(NamedTuple):
-    """What the policy wants the robot to do.
-
-    Args:
-        chunk: (T, A) float32 in the units of the spec, or (T,) int64 indices of discrete actions.
-        labels: For discrete actions, the name of each index; for others, the name of each element.
-        latency_ms: From the call of ``infer`` to this object, in milliseconds.
-        sequence: Number of this inference since the last reset, from 0.
-        outputs: Every output of the spec by name, as the graph gave it (not un-normalised).
-    """
-
-    chunk: Array
-    labels: tuple[str, ...]
-    latency_ms: float
-    sequence: int
-    outputs: Mapping[str, Array]
-
-
-class Policy:
+class BundlePolicy:
     """An open bundle. ``infer`` maps an observation to an ``Action``; ``reset`` starts a new episode.
 
     It may be opened in one thread and used in another. Calls from several threads at once take turns, so that each gets
@@ -77,6 +60,8 @@ class Policy:
         self._sequence = 0
         self._turn = threading.RLock()  # a signal handler may call while this thread has it
         self._busy = False
+        self.limit_s: float | None = None
+        """Seconds that an inference may take before it is stopped; without a limit when None."""
         self.golden_error: float | None = None
         self.golden_chunk_error: float | None = None
 
@@ -89,7 +74,7 @@ class Policy:
         threads: int | None = None,
         seed: int | None = None,
         memory_mb: float | None = None,
-    ) -> Policy:
+    ) -> BundlePolicy:
         """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``."""
         manifest = bundle.manifest
         if not manifest.graphs:
@@ -113,17 +98,20 @@ class Policy:
 
         Args:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
+                An ``EncodedObservation``, which ``encode`` returns, is taken as it is.
             noise: Value name -> float32 array, instead of what the program would draw.
 
         Raises:
             DataError: when the observation or the noise does not fit.
-            GraphError: when the engine fails, or an output or a kept value is not finite or not as declared.
+            GraphError: when the engine fails or takes longer than ``limit_s``, or an output or a kept value is not
+                finite or not as declared.
             UsageError: when another inference of a policy that keeps values is under way, or one of this thread.
         """
         start = time.perf_counter_ns()
         if self._busy:
             self._check_overlap()
-        with self._turn:
+        limit = contextlib.nullcontext() if self.limit_s is None else self._stopped_after(self.limit_s)
+        with self._turn, limit:
             try:
                 self._busy = True
                 if self._direct:
@@ -178,7 +166,7 @@ class Policy:
             self.program.reset(seed)
 
     @contextlib.contextmanager
-    def stopped_after(self, seconds: float) -> Iterator[None]:
+    def _stopped_after(self, seconds: float) -> Iterator[None]:
         """Stop the engine when the inference of this block takes longer.
 
         Raises:
@@ -232,15 +220,18 @@ class Policy:
         errors: list[float] = []
         of_chunks: list[float] = []
         chunks = golden_chunks(self.spec.action, stored, len(steps))
-        for number in range(max(inferences, len(steps))):
-            observation, noise, expected = steps[number % len(steps)]
-            if not number % len(steps):
-                self.reset()
-            with self.stopped_after(first_run_s):
+        limit, self.limit_s = self.limit_s, first_run_s
+        try:
+            for number in range(max(inferences, len(steps))):
+                observation, noise, expected = steps[number % len(steps)]
+                if not number % len(steps):
+                    self.reset()
                 action = self.infer(observation, noise=noise)
-            errors.append(relative_error(action.outputs[self.spec.action.name], expected))
-            if chunks:
-                of_chunks.append(self.chunk_error(action.chunk, chunks[number % len(steps)]))
+                errors.append(relative_error(action.outputs[self.spec.action.name], expected))
+                if chunks:
+                    of_chunks.append(self.chunk_error(action.chunk, chunks[number % len(steps)]))
+        finally:
+            self.limit_s = limit
         self.reset()
         self.golden_error, self.golden_chunk_error = _worst(errors), _worst(of_chunks)
 
@@ -310,6 +301,10 @@ class Policy:
         floats = all(set(graph.precision) <= {FLOAT32} and graph.compute in ("", FLOAT32)
                      for graph in self.bundle.manifest.graphs.values())  # fmt: skip
         return min(FLOAT_ROUNDING, self.golden_tolerances[0]) if floats else self.golden_tolerances[0]
+
+
+Policy = BundlePolicy
+"""The name of the class before ``vlatool.runtime.interface.Policy``, the protocol, was there."""
 
 
 def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:

@@ -25,7 +25,8 @@ from vlatool.machine.risky import risky
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.engines import of_branches
-from vlatool.runtime.policy import Action, Policy, relative_error
+from vlatool.runtime.interface import Action
+from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.sensitivity._switches import add_switches
 from vlatool.stage.base import Context, SampleSet

@@ -22,8 +22,9 @@ from vlatool.runtime.contract import OF_NOT_FINITE, OF_THE_GRAPHS, OF_THE_POLICY
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
+from vlatool.runtime.interface import Action
 from vlatool.runtime.observation import not_finite_text
-from vlatool.runtime.policy import Action, Policy, relative_error
+from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program, draw
 
 GOLDEN = "golden/golden.npz"

@@ -30,6 +30,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 from _policy_trials import EXPORT, METHODS, Outcome, Place, places, trials
 from _random_policies import RandomPolicy
 

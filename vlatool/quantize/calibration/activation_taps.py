@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Encoded, Moment
+from vlatool.data import Moment
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_linked
 from vlatool.graph.onnx_graph import OnnxGraph
@@ -15,7 +15,6 @@ from vlatool.machine.risky import risky
 from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context
@@ -56,17 +55,6 @@ class ActivationTap:
         return {name: values[name] for name in self._outputs}
 
 
-class _PreEncoded(ObservationEncoder):
-    """An encoder that passes encoded observations through."""
-
-    def __init__(self, encode: ObservationEncoder) -> None:
-        self.names, self._encode = encode.names, encode
-
-    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Encode an observation as ``ObservationEncoder`` does, unless it is encoded already."""
-        return observation if isinstance(observation, Encoded) else self._encode(observation)
-
-
 def run_with_taps(
     bundle: Bundle,
     taps: Mapping[str, ActivationTap],
@@ -92,7 +80,6 @@ def run_with_taps(
     graphs = bundle.manifest.graphs
     others = {name: open_graph(bundle, graphs[name], engine_class(), 1) for name in graphs if name not in taps}
     policy = Policy(bundle, Program(bundle.manifest.program, {**others, **taps}, seed=0), DEFAULT_ENGINE)
-    policy.encode = _PreEncoded(policy.encode)
     for index, each in enumerate(observations):
         moment = each if isinstance(each, Moment) else Moment(each, numbers[index] if numbers else index)
         number = moment.number

@@ -1,4 +1,4 @@
-"""How late a bundle's actions come in the loop: as long as an inference takes, here or on a board."""
+"""The latency of a bundle's actions in the control loop: that of an inference, here or on a board."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from vlatool.measurement.jobs import LatencyJob
 from vlatool.report import Measurement
 from vlatool.stage.base import Context
 
-LATE = "latency_in_the_loop"
+LOOP_LATENCY = "latency_in_the_loop"
 CALLS, SECONDS = 50, 2.0
 """Of each bundle, when its latency is measured."""
 
 
-def latency_of(bundle: Bundle, board: str, engine: str, context: Context) -> Measurement:
+def loop_latency(bundle: Bundle, board: str, engine: str, context: Context) -> Measurement:
     """Return how long an inference takes.
 
     Args:
-        bundle: With graphs.
+        bundle: A bundle with graphs.
         board: Profile that it is predicted for; measured on this machine with one thread when empty.
-        engine: Of the runtime; the bundle's own when empty.
-        context: For progress, and what is kept of an interrupted run.
+        engine: Engine of the runtime; the bundle's own when empty.
+        context: Progress, and the results of an interrupted run.
 
     Raises:
         ProfileError: when there is no such board.
@@ -38,9 +38,9 @@ def latency_of(bundle: Bundle, board: str, engine: str, context: Context) -> Mea
         latency = predictions(load_profile(board), bundle, engine)[0]
         if not latency.known:
             raise DataError(f"The latency on {board} cannot be predicted: {latency.note}.", "name another board")
-        return replace(latency, name=LATE)
+        return replace(latency, name=LOOP_LATENCY)
     calls = _calls(bundle, engine, context)
-    return Measurement(LATE, median(calls), "ms", samples=len(calls), note="median, one thread")
+    return Measurement(LOOP_LATENCY, median(calls), "ms", samples=len(calls), note="median, one thread")
 
 
 def _calls(bundle: Bundle, engine: str, context: Context) -> Sequence[float]:
@@ -56,6 +56,6 @@ def _calls(bundle: Bundle, engine: str, context: Context) -> Sequence[float]:
     return calls
 
 
-def late(jobs: list[EpisodesJob], latency: Measurement | None) -> list[EpisodesJob]:
-    """Return the jobs with actions that come so late; as they are without a latency."""
+def with_latency(jobs: list[EpisodesJob], latency: Measurement | None) -> list[EpisodesJob]:
+    """Return the jobs with a latency of their actions; as they are when None."""
     return jobs if latency is None else [replace(job, latency_ms=latency.value) for job in jobs]

@@ -1,4 +1,4 @@
-"""Play an action chunk one control step at a time."""
+"""A controller that waits for each chunk and plays it one control step at a time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import UsageError
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.policy import Policy
+from vlatool.runtime.interface import Policy
 
 
 class ChunkQueue:
@@ -20,7 +20,7 @@ class ChunkQueue:
     Steps that overlap are refused: the actions of one chunk are one robot's. A reset waits for the step under way.
 
     Args:
-        policy: The policy to ask.
+        policy: The policy that infers.
         execute: Actions taken from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
 
     Raises:
@@ -44,7 +44,7 @@ class ChunkQueue:
 
         Raises:
             UsageError: when another step is under way.
-            DataError, GraphError: as ``Policy.infer`` does.
+            DataError, GraphError: as the policy's ``infer`` does.
         """
         if self._owner:
             raise UsageError("A control step begins before the last one has ended.", "make one queue for each thread")
@@ -62,7 +62,7 @@ class ChunkQueue:
         """Forget the pending actions and what the policy carries from step to step.
 
         Args:
-            seed: Of the noise of the new episode; see ``Policy.reset``.
+            seed: Seed of the noise of the new episode; see ``Policy.reset``.
 
         Raises:
             UsageError: when this thread's own step is under way, or as ``Policy.reset`` does.
@@ -71,4 +71,4 @@ class ChunkQueue:
             raise UsageError("The queue is reset within its own step (a signal handler?).", "reset between two steps")
         with self._turn:
             self._pending = []
-            self.policy.reset() if seed is None else self.policy.reset(seed)
+            self.policy.reset(seed)

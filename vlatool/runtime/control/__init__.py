@@ -1,0 +1,70 @@
+"""Controllers and wrappers, one file each: what turns the chunks of a policy into one action for each control step.
+
+The first parameter of an entry says what it wraps, ``policy`` or ``controller``. An entry with ``infer`` is a policy
+again, one with ``act`` a controller. A controller that acts while its policy infers takes ``delay`` as well: the
+control steps that an inference takes.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from typing import Any
+
+from vlatool import registry
+from vlatool.errors import PluginError, UsageError
+from vlatool.runtime.interface import Controller, Policy
+
+KIND, BLOCKING, DELAYED = "control", "chunked", "late"
+
+
+def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
+    """Return the classes around a policy from the inside outwards: its wrappers, a player, wrappers of controllers.
+
+    Args:
+        names: Entries of the kind ``control``; ``chunked``, or ``late``, is added where none of them plays the policy.
+        delayed: Whether the controller is to act while the policy infers.
+
+    Raises:
+        UsageError: when a name is unknown, two of them play the policy, or the one that does cannot be delayed.
+    """
+    entries = {name: registry.load(KIND, name) for name in names}
+    players = [name for name, entry in entries.items() if _layer(entry) == 1]
+    if len(players) > 1:
+        raise UsageError(f"Both {players[0]} and {players[1]} play the chunks of the policy.", "name one of them")
+    player = players[0] if players else DELAYED if delayed else BLOCKING
+    entries[player] = registry.load(KIND, player)
+    if delayed and not _takes(entries[player], "delay"):
+        raise UsageError(f"The controller {player} waits for each inference: its actions cannot come late.",
+                         f"use {DELAYED}, or leave the latency out")  # fmt: skip
+    return sorted(entries.values(), key=_layer)
+
+
+def controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) -> Controller:
+    """Return a controller that acts with a policy: ``chunked``, ``late`` where there is a delay, or what is named.
+
+    Args:
+        policy: The policy that infers.
+        names: Entries of the kind ``control``, each around those before it; wrappers of policies are innermost.
+        delay: Control steps that an inference takes.
+
+    Raises:
+        UsageError: as ``layers`` does.
+        PluginError: when an entry lacks a method of the protocols.
+    """
+    made: Any = policy
+    for entry in layers(names, delayed=delay > 0):
+        made = entry(made, delay=delay) if delay and _takes(entry, "delay") else entry(made)
+        if not isinstance(made, Controller if _layer(entry) else Policy):
+            raise PluginError(f"{entry.__name__}, an entry of vlatool.{KIND}, lacks methods or properties.",
+                              "give it those of a protocol in vlatool/runtime/interface.py")  # fmt: skip
+    return made  # type: ignore[no-any-return]
+
+
+def _layer(entry: type) -> int:
+    """Return 0 for a wrapper of policies, 1 for a player of a policy, 2 for a wrapper of controllers."""
+    return hasattr(entry, "act") * (1 + (not _takes(entry, "policy")))
+
+
+def _takes(entry: type, parameter: str) -> bool:
+    return parameter in inspect.signature(entry).parameters

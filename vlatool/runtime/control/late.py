@@ -1,0 +1,98 @@
+"""A controller that acts while its policy infers: actions arrive as late in the control loop as inferences take."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle.spec import TensorSpec
+from vlatool.runtime.arguments import check_whole
+from vlatool.runtime.interface import Policy
+
+Array = NDArray[Any]
+STOPPABLE_MODES = ("delta", "velocity")
+"""Modes of an action in which 0 stands for no motion."""
+
+
+class LateController:
+    """Acts as a robot does that goes on while its policy infers.
+
+    When the executed part of a chunk is used up, an inference begins with the observation of that step, and its chunk
+    is used from ``delay`` steps later on. The steps until then take what is left of the last chunk, and then hold: no
+    motion where the action is a delta or a velocity (the gripper keeps its command), the last action again otherwise.
+    As many actions of the new chunk are left out as were taken from the last one meanwhile. The first chunk is waited
+    for. ``act`` runs the inference itself and withholds the chunk, so that the actions depend on ``delay`` alone.
+
+    Args:
+        policy: The policy that infers.
+        execute: Actions taken from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
+        delay: Control steps that an inference takes: whole ones, for one that ends within its own step is in time.
+
+    Raises:
+        UsageError: when ``execute`` or ``delay`` is not a whole number from 0.
+    """
+
+    def __init__(self, policy: Policy, execute: int = 0, *, delay: int = 0) -> None:
+        check_whole("execute", execute, 0)
+        check_whole("delay", delay, 0)
+        self._policy, self._delay = policy, delay
+        self._execute = execute or policy.spec.execute or policy.spec.chunk
+        self.fresh = False
+        """Whether the last action was the first of a chunk."""
+        self._forget()
+
+    def _forget(self) -> None:
+        self._pending: list[Array] = []
+        self._rest: list[Array] = []
+        self._coming: Array | None = None
+        self._wait = self._taken = 0
+        self._last: Array | None = None
+
+    def act(self, observation: Mapping[str, Any]) -> Array:
+        """Return the action of this control step: (A,) float32, or a 0-d int64 index.
+
+        Raises:
+            DataError, GraphError: as the policy's ``infer`` does.
+        """
+        if not self._pending and self._coming is None:
+            self._coming = self._policy.infer(observation).chunk
+            self._wait, self._taken = (0 if self._last is None else self._delay), 0
+        self.fresh = self._coming is not None and self._wait == 0
+        if self._coming is not None and self._wait == 0:
+            chunk = list(self._coming[self._taken :])
+            self._pending, self._rest, self._coming = chunk[: self._execute], chunk[self._execute :], None
+        self._last = np.asarray(self._next())
+        return self._last
+
+    def _next(self) -> Array:
+        if self._pending:
+            return self._pending.pop(0)
+        self._wait -= 1
+        if self._rest:
+            self._taken += 1
+            return self._rest.pop(0)
+        return hold(self._policy.spec.action, self._last)
+
+    def reset(self, seed: int | None = None) -> None:
+        """Start a new episode, with noise of this seed."""
+        self._forget()
+        self._policy.reset(seed)
+
+
+def hold(action: TensorSpec, last: Array | None) -> Array:
+    """Return what a robot does that has no action: it stops where an action can say so, and repeats the last otherwise.
+
+    Raises:
+        ValueError: when there is no last action.
+    """
+    if last is None:
+        raise ValueError("there is no action to hold")
+    if action.kind == "discrete" or action.mode not in STOPPABLE_MODES:
+        return last.copy()
+    still = np.zeros_like(last)
+    if (gripper := action.gripper) is not None:
+        still[gripper] = last[gripper]
+    return still

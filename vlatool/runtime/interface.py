@@ -1,0 +1,64 @@
+"""What a control loop calls: a policy, which infers chunks of actions, and a controller, which acts on an observation.
+
+Whatever wraps a policy (records it, changes its actions) is a ``Policy`` itself, and whatever acts with one a
+``Controller``; so wrappers compose in any order, and callers need nothing beside these methods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from numpy.typing import NDArray
+
+from vlatool.bundle.spec import PolicySpec
+
+Array = NDArray[Any]
+
+
+class Action(NamedTuple):
+    """What the policy wants the robot to do.
+
+    Args:
+        chunk: (T, A) float32 in the units of the spec, or (T,) int64 indices of discrete actions.
+        labels: For discrete actions, the name of each index; for others, the name of each element.
+        latency_ms: From the call of ``infer`` to this object, in milliseconds.
+        sequence: Number of this inference since the last reset, from 0.
+        outputs: Every output of the spec by name, as the graph gave it (not un-normalised).
+    """
+
+    chunk: Array
+    labels: tuple[str, ...]
+    latency_ms: float
+    sequence: int
+    outputs: Mapping[str, Array]
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Maps an observation to a chunk of actions; may keep values from inference to inference."""
+
+    @property
+    def spec(self) -> PolicySpec:
+        """What it takes and gives, and the control rate."""
+
+    def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
+        """Return the next action chunk; see ``vlatool.runtime.policy.BundlePolicy.infer``."""
+
+    def reset(self, seed: int | None = None) -> None:
+        """Start a new episode, with noise of this seed; that of the policy when None."""
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """Maps the observation of each control step to one action."""
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the last action was the first of a chunk."""
+
+    def act(self, observation: Mapping[str, Any]) -> Array:
+        """Return the action of this control step: (A,) float32, or a 0-d int64 index of a discrete action."""
+
+    def reset(self, seed: int | None = None) -> None:
+        """Start a new episode, with noise of this seed; that of the policy when None."""
