@@ -109,7 +109,7 @@ def test_a_part_that_is_missing_has_no_answer(model: LatencyModel) -> None:
 def test_a_measurement_on_a_new_board_counts_there(model: LatencyModel) -> None:
     other = replace(CONV, macs=3e9, layers=30)
     before = model.predict([ask(other, NEW)])[0]
-    told = model.conditioned([(ask(CONV, NEW), 4 * model.predict([ask(CONV, NEW)])[0].ms)])
+    told = model.condition([(ask(CONV, NEW), 4 * model.predict([ask(CONV, NEW)])[0].ms)])
     after = told.predict([ask(other, NEW)])[0]
     assert (before.regime, after.regime) == ("unseen", "calibrated")
     assert after.ms > 1.5 * before.ms, "the board is slower than was thought"
@@ -118,20 +118,20 @@ def test_a_measurement_on_a_new_board_counts_there(model: LatencyModel) -> None:
 
 
 def test_a_measurement_is_believed(model: LatencyModel) -> None:
-    told = model.conditioned([(ask(CONV, NEW), 123.0)])
+    told = model.condition([(ask(CONV, NEW), 123.0)])
     assert told.predict([ask(CONV, NEW)])[0].ms == pytest.approx(123.0, rel=0.1)
 
 
 def test_nothing_measured_changes_nothing(model: LatencyModel) -> None:
-    same = model.conditioned([])
+    same = model.condition([])
     assert same.parts == model.parts
     assert same.own == frozenset()
 
 
 def test_what_was_measured_is_taken_in_once(model: LatencyModel) -> None:
-    told = model.conditioned([(ask(CONV, NEW), 123.0)])
-    assert model.conditioned([(ask(CONV, NEW), 123.0)]) is told, "for each bundle that a command predicts"
-    other = model.conditioned([(ask(CONV, NEW), 60.0)])
+    told = model.condition([(ask(CONV, NEW), 123.0)])
+    assert model.condition([(ask(CONV, NEW), 123.0)]) is told, "for each bundle that a command predicts"
+    other = model.condition([(ask(CONV, NEW), 60.0)])
     assert other.predict([ask(CONV, NEW)])[0].ms < told.predict([ask(CONV, NEW)])[0].ms
 
 
@@ -195,7 +195,7 @@ def test_an_npu_that_was_never_published_is_unknown(model: LatencyModel) -> None
     (found,) = model.predict([asked])
     assert (found.regime, found.why) == ("unseen", module.UNKNOWN_NPU)
     assert model.predict([replace(asked, compute_unit=HAILO)])[0].known
-    told = model.conditioned([(asked, 20.0)])
+    told = model.condition([(asked, 20.0)])
     assert told.predict([asked])[0].known, "once it was measured"
 
 

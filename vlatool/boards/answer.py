@@ -81,7 +81,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     asked = replace(asked, execute=spec.executed)
     if asked.hz is None and asked.latency_ms is None:
         asked = replace(asked, hz=spec.control_hz)
-    model = load_model().conditioned(measured_questions(calibration))
+    model = load_model().condition(measured_questions(calibration))
     owned = [board for board in boards if board.price_usd_per_hour is None]
     rented = [board for board in boards if board.price_usd_per_hour is not None]
     context.tell("predicting", None)
@@ -212,7 +212,7 @@ def simulated(
     bundle = opened(source, context)
     spec, load = bundle.manifest.spec, counted(bundle, context)
     candidate = asked if engine or precision else replace(asked, engine=_engine_of(bundle, profile, load))
-    model = load_model().conditioned(measured_questions())
+    model = load_model().condition(measured_questions())
     outcome = outcomes([candidate], load, model)[0]
     if not outcome.latency.known:
         raise DataError(f"{source} on {board}: {outcome.latency.why}.", _fix_of(load))

@@ -82,7 +82,7 @@ class Comparison:
         return self.baseline.ms / self.current.ms if self.baseline is not None else float("nan")
 
     @property
-    def suggested(self) -> Candidate | None:
+    def suggestion(self) -> Candidate | None:
         """The candidate with the largest improvement for the least change; None when none improves enough."""
         fair = [candidate for candidate in self.others if candidate.error <= self.current.error * NEAR_BEST]
         exact = [

@@ -235,7 +235,7 @@ def candidate_row(candidate: Candidate, comparison: Comparison, where: Mapping[s
     role, reason = "subject", ""
     if candidate is comparison.baseline:
         role = "baseline"
-    elif candidate is comparison.suggested:
+    elif candidate is comparison.suggestion:
         role = "chosen"
     if candidate.stage is not None:
         reason = command(candidate.stage, source)
@@ -244,7 +244,7 @@ def candidate_row(candidate: Candidate, comparison: Comparison, where: Mapping[s
 
 def suggestion(comparison: Comparison, source: str) -> list[str]:
     """Return the sentence with the suggested command; none when nothing helps enough."""
-    best = comparison.suggested
+    best = comparison.suggestion
     if best is None or best.stage is None:
         return []
     return [f"Do this: {command(best.stage, source)} ({_effect(best, comparison.current)})."]
@@ -257,7 +257,7 @@ def trial_sentences(comparison: Comparison, worst: Sequence[LayerError]) -> list
         names = ", ".join(f"'{short_names(worst)[layer.name]}'" for layer in worst[: candidate.layers])
         what = candidate.name.partition("without")[0] + (f"exclude {names}" if candidate.layers else "")
         sentences.append(f"Tried: {what}: {_effect(candidate, comparison.current)}.")
-    if comparison.others and comparison.suggested is None:
+    if comparison.others and comparison.suggestion is None:
         sentences.append("None of these helps enough to be suggested: the error is spread over many layers.")
     return sentences
 

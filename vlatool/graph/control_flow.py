@@ -112,7 +112,7 @@ class _Flattener:
         inside = {**names}
         items: list[Item] = []
         for node in nodes:
-            renamed = _renamed(node, inside, prefix)
+            renamed = _rename(node, inside, prefix)
             subgraphs = {item.name: item.g for item in node.attribute if item.HasField("g")}
             is_control = not node.domain and node.op_type in CONTROL_OPS and subgraphs
             if is_control and not (node.op_type == "Scan" and self.opset < MIN_SCAN_OPSET):
@@ -217,7 +217,7 @@ class _Flattener:
         return None if tensor is None else int(np.asarray(helper.to_array(tensor)).reshape(-1)[0])
 
 
-def _renamed(node: Any, names: Mapping[str, str], prefix: str) -> Any:
+def _rename(node: Any, names: Mapping[str, str], prefix: str) -> Any:
     """Return a copy of a node with the names of the flat graph."""
     renamed = copy.deepcopy(node)
     renamed.input[:] = [names.get(name, name) for name in node.input]

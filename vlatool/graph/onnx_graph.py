@@ -64,7 +64,7 @@ class OnnxGraph:
     # ---- types and shapes
 
     @cached_property
-    def inferred(self) -> list[Any]:
+    def value_infos(self) -> list[Any]:
         """``onnx.ValueInfoProto`` of inputs, inferred values and outputs.
 
         Weights take part as inputs of their type and shape: neither their bytes nor protobuf's limit of 2 GiB matter.
@@ -84,13 +84,13 @@ class OnnxGraph:
     @cached_property
     def types(self) -> dict[str, int]:
         """Value -> ``onnx.TensorProto.DataType``; constants are not among them."""
-        return {value.name: value.type.tensor_type.elem_type for value in self.inferred}
+        return {value.name: value.type.tensor_type.elem_type for value in self.value_infos}
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Value or constant -> shape, of those whose shape is fixed."""
         shapes = {name: tuple(tensor.dims) for name, tensor in self.constants.items()}
-        static = ((value.name, static_shape(value.type.tensor_type)) for value in self.inferred)
+        static = ((value.name, static_shape(value.type.tensor_type)) for value in self.value_infos)
         return shapes | {name: shape for name, shape in static if shape is not None}
 
     def float_values(self) -> list[str]:

@@ -115,10 +115,10 @@ class QdqWriter(OnnxGraph):
         if name not in self.dequantized:
             scale = self.activation_scale(name)
             self.nodes.append(self.node("QuantizeLinear", [name, *scale], [f"{name}.q"], f"{name}/quantize"))
-            self.dequantized[name] = self._dequantize(name, [self._bounded(name), *scale])
+            self.dequantized[name] = self._dequantize(name, [self._clip_to_7_bits(name), *scale])
         return self.dequantized[name]
 
-    def _bounded(self, name: str) -> str:
+    def _clip_to_7_bits(self, name: str) -> str:
         """Return the quantized value, clipped to 7 bits even where an observation leaves the calibrated range."""
         quantized = f"{name}.q"
         if name not in self.signed or not self.style.reduce_range:

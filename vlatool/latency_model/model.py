@@ -119,7 +119,7 @@ class LatencyModel:
                 answers[index] = answer
         return answers
 
-    def conditioned(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
+    def condition(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
         """Return the model with a user's measurements added: (question, ms); the same object for the same figures.
 
         Its processes, about a second of work, are therefore built once in a command, for any number of bundles.
@@ -127,10 +127,10 @@ class LatencyModel:
         if not measured:
             return self
         if self._condition_cache is None or self._condition_cache[0] != measured:
-            self._condition_cache = (measured, self._conditioned(measured))
+            self._condition_cache = (measured, self._condition(measured))
         return self._condition_cache[1]
 
-    def _conditioned(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
+    def _condition(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
         parts = dict(self.parts)
         own = set(self.own)
         for part, known in self.parts.items():

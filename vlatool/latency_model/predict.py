@@ -25,7 +25,7 @@ def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Meas
         engine: Engine of the board; when empty, the bundle's own, where the board has that, or its preferred one, where
             it runs such graphs, or another one that does.
     """
-    load, model = workload(bundle), load_model().conditioned(measured_questions())
+    load, model = workload(bundle), load_model().condition(measured_questions())
     engine = engine or engine_for(profile, load, bundle.manifest.engine)
     outcome = outcomes([Candidate(profile, profile.default_mode, engine or profile.engine)], load, model)[0]
     if not engine:

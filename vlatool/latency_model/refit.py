@@ -115,7 +115,7 @@ def one_fold(
         for _ in range(DRAWS):
             known = names[random.integers(len(names))]
             measured = merge_versions(point for point in mine if point.model == known)
-            conditioned = model.conditioned(
+            conditioned = model.condition(
                 [(point.question, float(np.exp(point.log_ms))) for point in measured if point.question]
             )
             answered["calibrated"] += predict_points(conditioned, [point for point in mine if point.model != known])

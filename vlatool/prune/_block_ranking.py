@@ -58,7 +58,7 @@ class BlockRanking:
             reference = [action.numpy() for action in self.actions()]
             errors = {}
             for block in candidates:
-                with self._hooked({*removed, block}, lambda _: _replace_by_identity):
+                with self._forward_hooks({*removed, block}, lambda _: _replace_by_identity):
                     pairs = zip(self.actions(), reference, strict=True)
                     errors[block] = float(np.mean([relative_error(action.numpy(), whole) for action, whole in pairs]))
         return errors
@@ -75,7 +75,7 @@ class BlockRanking:
 
             return record
 
-        with torch.no_grad(), self._hooked(candidates, hook):
+        with torch.no_grad(), self._forward_hooks(candidates, hook):
             for _ in self.actions():
                 pass
         return {block: float(np.mean(shares)) if shares else 0.0 for block, shares in rotations.items()}
@@ -98,14 +98,14 @@ class BlockRanking:
             return scale
 
         total = dict.fromkeys(candidates, 0.0)
-        with self._hooked(candidates, hook):
+        with self._forward_hooks(candidates, hook):
             for slopes in action_gradients(self.actions(), gates):
                 for block, slope in slopes.items():
                     total[block] += float(slope) ** 2
         return total
 
     @contextlib.contextmanager
-    def _hooked(self, blocks: Collection[BlockId], hook: Callable[[BlockId], Any]) -> Iterator[None]:
+    def _forward_hooks(self, blocks: Collection[BlockId], hook: Callable[[BlockId], Any]) -> Iterator[None]:
         handles = [self._blocks[block].register_forward_hook(hook(block), with_kwargs=True) for block in blocks]
         try:
             yield

@@ -195,7 +195,7 @@ class Macs:
                 for (leaves, keepers), macs in walk.terms(product).items():
                     self._add(graph, walk, leaves, keepers, runs[graph] * macs)
 
-    def saved(self, number: int, size: int, sizes: Sequence[int]) -> int:
+    def savings(self, number: int, size: int, sizes: Sequence[int]) -> int:
         """Return the multiply-accumulates saved by reducing one group.
 
         Args:
@@ -213,7 +213,7 @@ class Macs:
 
     def saved_alone(self, number: int, size: int) -> int:
         """Return the multiply-accumulates saved by reducing one group to ``size`` units, with all others whole."""
-        return self.saved(number, size, self._sizes)
+        return self.savings(number, size, self._sizes)
 
     def macs(self, sizes: Sequence[int]) -> int:
         """Return the multiply-accumulates for these numbers of units."""

@@ -93,7 +93,7 @@ class Structured(ModuleStage):
             prices = []
             for number, group in enumerate(groups):
                 cost, removed = group.cheapest_units(self.least)
-                saved = work.saved(number, sizes[number] - len(removed), sizes)
+                saved = work.savings(number, sizes[number] - len(removed), sizes)
                 prices += [(cost / saved, number, removed)] if saved > 0 else []
             if not prices:
                 return

@@ -145,7 +145,7 @@ class Plan:
         least, largest = reduce_counts(lost, won, pairs, size or pairs)
         if _drop(least) > self.limit and exact_p(*least, self.limit) <= level:
             return "fail"
-        if _drop(largest) < self.limit and exact_p(*_swapped(largest), -self.limit) <= level:
+        if _drop(largest) < self.limit and exact_p(*_swap(largest), -self.limit) <= level:
             return "pass"
         return "inconclusive" if pairs == self.most or self._futile(lost, won, pairs) else GO_ON
 
@@ -183,7 +183,7 @@ class Plan:
         """
         level = self._level(lost, won, pairs)
         least, largest = reduce_counts(lost, won, pairs, size or pairs)
-        high = -_lower_bound(*_swapped(largest), level, -self.limit)
+        high = -_lower_bound(*_swap(largest), level, -self.limit)
         return (lost - won) / pairs, _lower_bound(*least, level, self.limit), high
 
     def _level(self, lost: int, won: int, pairs: int) -> float:
@@ -364,7 +364,7 @@ def _drop(counts: Counts) -> float:
     return (lost - won) / pairs
 
 
-def _swapped(counts: Counts) -> Counts:
+def _swap(counts: Counts) -> Counts:
     lost, won, pairs = counts
     return won, lost, pairs
 

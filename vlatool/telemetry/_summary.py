@@ -149,7 +149,7 @@ def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> S
     energies = [_energy(total, samples) for total in totals(series.first for series in samples.values())]
     missing += [energy for energy in energies if isinstance(energy, Absent)]
     missing += [] if energies else [Absent("energy", NO_POWER)]
-    throttled, throttling = _throttled(gauges, counters)
+    throttled, throttling = _throttling(gauges, counters)
     times = [time_s for series in samples.values() for time_s in (series.times[0], series.times[-1])]
     return Summary(
         seconds=max(times) - min(times) if times else 0.0,
@@ -227,7 +227,7 @@ def _trapezoid(times: Sequence[float], watts: Sequence[float]) -> float:
     return sum((after - before) * (first + second) / 2 for (before, after), (first, second) in steps)
 
 
-def _throttled(gauges: Mapping[str, Gauge], counters: Mapping[str, Change]) -> tuple[bool | None, tuple[str, ...]]:
+def _throttling(gauges: Mapping[str, Gauge], counters: Mapping[str, Change]) -> tuple[bool | None, tuple[str, ...]]:
     flags = [(flag.note or name, flag.max) for name, flag in gauges.items() if flag.unit == THROTTLE]
     events = [(event.note or name, event.difference) for name, event in counters.items() if event.unit == THROTTLE]
     if not flags and not events:

@@ -86,7 +86,7 @@ def to_float16(model: Any, kept: set[str]) -> Any:
     converter = build_tool("transformers.float16")
     _copy_shared_constants(model, kept)
     ends = {value.name for value in (*model.graph.input, *model.graph.output)}
-    inferred = [value for value in OnnxGraph(model).inferred if value.name not in ends]
+    inferred = [value for value in OnnxGraph(model).value_infos if value.name not in ends]
     del model.graph.value_info[:]
     model.graph.value_info.extend(inferred)
     narrow = converter.convert_float_to_float16(

@@ -77,7 +77,7 @@ class ValueForms(OnnxGraph):
         if forms is None or forms.rows:
             return
         forms.rows = name
-        value, shape = self.padded(name), self.shapes[name]
+        value, shape = self.padded_form(name), self.shapes[name]
         flat = shape[:-1] == (1, self.row_count(name))
         if self._padding(name):
             bounds = [self.numbers([number]) for number in (0, self.row_count(name), 1)]
@@ -87,7 +87,7 @@ class ValueForms(OnnxGraph):
         if not flat:
             self.append("Reshape", [value, self.numbers(list(shape))], name, f"{name}/shape")
 
-    def padded(self, name: str) -> str:
+    def padded_form(self, name: str) -> str:
         """Return the name of the padded form, (1, M', C); created at its first use."""
         forms = self._form(name)
         if forms.padded:
@@ -113,7 +113,7 @@ class ValueForms(OnnxGraph):
         if not forms.pixels:
             transposed, forms.pixels = f"{name}/turned", f"{name}/pixels"
             shape = [1, self.shapes[name][-1], 1, self.row_count(name) + self._padding(name)]
-            self.append("Transpose", [self.padded(name)], transposed, transposed, perm=[0, 2, 1])
+            self.append("Transpose", [self.padded_form(name)], transposed, transposed, perm=[0, 2, 1])
             self.append("Reshape", [transposed, self.numbers(shape)], forms.pixels, forms.pixels)
         return forms.pixels
 

@@ -161,7 +161,7 @@ class _ConvolutionRewriter(ValueForms):
         if len(leading) != 1 or not self._is_rowwise(node, [name for name in inputs if name not in activations]):
             return False
         padded = self.padded_name(value)
-        copy = self.copy(node, [self.padded(name) if name in activations else name for name in node.input], padded)
+        copy = self.copy(node, [self.padded_form(name) if name in activations else name for name in node.input], padded)
         self._set_last_axis(copy)
         self.forms[value] = FormNames("padded", rows=value if padded == value else "", padded=padded)
         return True

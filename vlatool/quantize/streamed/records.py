@@ -69,7 +69,7 @@ class Record:
     verb: str = "quantized"
 
 
-def aligned(size: int) -> int:
+def round_to_page(size: int) -> int:
     """Return ``size`` rounded up to whole pages."""
     return -(-size // PAGE) * PAGE
 

@@ -23,7 +23,7 @@ from vlatool.quantize.streamed._graph_rewrite import Product, Task
 from vlatool.quantize.streamed._journal import DATA
 from vlatool.quantize.streamed._layer_executor import LayerExecutor, Values
 from vlatool.quantize.streamed.options import WeightOptions
-from vlatool.quantize.streamed.records import Record, Tools, aligned
+from vlatool.quantize.streamed.records import Record, Tools, round_to_page
 from vlatool.quantize.streamed.tensor_jobs import (
     dequantize_record,
     loss_figures,
@@ -59,7 +59,7 @@ def calibrated_records(
         if task.kind == "copy":
             records += records_for(task, stage.block_format, stage.choose, 0.0)
             continue
-        size, fill = aligned(task.size), partial(calibration.fill, number)
+        size, fill = round_to_page(task.size), partial(calibration.fill, number)
         records.append(Record(task.label, size, fill, task.source.count, False))
     return records
 

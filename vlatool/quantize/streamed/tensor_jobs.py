@@ -28,7 +28,7 @@ from vlatool.quantize.streamed._block_quantization import (
     unpack_zero_points,
 )
 from vlatool.quantize.streamed._graph_rewrite import PART_BYTES, Piece, Task, stores_zeros
-from vlatool.quantize.streamed.records import Record, Tools, aligned
+from vlatool.quantize.streamed.records import Record, Tools, round_to_page
 from vlatool.weights.shards import FLOATS, StoredTensor
 
 Array = NDArray[Any]
@@ -82,13 +82,13 @@ def records_for(task: Task, form: BlockFormat, choose: str, tolerance: float) ->
     source = task.source
     if task.kind != "copy":
         job = Job(task, form, choose, tolerance)
-        return [Record(task.label, aligned(task.size), job, source.count, source.array is None)]
+        return [Record(task.label, round_to_page(task.size), job, source.count, source.array is None)]
     width = COPY_ITEM_BYTES.get(task.dtype) or source.item_bytes
     step, records = PART_BYTES // width, []
     for first in range(0, max(source.count, 1), step):
         count = min(step, source.count - first)
         job = Job(task, form, choose, tolerance, first, count)
-        records.append(Record(task.label, aligned(count * width), job, count, source.array is None, "copied"))
+        records.append(Record(task.label, round_to_page(count * width), job, count, source.array is None, "copied"))
     return records
 
 

@@ -25,7 +25,7 @@ from vlatool.quantize.streamed._graph_rewrite import (
 from vlatool.quantize.streamed._weightless_export import GraphTemplate
 from vlatool.quantize.streamed.graph_templates import BLOCKED_OPSET
 from vlatool.quantize.streamed.options import WeightOptions
-from vlatool.quantize.streamed.records import aligned
+from vlatool.quantize.streamed.records import round_to_page
 
 Entry = tuple[Any, Task, "Product | str"]
 """Key of a tensor in its form, its task, and the product or initializer that uses it."""
@@ -91,9 +91,9 @@ class WeightsPlan:
 def task_bytes(task: Task) -> int:
     """Return the size of a task's result in the file."""
     if task.kind != "copy" or not task.source.count:
-        return aligned(task.size)
+        return round_to_page(task.size)
     whole, rest = divmod(task.size, PART_BYTES)
-    return whole * PART_BYTES + aligned(rest)
+    return whole * PART_BYTES + round_to_page(rest)
 
 
 def make_plan(templates: dict[str, GraphTemplate], stage: WeightOptions, bundle: Bundle, file: str) -> WeightsPlan:
