@@ -174,8 +174,8 @@ def test_a_stack_that_graphs_share_is_cut_once(source_bundle: Bundle):
     ({"keep": "0,4"}, r"names block 4; trunk \(4\) has the blocks 0 to 3"),
     ({"keep": "-1"}, "names block -1"),
     ({"keep": "3,2,1,0"}, "names all blocks"),
-    ({"keep": "0", "blocks": 2}, "--blocks would say so again"),
-    ({"keep": "0", "ratio": 0.25, "rank": "even"}, "--ratio and --rank would"),
+    ({"keep": "0", "blocks": 2}, "--keep excludes --blocks"),
+    ({"keep": "0", "ratio": 0.25, "rank": "even"}, "--keep excludes --ratio and --rank"),
     ({"keep": "0", "include": ("*",)}, r"these differ: trunk \(4\), more \(3\)"),
     ({"rank": "even", "ratio": 0.1}, "--ratio 0.1 removes no block"),
 ])  # fmt: skip
@@ -210,7 +210,7 @@ def test_a_block_that_changes_shapes_is_named(source_bundle: Bundle):
             self.head = nn.Linear(18, 8)
 
     assert observations_for(source_bundle, 1)
-    with pytest.raises(SourceError, match=r"A block gives \[1, 17\] for \[1, 16\]"):
+    with pytest.raises(SourceError, match=r"A block maps \[1, 16\] to \[1, 17\]"):
         Depth(samples=1).change({"main": Grown().eval()}, source_bundle, Context())
 
 

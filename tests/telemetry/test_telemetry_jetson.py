@@ -275,7 +275,7 @@ def test_tegrastats_is_asked_for_one_line_and_may_fall_silent() -> None:
     assert read(found)["tegrastats.VDD_IN"] == 16.321
     answers.clear()
     assert read(found) == {}
-    assert "no line" in reason(TegrastatsReader.open(run=commands({})))
+    assert "prints nothing" in reason(TegrastatsReader.open(run=commands({})))
 
 
 @pytest.mark.parametrize(
@@ -305,4 +305,4 @@ def test_the_power_mode_is_a_number_with_its_name() -> None:
 def test_a_copied_tree_runs_no_command_here(tmp_path: Path) -> None:
     root = write(tmp_path, VM)
     assert "no mode" in reason(NvpmodelReader.open(root))
-    assert "no line" in reason(TegrastatsReader.open(root))
+    assert "prints nothing" in reason(TegrastatsReader.open(root))
