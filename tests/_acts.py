@@ -20,7 +20,7 @@ for fd in map(int, os.listdir("/proc/self/fd")):
 """
 NONSENSE = "answered nonsense"
 FORGES = {
-    "mute": ("class X(Exception):\n    def __str__(self): raise ValueError()\nraise X()", "its text cannot be told"),
+    "mute": ("class X(Exception):\n    def __str__(self): raise ValueError()\nraise X()", "its text cannot be read"),
     "mute base": ("class X(BaseException):\n    def __str__(self): raise ValueError()\nraise X()", "raised X"),
     "verdict": ("import vlatool.errors as e; raise e.GateFailed('slow', '')", "raised GateFailed: slow"),
     "base": ("import vlatool.errors as e; raise e.VlatoolError('x', 'y')", "raised VlatoolError: x"),

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, isa
-from vlatool.machine.instruction_sets import RUNGS, SATURATING, computed_in, rung
+from vlatool.machine.instruction_sets import RUNGS, SATURATING, openvino_set, rung
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN, engine_class
 
@@ -85,4 +85,4 @@ def lacks(need: str, reason: str) -> str:
     """
     if NEEDS[need]():
         return ""
-    return f"needs {need}, and OpenVINO computes in {computed_in() or 'no x86 set'} here: {reason}"
+    return f"needs {need}, and OpenVINO computes in {openvino_set() or 'no x86 set'} here: {reason}"

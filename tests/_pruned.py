@@ -13,7 +13,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from vlatool.module.axes import Member, Walk
-from vlatool.module.cut import RETRACE, cut, traced
+from vlatool.module.unit_removal import RETRACE, remove_units, trace_module
 from vlatool.prune._selection import Selection
 from vlatool.prune._unit_groups import Rank, UnitGroup, find_groups, rank_units
 from vlatool.prune.structured import Structured
@@ -69,11 +69,11 @@ def check_pruned(
         rank: How units are ranked.
         ratio: Share of the work that is to go.
     """
-    walks = {"main": Walk(traced(module.eval(), feeds))}
+    walks = {"main": Walk(trace_module(module.eval(), feeds))}
     groups = find_groups(walks, Selection((), ()), 2, what)
     rank_units(groups, rank, {"main": module}, None, 0)  # type: ignore[arg-type]
     done = Structured(ratio=ratio, multiple=2, least=0.2).choose(walks, groups, {"main": 1}, Context())
-    small = cut(copy.deepcopy(module), feeds, done.edits) if done.edits else module
+    small = remove_units(copy.deepcopy(module), feeds, done.edits) if done.edits else module
     silent = silenced(module, groups)
     others = [[_other(feed, size) for feed in feeds] for size in ((1,) if hasattr(small, RETRACE) else (1, 3))]
     with torch.no_grad():

@@ -206,7 +206,7 @@ def recorded(count: int, seed: int = 0, *, episodes: bool = True) -> dict[str, n
 def recurrent_bundle(folder: Path, kind: str, **options) -> Bundle:
     """Make the source bundle of such a policy."""
     policy = write_recurrent(folder, kind, **options)
-    trust.name(policy)
+    trust.allow(policy)
     return run_transform(TorchModule(policy=policy), None, folder.parent / f"{folder.name}-source", Context())
 
 

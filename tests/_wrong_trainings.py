@@ -214,7 +214,7 @@ ROWS = [
     Row("a full disk at the recordings", "No space left on device", 3,
         lambda at: at.unwritable("vlatool.training.rounds.new_array")),
     Row("a full disk at the labels", "No space left on device", 3,
-        lambda at: at.unwritable("vlatool.training.session.label")),
+        lambda at: at.unwritable("vlatool.training.session.write_labels")),
     Row("a full disk at the bundle", "the disk is full", 3,
         lambda at: at.unwritable("vlatool.module.stage.write_module")),
     Row("a full disk at the report", "the disk is full", 3,
@@ -319,5 +319,5 @@ ROWS = [
 def place(root: Path, monkeypatch: pytest.MonkeyPatch, fixture: Callable[[str], Any]) -> Workshop:
     """Return where they are made."""
     monkeypatch.setenv("VLATOOL_CACHE", str(root / "cache"))
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
     return Workshop(root, fixture("policy_template"), fixture("pruned_once"), monkeypatch)

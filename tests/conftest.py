@@ -53,6 +53,12 @@ MEASURED_ON = (
     ("hailo-8l", "npu", "hailort", "int8", 3.5), ("core-ultra-7-155H", "npu", "openvino-npu", "int8", 3.0),
 )  # fmt: skip
 """Device, class, runtime, precision, and 10^12 operations that it does in a second."""
+LONG = frozenset({
+    "test_broken_policies.py", "test_claims_accuracy.py", "test_claims_of_episodes.py", "test_confined.py",
+    "test_distill_shards.py", "test_dying_engine.py", "test_kill9_small.py", "test_pipeline.py", "test_plugins.py",
+    "test_rebuild.py", "test_workers_ray.py",
+})  # fmt: skip
+"""Files with a test or a fixture that takes ten seconds or more of a core; they begin first, so that none is last."""
 
 
 def published_rows() -> list[dict[str, str]]:
@@ -88,6 +94,14 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ[VARIABLE] = "1"
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in the background
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the long tests: a worker that begins one at the end keeps all others waiting.
+
+    pytest-randomly has shuffled the tests before; the order is otherwise kept.
+    """
+    items.sort(key=lambda item: item.path.name not in LONG)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -150,7 +164,7 @@ def source_bundle(policy_template: Path) -> Bundle:
     """The source bundle of the tiny policy; read only."""
     from vlatool.sources.torch_module import TorchModule
 
-    trust.name(policy_template)  # as making the bundle does, in the process that makes it
+    trust.allow(policy_template)  # as making the bundle does, in the process that makes it
     return made_once("source", TorchModule(policy=policy_template), None)
 
 

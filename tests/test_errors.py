@@ -6,7 +6,7 @@ import pytest
 
 from tests._raised import made, made_in
 from vlatool import errors
-from vlatool.errors import MissingExtra, VlatoolError, instead, nearest, require
+from vlatool.errors import MissingExtra, VlatoolError, fix_for, require, suggest
 
 EXIT_CODES = {
     "VlatoolError": 70,
@@ -85,19 +85,19 @@ def test_an_error_without_a_remedy_is_found(source, without):
 
 
 def test_instead_names_what_is_near_or_says_what_there_is():
-    assert instead("proprioo", ["image", "proprio"]) == "write 'proprio'"
-    assert instead("xyz", ["proprio"]) == "write 'proprio'"
-    assert instead("xyz", ["proprio", "image"]) == "choose one of those that are known"
-    assert instead("xyz", []) == "leave it out: there is none to choose from"
+    assert fix_for("proprioo", ["image", "proprio"]) == "write 'proprio'"
+    assert fix_for("xyz", ["proprio"]) == "write 'proprio'"
+    assert fix_for("xyz", ["proprio", "image"]) == "choose one of those that are known"
+    assert fix_for("xyz", []) == "leave it out: there is nothing to choose from"
 
 
 def test_nearest_puts_the_likely_name_first():
-    assert nearest("proprioo", ["image", "proprio"]) == "did you mean 'proprio'? known: image, proprio"
+    assert suggest("proprioo", ["image", "proprio"]) == "did you mean 'proprio'? known: image, proprio"
 
 
 def test_nearest_lists_what_is_known_when_nothing_is_near():
-    assert nearest("xyz", ["proprio", "image"]) == "known: image, proprio"
-    assert nearest("xyz", []) == "known: none"
+    assert suggest("xyz", ["proprio", "image"]) == "known: image, proprio"
+    assert suggest("xyz", []) == "known: none"
 
 
 def test_require_gives_the_module():

@@ -72,6 +72,11 @@ class Workshop(Place):
         folder = self.policy(*swap)
         return Path(shutil.copyfile(self.float / "graphs/main.onnx", folder / "tiny.onnx"))
 
+    def checkpoint(self) -> Path:
+        """What another library saves."""
+        self.file("act/config.json", "{}")
+        return self.file("act/model.safetensors", b"").parent
+
     def bundle(
         self, file: str = "", content: bytes | Callable[[bytes], bytes] = b"", *, sealed: bool = False, of: str = "int8"
     ) -> Path:
@@ -390,7 +395,12 @@ SOURCES = [
     Row("an empty ONNX file", "its graph has no nodes", 3, lambda at: ["quantize", at.file("a.onnx", ""), *at.to]),
     Row("an ONNX file that lacks an input", "The ONNX file has no 'frames'", 3,
         lambda at: ["quantize", at.onnx("name: image", "name: frames"), *at.to]),
-    Row("a source without a description", "No such file", 3, lambda at: ["optimize", at.place, *at.to, *PLAN]),
+    Row("a source without a description", "is not a bundle ... no source of policies reads it (found: nothing)", 3,
+        lambda at: ["optimize", at.place, *at.to, *PLAN]),
+    Row("a bundle for a policy", "is a bundle; the policy that it was made from is needed", 3,
+        lambda at: ["optimize", at.float, *at.to, *PLAN]),
+    Row("a checkpoint of another library", "(found: config.json, model.safetensors); it looks like", 3,
+        lambda at: ["quantize", at.checkpoint(), *at.to]),
     Row("a description that is not YAML", "is not valid YAML", 3,
         lambda at: ["export", at.policy("schema: 1", "schema: [1"), *at.to]),
     Row("an unknown key", "unknown key 'sorce'; did you mean 'source'", 3,

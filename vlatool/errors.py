@@ -1,4 +1,4 @@
-"""The tree of user faults: what was wrong, what to do, and the exit code.
+"""The hierarchy of errors: what is wrong, how to fix it, and the exit code.
 
 VlatoolError                 70  our bug, unless a subclass says otherwise
 ├── UsageError                2  an invalid command line or call
@@ -31,22 +31,22 @@ from pathlib import Path
 from types import ModuleType
 from typing import ClassVar
 
-HERE = Path(__file__).parent
-DISTRIBUTION = "vlatool" if (HERE / "cli").is_dir() else "vlatool-runtime"
-"""What pip calls this installation: all of vlatool, or what a robot needs alone, which has no command line."""
+PACKAGE = Path(__file__).parent
+DISTRIBUTION = "vlatool" if (PACKAGE / "cli").is_dir() else "vlatool-runtime"
+"""Name of this distribution for pip: all of vlatool, or only what a robot needs, without a command line."""
 
 
 class VlatoolError(Exception):
     """Base of every error that vlatool raises on purpose.
 
     Args:
-        message: What was wrong, what was got and what is allowed; one or two sentences.
-        fix: What the person can do next; the remedy of the class when empty.
+        message: problem, with what was received and what is allowed, in one or two sentences.
+        fix: what the user can do next; the remedy of the class when empty.
     """
 
     exit_code = 70
     remedy: ClassVar[str] = ""
-    """What helps wherever an error of this class is raised; empty where that depends on the place, which says it."""
+    """Fix for errors of this class that name none of their own; empty where each error has its own."""
 
     def __init__(self, message: str, fix: str = "") -> None:
         super().__init__(message)
@@ -57,7 +57,7 @@ class VlatoolError(Exception):
         return f"{self.message}\n  fix: {self.fix}" if self.fix else self.message
 
     def __reduce__(self) -> tuple[type[VlatoolError], tuple[str, str]]:
-        """Pickle both parts, so that an error crosses a process border unchanged."""
+        """Pickle message and fix, so that an error passes between processes unchanged."""
         return type(self), (self.message, self.fix)
 
 
@@ -145,61 +145,61 @@ class FallsShort(VlatoolError):
     exit_code = 5
 
 
-NOT_MADE = (3, 4, 5)
-"""Exit codes of errors that say that something cannot be made of a policy; where others are tried, these go on."""
+NOT_POSSIBLE = (3, 4, 5)
+"""Exit codes of errors that rule out one candidate; a search goes on with the others."""
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return part of a sentence that lists what is known, with the nearest name first.
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Return a part of a sentence that lists the known names, after the most similar one.
 
     Example:
-        >>> nearest("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
+        >>> suggest("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
         "did you mean 'raspberry-pi-5'? known: jetson-orin-nano, raspberry-pi-5"
     """
     names = sorted(known)
-    hit = _near(name, names)
+    hit = _closest(name, names)
     listing = "known: " + (", ".join(names) if names else "none")
     return f"did you mean '{hit}'? {listing}" if hit else listing
 
 
-def instead(name: str, known: Iterable[str]) -> str:
-    """Return what to do about a name that is not known, beside a message with what ``nearest`` says of it.
+def fix_for(name: str, known: Iterable[str]) -> str:
+    """Return the fix for an unknown name, to go with a message that uses ``suggest``.
 
     Example:
-        >>> instead("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
+        >>> fix_for("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
         "write 'raspberry-pi-5'"
     """
     names = sorted(known)
-    if hit := _near(name, names):
+    if hit := _closest(name, names):
         return f"write '{hit}'"
     if len(names) == 1:
         return f"write '{names[0]}'"
-    return "choose one of those that are known" if names else "leave it out: there is none to choose from"
+    return "choose one of those that are known" if names else "leave it out: there is nothing to choose from"
 
 
-def _near(name: str, names: list[str]) -> str:
-    """Return the name that is most like another one, empty where none is."""
+def _closest(name: str, names: list[str]) -> str:
+    """Return the most similar name, empty where none is similar."""
     return next(iter(difflib.get_close_matches(name, names, n=1)), "")
 
 
-def install(extra: str, distribution: str = DISTRIBUTION) -> str:
+def pip_install(extra: str, distribution: str = DISTRIBUTION) -> str:
     """Return the command that installs an extra of vlatool.
 
     Example:
-        >>> install("ort")
+        >>> pip_install("ort")
         "pip install 'vlatool[ort]'"
     """
     return f"pip install '{distribution}[{extra}]'"
 
 
-def refuse_two_distributions(packages: Path = HERE.parent) -> None:
-    """Refuse to go on where vlatool and vlatool-runtime are installed side by side: they own the same files.
+def refuse_two_distributions(packages: Path = PACKAGE.parent) -> None:
+    """Refuse to run where both vlatool and vlatool-runtime are installed: they own the same files.
 
     Args:
-        packages: The folder that vlatool is installed in.
+        packages: folder that vlatool is installed in.
 
     Raises:
-        InstallationError: when both are.
+        InstallationError: when both are installed.
     """
     if all(any(packages.glob(f"{name}-*.dist-info")) for name in ("vlatool", "vlatool_runtime")):
         raise InstallationError(
@@ -209,7 +209,7 @@ def refuse_two_distributions(packages: Path = HERE.parent) -> None:
 
 
 def require_present(module: str, extra: str) -> None:
-    """Raise for a module that is absent, without importing it; names the extra that provides it.
+    """Raise an error that names the extra for a missing module, without importing it.
 
     Raises:
         MissingExtra: when the module is not installed.
@@ -219,11 +219,11 @@ def require_present(module: str, extra: str) -> None:
     except ImportError:
         absent = True
     if absent or sys.modules.get(module, ...) is None:
-        raise MissingExtra(f"This needs the package '{module}', which the extra '{extra}' provides.", install(extra))
+        raise _missing(module, extra)
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import ``module``; where that fails, name the extra that provides it.
+    """Import a module; where that fails, name the extra that provides it.
 
     Raises:
         MissingExtra: when the module is not installed.
@@ -235,9 +235,10 @@ def require(module: str, extra: str) -> ModuleType:
         if error.name is not None and error.name.partition(".")[0] != top:
             raise MissingExtra(
                 f"'{module}' is installed, but '{error.name}', which it needs, is not.",
-                install(extra),
+                pip_install(extra),
             ) from error
-        raise MissingExtra(
-            f"This needs the package '{top}', which the extra '{extra}' provides.",
-            install(extra),
-        ) from error
+        raise _missing(top, extra) from error
+
+
+def _missing(package: str, extra: str) -> MissingExtra:
+    return MissingExtra(f"This needs the package '{package}', which the extra '{extra}' provides.", pip_install(extra))

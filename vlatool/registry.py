@@ -1,25 +1,29 @@
-"""(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or what another package adds; loads only what is named.
+"""(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or one of another package; imports only what is named.
 
-One thing, one file, found by its file name: there is no list to edit. A file whose name starts with ``_`` and a
-sub-package are shared parts of the folder, not entries. Another package adds an entry by an entry point of the group
+One entry, one file, found by its file name: there is no list to edit. A file whose name starts with ``_`` and a
+sub-package are shared by the folder and are not entries. Another package adds an entry by an entry point of the group
 ``vlatool.<kind>`` (``vlatool.quantize``, ``vlatool.engines``, ...) that names a module or a class in it; vlatool's own
 come first.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.util
 import inspect
 import pkgutil
 import traceback
+from collections.abc import Iterator, Mapping
+from enum import IntEnum
 from importlib import metadata
 from types import ModuleType
+from typing import Any
 
-from vlatool.errors import PluginError, UsageError, VlatoolError, instead, nearest
+from vlatool.errors import PluginError, UsageError, VlatoolError, fix_for, suggest
 
-PACKAGES = {
+PACKAGE_OF_KIND = {
     "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
     "sections": "vlatool.render.sections", "losses": "vlatool.training.losses",
     "hints": "vlatool.training.hints", "motion": "vlatool.motion.metrics",
@@ -31,17 +35,28 @@ NOUNS = {
     "render": "report format", "motion": "metric of motion", "videos": "format of videos",
     "workers": "launcher of workers", "control": "controller",
 }  # fmt: skip
-_FOREIGN: dict[type, str] = {}
-"""Class of another package -> ``kind.name``, once it was loaded."""
+_PLUGIN_CLASSES: dict[type, str] = {}
+"""Loaded class of another package -> ``kind.name``."""
+
+
+class Claim(IntEnum):
+    """How sure an entry is that it reads what a person names.
+
+    ``claims`` of an entry looks at names and first bytes alone: it is asked about every path that a shell completes.
+    """
+
+    NONE = 0
+    MAYBE = 1
+    CERTAIN = 2
 
 
 def package_of(kind: str) -> str:
     """Return the package that holds the files of ``kind`` (``"engines"`` live in the runtime)."""
-    return PACKAGES.get(kind, f"vlatool.{kind}")
+    return PACKAGE_OF_KIND.get(kind, f"vlatool.{kind}")
 
 
 def noun_of(kind: str) -> str:
-    """Return what an entry of a kind is called in messages."""
+    """Return the noun for an entry of a kind in messages."""
     return NOUNS.get(kind, kind.removesuffix("s"))
 
 
@@ -52,30 +67,30 @@ def names(kind: str) -> list[str]:
         >>> "static_int8" in names("quantize")
         True
     """
-    return sorted({*_own(kind), *plugins(kind)})
+    return sorted({*_builtin_names(kind), *plugins(kind)})
 
 
 @functools.cache
 def plugins(kind: str) -> dict[str, metadata.EntryPoint]:
-    """Return what other packages add to a kind: name -> entry point. A name that vlatool has itself is not taken."""
-    own = _own(kind)
+    """Return the entries of a kind from other packages: name -> entry point; vlatool's own names are not replaced."""
+    own = _builtin_names(kind)
     entries = {entry.name.replace("-", "_"): entry for entry in metadata.entry_points(group=f"vlatool.{kind}")}
     return {name: entry for name, entry in entries.items() if name not in own}
 
 
 def module(kind: str, name: str) -> ModuleType:
-    """Import the file of one entry.
+    """Import the module of an entry.
 
     Raises:
         UsageError: for an unknown entry; suggests the nearest one.
-        PluginError: when another package adds it, and cannot be imported.
+        PluginError: when it is another package's and cannot be imported.
     """
     own_name = name.replace("-", "_")
-    if own_name in _own(kind):
+    if own_name in _builtin_names(kind):
         return importlib.import_module(f"{package_of(kind)}.{own_name}")
     if own_name not in plugins(kind):
         raise UsageError(
-            f"Unknown {noun_of(kind)} '{name}'; {nearest(own_name, names(kind))}.", instead(own_name, names(kind))
+            f"Unknown {noun_of(kind)} '{name}'; {suggest(own_name, names(kind))}.", fix_for(own_name, names(kind))
         )
     entry = plugins(kind)[own_name]
     try:
@@ -87,11 +102,11 @@ def module(kind: str, name: str) -> ModuleType:
 
 
 def load(kind: str, name: str) -> type:
-    """Return the one public class that the file of an entry defines, or that an entry point names.
+    """Return the only public class that the file of an entry defines, or the one that an entry point names.
 
     Raises:
         UsageError: for an unknown entry.
-        PluginError: when another package adds it, and it is not such a class.
+        PluginError: when it is another package's and not such a class.
         TypeError: when the file defines no public class, or several (a fault of the file).
     """
     source = module(kind, name)
@@ -105,17 +120,56 @@ def load(kind: str, name: str) -> type:
             raise TypeError(f"{entry.value} is not a class")
     except (AttributeError, TypeError) as error:
         raise _plugin_error(entry, f"does not name a class: {error}") from error
-    _FOREIGN[entry_class] = f"{kind}.{own_name}"
+    _PLUGIN_CLASSES[entry_class] = f"{kind}.{own_name}"
     return entry_class
 
 
+def loadable(kind: str) -> Iterator[tuple[str, Any]]:
+    """Yield the name and the class of each entry, without those that cannot be imported, which ``doctor`` names."""
+    for name in names(kind):
+        with contextlib.suppress(PluginError):
+            yield name, load(kind, name)
+
+
+def is_certain(kind: str, named: Any) -> bool:
+    """Return whether an entry is certain to read what a person names."""
+    return any(entry.claims(named) is Claim.CERTAIN for _, entry in loadable(kind))
+
+
+def claimant(kind: str, named: Any, error: type[VlatoolError]) -> Any:
+    """Return the entry that reads what a person names: the one that is certain, else the one that may; None if none.
+
+    Raises:
+        VlatoolError: (of the type ``error``) when several are equally sure.
+    """
+    claims = {name: (entry, Claim(entry.claims(named))) for name, entry in loadable(kind)}
+    surest = max((claim for _, claim in claims.values()), default=Claim.NONE)
+    found = {name: entry for name, (entry, claim) in claims.items() if claim is surest is not Claim.NONE}
+    if len(found) > 1:
+        raise error(
+            f"{named} is ambiguous; each {noun_of(kind)} of these reads it: {_requirements(found)}.",
+            "name the file that is meant, or move what the other one reads elsewhere; a package that is not needed can "
+            "be uninstalled",
+        )
+    return next(iter(found.values()), None)
+
+
+def requirements(kind: str) -> str:
+    """Return what each entry of a kind needs to read something, for messages: ``onnx (a .onnx file)``."""
+    return _requirements(dict(loadable(kind)))
+
+
+def _requirements(entries: Mapping[str, Any]) -> str:
+    return "; ".join(f"{name} ({entry.needs})" for name, entry in entries.items())
+
+
 def entry_of(entry_class: type) -> str:
-    """Return ``kind.name`` of a class that ``load`` returned, or of one in a file of its kind."""
-    return _FOREIGN.get(entry_class) or ".".join(entry_class.__module__.split(".")[-2:])
+    """Return ``kind.name`` of a class that ``load`` returned, or that is in a file of its kind."""
+    return _PLUGIN_CLASSES.get(entry_class) or ".".join(entry_class.__module__.split(".")[-2:])
 
 
 def all_plugins() -> dict[str, list[str]]:
-    """Return other package (``acme 1.2``) -> what it adds, as ``kind.name``."""
+    """Return the other packages that extend vlatool: ``acme 1.2`` -> its entries as ``kind.name``."""
     added: dict[str, list[str]] = {}
     for group in sorted(metadata.entry_points().groups):
         for entry in plugins(group.partition(".")[2]).values() if group.startswith("vlatool.") else ():
@@ -123,11 +177,11 @@ def all_plugins() -> dict[str, list[str]]:
     return added
 
 
-def owner(module_name: str) -> str:
-    """Return which other package a module is from (``acme 1.2``); empty for vlatool's own, and for any that adds none.
+def plugin_of(module_name: str) -> str:
+    """Return the other package that a module is from (``acme 1.2``); empty if it does not extend vlatool.
 
     Args:
-        module_name: Of any module of that package.
+        module_name: name of any module of that package.
     """
     top = module_name.partition(".")[0]
     groups = (group for group in metadata.entry_points().groups if group.startswith("vlatool.") and top != "vlatool")
@@ -135,20 +189,20 @@ def owner(module_name: str) -> str:
     return next((_title(entry) for entry in entries if entry.module.partition(".")[0] == top), "")
 
 
-def blamed(error: BaseException) -> str:
-    """Return which other package's code an exception came out of, the last before vlatool's own or a library's."""
+def package_at_fault(error: BaseException) -> str:
+    """Return the other package that an exception came from: the last one before vlatool's own or a library's frames."""
     frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    owners = [(name.partition(".")[0] == "vlatool", owner(name)) for name in frames]
+    owners = [(name.partition(".")[0] == "vlatool", plugin_of(name)) for name in frames]
     return next((other for own, other in reversed(owners) if own or other), "")
 
 
-def complaint(package: str, kind: str, message: str) -> tuple[str, str]:
-    """Return message and fix of the error of another package whose code raised an exception."""
+def plugin_failure(package: str, kind: str, message: str) -> tuple[str, str]:
+    """Return the message and the fix for an exception that another package's code raised."""
     words = f"The package {package}, which adds to vlatool, fails: {kind}: {message}."
     return words, "report it to its authors, with the traceback of VLATOOL_DEBUG=1"
 
 
-def _own(kind: str) -> list[str]:
+def _builtin_names(kind: str) -> list[str]:
     spec = importlib.util.find_spec(package_of(kind))
     if spec is None or spec.submodule_search_locations is None:
         return []

@@ -310,7 +310,7 @@ def test_a_job_runs_elsewhere_where_the_context_says_so(float_bundle):
         asked.append((job, bundles))
         return {**to_json(measure(from_json(LatencyJob, job), tell)), "target": {"python": "3.10"}}
 
-    report = benchmarked(float_bundle, Context(elsewhere=elsewhere))
+    report = benchmarked(float_bundle, Context(measure_remotely=elsewhere))
     assert asked[0][1] == [float_bundle.path]
     assert report.environment["target"] == {"python": "3.10"}
     assert report.rows[0].measurements[0].where != "this host"
@@ -346,7 +346,7 @@ def test_what_the_engine_logs_is_kept(float_bundle):
         log = "".join(f"warning {number}\n" for number in range(50))
         return {**to_json(measure(from_json(LatencyJob, job), tell)), "log": log}
 
-    lines = benchmarked(float_bundle, Context(elsewhere=elsewhere)).rows[0].details["log"]
+    lines = benchmarked(float_bundle, Context(measure_remotely=elsewhere)).rows[0].details["log"]
     assert [line["line"] for line in lines] == [f"warning {number}" for number in range(10, 50)]
     assert "log" not in benchmarked(float_bundle).rows[0].details
 

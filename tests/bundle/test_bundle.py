@@ -22,7 +22,7 @@ from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.program import single_graph
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import BundleError
-from vlatool.files.written import LEDGER
+from vlatool.files.ownership import LEDGER
 
 MANIFEST = Manifest("tiny", "1.0.0", PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0))
 
@@ -332,7 +332,7 @@ def test_the_size_of_the_graphs_counts_everything_beside_them(bundle):
 
 
 def test_files_that_an_engine_opens_by_name_are_those_that_were_hashed(bundle):
-    with bundle.held("graphs", ["graphs/main.onnx"]) as place:
+    with bundle.verified_folder("graphs", ["graphs/main.onnx"]) as place:
         assert (place / "main.onnx").read_bytes() == b"weights" * 100
 
 
@@ -357,13 +357,13 @@ def rewrite_in_place(folder: Path) -> None:
 
 @pytest.mark.parametrize("attack", [rename_over, swap_and_swap_back, rewrite_in_place])
 def test_what_changes_while_an_engine_opens_it_is_seen(bundle, attack):
-    with pytest.raises(BundleError, match="was changed while"), bundle.held("graphs", ["graphs/main.onnx"]):
+    with pytest.raises(BundleError, match="was changed while"), bundle.verified_folder("graphs", ["graphs/main.onnx"]):
         attack(bundle.path / "graphs")
 
 
 def test_a_held_file_is_verified(bundle):
     (bundle.path / "graphs/main.onnx").write_bytes(b"Weights" * 100)
-    with pytest.raises(BundleError, match="its SHA-256"), bundle.held("graphs", ["graphs/main.onnx"]):
+    with pytest.raises(BundleError, match="its SHA-256"), bundle.verified_folder("graphs", ["graphs/main.onnx"]):
         pytest.fail("the block must not run")
 
 

@@ -268,7 +268,7 @@ def test_a_kept_value_needs_a_shape(kept: object, got: str):
     [
         ({"graph": "main"}, "must be a list of steps; got dict"),
         (None, "must be a list of steps; got NoneType"),
-        (["main"], "Step 0 of the program needs 'graph', 'feeds' and 'gives'"),
+        (["main"], "Step 0 of the program lacks 'graph', 'feeds' or 'gives'"),
         ([{"graph": "main", "feeds": {}}], "Step 0 of the program needs"),
         ([{"graph": "main", "feeds": {}, "gives": {}, "repeats": 2}], "unknown key 'repeats'; did you mean 'repeat'"),
     ],

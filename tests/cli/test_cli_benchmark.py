@@ -55,7 +55,7 @@ def test_what_was_measured_is_printed_also_when_it_cannot_be_written(vlatool, fl
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(_console, "writing", full)
+    monkeypatch.setattr(_console, "write_directory", full)
     code, out, error = vlatool("benchmark", float_bundle.path, *QUICK, "-o", tmp_path / "report")
     assert code == 3
     assert "median latency" in out

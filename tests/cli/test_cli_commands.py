@@ -443,7 +443,7 @@ def test_anything_else_is_no_drop(text):
 def test_progress_is_plain_lines_away_from_a_terminal_and_one_for_each_kind(capsys):
     with progress(workers=3) as context:
         for what in ("10 episodes, 80.0% succeed", "20 episodes, 85.0% succeed", "measuring", "measuring"):
-            context.tell(what, 0.5)
+            context.progress(what, 0.5)
     assert context.workers == 3
     assert context.command.startswith("vlatool")
     told = capsys.readouterr()
@@ -456,7 +456,7 @@ def test_numbers_of_a_long_work_are_told_again_every_half_minute(capsys, monkeyp
     monkeypatch.setattr("vlatool.cli._console.time", SimpleNamespace(monotonic=lambda: next(seconds)))
     with progress() as context:
         for count in (10, 20, 30, 40):
-            context.tell(f"{count} of 100 episodes", count / 100)
+            context.progress(f"{count} of 100 episodes", count / 100)
     assert capsys.readouterr().err == "... 10 of 100 episodes\n... 30 of 100 episodes\n"
 
 
@@ -468,8 +468,8 @@ def test_progress_is_a_bar_on_a_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with progress() as context:
         assert isinstance(context, Context)
-        context.tell("measuring", None)
-        context.tell("measuring", 0.5)
+        context.progress("measuring", None)
+        context.progress("measuring", 0.5)
     assert sys.stderr.getvalue().strip()
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests._reach import folder_of
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import MOST, PLAYED, Encoded, kept_rows, played_observations, recorded_observations
+from vlatool.data import MAX_PLAYED, PLAYED, Encoded, kept_rows, played_observations, recorded_observations
 from vlatool.errors import DataError
 from vlatool.quantize.calibration.activation_statistics import calibrate
 from vlatool.quantize.static_int8 import StaticInt8
@@ -104,13 +104,13 @@ def test_ranges_cover_what_the_training_saw_and_the_recording_did_not(tmp_path: 
     np.savez(folder / "calibration.npz", state=near)
     exported = trained(folder, "quantize.qat", tmp_path)
     played = np.concatenate([row["state"] for row in played_observations(exported)])
-    assert len(played) == MOST
+    assert len(played) == MAX_PLAYED
     (name,) = ranges_of(exported)
     low, high = ranges_of(exported)[name]
     assert (low, high) == (pytest.approx(min(played.min(), 0)), pytest.approx(played.max()))
     assert high > 10 * np.abs(near).max(), "episodes go farther than what was recorded"
     int8 = run_transform(StaticInt8(), exported, tmp_path / "int8", Context())
-    assert int8.manifest.made_by["calibration"]["samples"] == 16 + MOST, "half of a recording is held out"
+    assert int8.manifest.made_by["calibration"]["samples"] == 16 + MAX_PLAYED, "half of a recording is held out"
 
 
 def test_an_input_may_be_called_as_it_likes_and_a_second_training_keeps_its_own(tmp_path: Path):
@@ -133,7 +133,7 @@ def test_a_policy_without_recordings_calibrates_on_its_training(tmp_path: Path):
     exported = trained(folder_of(tmp_path / "policy"), "quantize.qat", tmp_path)
     StaticInt8().check(exported, None)
     int8 = run_transform(StaticInt8(), exported, tmp_path / "int8", Context())
-    assert int8.manifest.made_by["calibration"]["samples"] == MOST
+    assert int8.manifest.made_by["calibration"]["samples"] == MAX_PLAYED
     with pytest.raises(DataError, match="carries no calibration data") as told:
         run_transform(build_stage("quantize.smooth_quant", {}), exported, tmp_path / "smooth", Context())
     assert "qat" not in told.value.fix, "it would not help"

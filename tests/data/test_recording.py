@@ -98,12 +98,12 @@ def test_a_chunk_that_is_recorded_in_part_is_told(tmp_path: Path, shape, steps):
     recording = read(tmp_path, action=np.zeros(shape, np.float32))
     assert recording.actions.shape == (COUNT, steps, 2)
     if steps == 3:
-        assert recording.unjudged == ()
+        assert recording.unjudged_steps == ()
     else:
-        (told,) = recording.unjudged
+        (told,) = recording.unjudged_steps
         some = "the first one alone is" if steps == 1 else "the first 2 alone are"
         assert told.startswith(f"recording.npz records {steps} of the 3 actions of each chunk: {some} held against")
-    assert read(tmp_path).unjudged == (), "nothing is held against an expert where there is none"
+    assert read(tmp_path).unjudged_steps == (), "nothing is held against an expert where there is none"
 
 
 @pytest.mark.parametrize(

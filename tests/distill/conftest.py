@@ -11,4 +11,4 @@ import pytest
 def in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stages run without a child of their own, with a new cache."""
     monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))

@@ -22,7 +22,7 @@ from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
-from vlatool.training.yielded import ROWS
+from vlatool.training.user_batches import DEFAULT_ROWS
 from vlatool.user_code import trust
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -115,8 +115,8 @@ def test_how_many_rows_are_taken(
     policy_dir: Path, tmp_path: Path, options: dict[str, Any], rows: int | None, monkeypatch: pytest.MonkeyPatch
 ):
     """With recordings beside them; where the teacher plays, only those that are asked for."""
-    assert ROWS == 8192
-    monkeypatch.setattr("vlatool.training.yielded.ROWS", 30)
+    assert DEFAULT_ROWS == 8192
+    monkeypatch.setattr("vlatool.training.user_batches.DEFAULT_ROWS", 30)
     plays = options.pop("plays", False)
     source = pruned(policy(policy_dir, recorded=not plays, plays=plays))
     made = distilled(source, tmp_path / "out", **options, steps=1)
@@ -160,7 +160,7 @@ def test_the_file_runs_only_where_its_folder_is_named(policy_dir: Path, tmp_path
     source = pruned(policy(policy_dir))
     ran = policy_dir.parent / "ran"
     (policy_dir / "train.py").write_text(f"open({str(ran)!r}, 'w').close()\n")
-    with trust.nothing_named(), pytest.raises(SourceError, match="which you did not name"):
+    with trust.forget_named(), pytest.raises(SourceError, match="which you did not name"):
         distilled(source, tmp_path / "out", **ALONE)
     with pytest.raises(SourceError, match="has changed since"):
         distilled(source, tmp_path / "out", **ALONE)

@@ -13,7 +13,7 @@ from _trainings import Killed, distilled, killed_after, raise_killed, training_o
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
-from vlatool.module.batched import PATH, BatchedProgram
+from vlatool.module.batched_program import PATH, BatchedProgram
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune.neurons import Neurons
 from vlatool.prune.steps import Steps
@@ -24,7 +24,7 @@ from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 from vlatool.training.flow import flow_loss
 from vlatool.training.losses.l1 import L1
-from vlatool.training.rounds import AFTER, BEFORE, LABEL, NOISE, NUMBER, label
+from vlatool.training.rounds import AFTER, BEFORE, LABEL, NOISE, NUMBER, write_labels
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 SAMPLE = Path(__file__).parents[2] / "sample_models/vln-babyai"
@@ -96,7 +96,7 @@ def test_turns_one_after_the_other_are_the_loop(whole: Bundle, alone: bool):
 def test_each_row_is_labelled_with_a_turn_of_the_teachers(whole: Bundle, tmp_path: Path):
     count, teacher = 70, programs(whole)
     np.save(tmp_path / "state.npy", states(count)["state"].numpy())
-    names = label(tmp_path, ["state"], ["action"], teacher, (0, 0), Context(), turns=True)
+    names = write_labels(tmp_path, ["state"], ["action"], teacher, (0, 0), Context(), turns=True)
     assert names == ["action", NUMBER, f"{BEFORE}x", f"{AFTER}x"]
     kept = {name: torch.from_numpy(np.load(tmp_path / f"{LABEL}{name}.npy")) for name in names}
     drawn = torch.from_numpy(np.load(tmp_path / f"{NOISE}x.npy"))
@@ -111,7 +111,7 @@ def test_each_row_is_labelled_with_a_turn_of_the_teachers(whole: Bundle, tmp_pat
 def test_the_loss_is_what_the_end_is_off_where_every_turn_errs_alike(whole: Bundle, tmp_path: Path):
     """A student that moves by 0.01 too far in each of four turns ends 0.04 too far."""
     np.save(tmp_path / "state.npy", states(8)["state"].numpy())
-    label(tmp_path, ["state"], ["action"], programs(whole), (0, 0), Context(), turns=True)
+    write_labels(tmp_path, ["state"], ["action"], programs(whole), (0, 0), Context(), turns=True)
     rows = {path.name.removesuffix(".npy"): np.load(path) for path in tmp_path.glob("*.npy")}
     student = programs(whole)
     assert float(flow_loss(student, L1(), torch.no_grad)(rows)) == pytest.approx(0.0, abs=1e-6)

@@ -82,9 +82,9 @@ def test_they_pull_the_features_to_the_teachers(shallow: Bundle, tmp_path: Path)
 
 def _far(student: Bundle) -> float:
     """The term of the features alone."""
-    _, lesson = build_stage("distill.policy", {"features": 1.0}).prepared(load_modules(student), student)
+    _, objective = build_stage("distill.policy", {"features": 1.0}).prepare_objective(load_modules(student), student)
     with torch.no_grad():
-        return float(lesson.loss(recorded_rows()) - lesson.judged(recorded_rows()))
+        return float(objective.loss(recorded_rows()) - objective.judged(recorded_rows()))
 
 
 def recorded_rows(count: int = 5) -> dict[str, np.ndarray]:
@@ -159,9 +159,9 @@ def test_a_student_with_fewer_heads_and_neurons_is_compared_too(batches: bool, t
 def test_the_teacher_of_a_quantized_student_is_not_quantized(tmp_path: Path):
     """Student and teacher have the same weights: were both rounded, their features would be the same."""
     source = source_of(write_deep(tmp_path / "policy", MANY), tmp_path / "source")
-    _, lesson = build_stage("quantize.qat", {"features": 1.0}).prepared(load_modules(source), source)
+    _, objective = build_stage("quantize.qat", {"features": 1.0}).prepare_objective(load_modules(source), source)
     with torch.no_grad():
-        assert float(lesson.loss(recorded_rows()) - lesson.judged(recorded_rows())) > 1e-5
+        assert float(objective.loss(recorded_rows()) - objective.judged(recorded_rows())) > 1e-5
 
 
 # ---- what cannot be compared

@@ -111,7 +111,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_weights(
 
     train = Trainer.train
     monkeypatch.setattr(Trainer, "train", dying)
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
     stage = build_stage("distill.policy", SHORT)
     while len(dies_at) > 1:
         with pytest.raises(Killed):
@@ -219,7 +219,7 @@ def test_what_was_trained_is_kept_until_the_bundle_is_written(
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
     options = {"episodes": 0, "student_episodes": 0, "steps": 3}
     with monkeypatch.context() as patched:
         patched.setattr("vlatool.module.stage.write_module", full)

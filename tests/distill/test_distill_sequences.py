@@ -13,7 +13,7 @@ from _trainings import Killed, digest, distilled, killed_after, raise_killed, tr
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError, SourceError
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.module.torch_policy import torch_policy
 from vlatool.report import read_report
 from vlatool.stage.base import Context
@@ -85,7 +85,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Bundle, Bundle, Bu
     place = tmp_path_factory.mktemp("learnt")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VLATOOL_CACHE", str(place / "cache"))
-        patch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+        patch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
         source, named = pair(place, count=60)
         made = distilled(source, place / "out", **{**LEARNS, **named})
     return source, made, Bundle.open(named["teacher"])
@@ -262,7 +262,7 @@ def one_episode(place: Path) -> tuple[Bundle, dict[str, str]]:
         folder = write_recurrent(place / kind, kind, count=3)
         rows = recorded(3)
         np.savez(folder / "calibration.npz", **{**rows, "episode": np.zeros(len(rows["episode"]), int)})
-        trust.name(folder)
+        trust.allow(folder)
         made.append(run_transform(TorchModule(policy=folder), None, place / f"{kind}-source", Context()))
     return made[0], {"teacher": str(made[1].path)}
 

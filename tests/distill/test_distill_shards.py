@@ -67,7 +67,7 @@ def two(pruned_deep: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle
     place = tmp_path_factory.mktemp("two")
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("VLATOOL_CACHE", str(place / "cache"))
-        patched.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+        patched.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
         return distilled(pruned_deep, place / "out", processes=2, shard=True, **ALL)
 
 

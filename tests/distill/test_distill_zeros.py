@@ -25,7 +25,7 @@ SHORT = {"steps": 6, "batch": 6, "episodes": 0, "student_episodes": 0, "learning
 @pytest.fixture(autouse=True)
 def in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
 
 
 @pytest.fixture
@@ -55,11 +55,11 @@ def test_zeros_of_two_of_four_stay(sparse: Bundle, tmp_path: Path, options: dict
 def test_quantization_aware_training_keeps_them(sparse: Bundle):
     stage = build_stage("quantize.qat", {"steps": 2, "batch": 6, "episodes": 0, "student_episodes": 0})
     modules = load_modules(sparse)
-    _, lesson = stage.prepared(modules, sparse)
-    assert lesson.constraint is not None
+    _, objective = stage.prepare_objective(modules, sparse)
+    assert objective.constraint is not None
     weight = modules["main"].blocks[0].mlp[1].weight
     zero = weight == 0
-    with lesson.constraint.step(1):
+    with objective.constraint.step(1):
         weight.data += 1
     assert torch.equal(weight == 0, zero)
 
@@ -69,7 +69,7 @@ def test_zeros_of_a_policy_that_was_never_pruned_are_free(source_bundle: Bundle)
     modules["main"].blocks[0].mlp[1].weight.data[:, :4] = 0
     assert not has_zeros(source_bundle)
     stage = build_stage("quantize.qat", {"steps": 2, "batch": 6, "episodes": 0, "student_episodes": 0})
-    assert stage.prepared(modules, source_bundle)[1].constraint is None
+    assert stage.prepare_objective(modules, source_bundle)[1].constraint is None
     assert len(sparse_weights(modules.values())) == 1
     modules["main"].blocks[0].mlp[1].weight.data[:] = 0
     assert not sparse_weights([*modules.values(), *modules.values()]), "made so by its author"

@@ -36,7 +36,7 @@ def named(checks: Iterable[Check], name: str) -> Check:
 
 
 def arithmetic_of(monkeypatch: pytest.MonkeyPatch, found: str) -> list[Check]:
-    monkeypatch.setattr(doctor, "products_apart", lambda engine: found)
+    monkeypatch.setattr(doctor, "int8_arithmetic", lambda engine: found)
     return list(doctor.arithmetic())
 
 
@@ -56,16 +56,16 @@ def test_avx2_without_vnni_names_flags_and_the_engine_that_is_exact() -> None:
 
 
 def test_a_variable_that_confines_openvino_is_a_warning() -> None:
-    (found,) = doctor.confined("AVX2")
+    (found,) = doctor.onednn_limit("AVX2")
     assert (found.status, "ONEDNN_MAX_CPU_ISA=AVX2" in found.finding) == ("warn", True)
-    assert list(doctor.confined(None)) == []
+    assert list(doctor.onednn_limit(None)) == []
 
 
 def test_an_engine_that_is_not_installed_is_not_asked(monkeypatch) -> None:
     def missing(engine: str) -> str:
         raise MissingExtra(f"{engine} is not installed")
 
-    monkeypatch.setattr(doctor, "products_apart", missing)
+    monkeypatch.setattr(doctor, "int8_arithmetic", missing)
     assert list(doctor.arithmetic()) == []
 
 
@@ -74,7 +74,7 @@ def test_an_engine_that_measures_no_products_of_its_own_is_not_known(monkeypatch
         package = "numpy"
 
     monkeypatch.setattr(doctor.registry, "load", lambda kind, name: Bare)
-    monkeypatch.setattr(doctor, "products_apart", lambda engine: products.run({"engine": engine}, print))
+    monkeypatch.setattr(doctor, "int8_arithmetic", lambda engine: products.run({"engine": engine}, print))
     (check,) = [check for check in doctor.arithmetic() if check.name == "int8 ort_cpu"]
     assert (check.status, "not known" in check.finding) == ("warn", True)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.episodes.body import Body, alike
+from vlatool.episodes.body import Body, same_unit_elements
 from vlatool.motion.measure import measure_episode
 
 ACTION = TensorSpec("action", (1, 2, 4), unit=("m", "m", "m", "1"), labels=("x", "y", "z", "gripper"))
@@ -22,7 +22,7 @@ def played(infos: list[Any]) -> Body:
     body = Body(SPEC)
     body.look(infos[0])
     for step, info in enumerate(infos[1:]):
-        body.acted(np.full(4, step, np.float32), step % 2 == 0)
+        body.add_action(np.full(4, step, np.float32), step % 2 == 0)
         body.look(info)
     return body
 
@@ -121,7 +121,7 @@ def test_what_is_wrong_gives_no_number_and_a_reason(case: str):
 def test_an_episode_of_one_step():
     body = Body(SPEC)
     body.look({"position": (0.0, 0.0)})
-    body.acted(np.zeros(4, np.float32), True)
+    body.add_action(np.zeros(4, np.float32), True)
     body.look({"position": (3.0, 4.0)})
     found = measure_episode(body.track())
     assert found["task_time"] == pytest.approx(0.1)
@@ -130,8 +130,8 @@ def test_an_episode_of_one_step():
 
 
 def test_elements_of_an_action_that_share_a_unit():
-    assert alike(TensorSpec("a", (1, 1, 3), unit="rad")) == (0, 1, 2)
-    assert alike(TensorSpec("a", (1, 1, 4), unit=("m", "rad", "rad", "1"))) == (1, 2)
-    assert alike(TensorSpec("a", (1, 2), kind="discrete", labels=("l", "r"))) == ()
+    assert same_unit_elements(TensorSpec("a", (1, 1, 3), unit="rad")) == (0, 1, 2)
+    assert same_unit_elements(TensorSpec("a", (1, 1, 4), unit=("m", "rad", "rad", "1"))) == (1, 2)
+    assert same_unit_elements(TensorSpec("a", (1, 2), kind="discrete", labels=("l", "r"))) == ()
     assert TensorSpec("a", (1, 1, 2), labels=("x", "Gripper effort")).gripper == 1
     assert TensorSpec("a", (1, 1, 2), labels=("left_gripper", "right_gripper")).gripper is None

@@ -9,7 +9,7 @@ import pytest
 from _policies import EchoController
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.episodes.disturbed import DisturbedController
+from vlatool.episodes.disturbances import DisturbedController
 
 
 def spec(hz: float) -> PolicySpec:

@@ -12,7 +12,7 @@ from tests._reach import TREMBLES, bundle_of
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.episodes.body import Body
-from vlatool.episodes.disturbed import DELAY, DisturbedController
+from vlatool.episodes.disturbances import DELAY, DisturbedController
 from vlatool.episodes.environment import World
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import EpisodesJob
@@ -77,7 +77,7 @@ def test_an_action_that_is_repeated_is_the_one_that_was_commanded():
     for _ in range(4):
         action = acting.act({"t": 5})
         world.step(action)
-        body.acted(action, acting.fresh)
+        body.add_action(action, acting.fresh)
         body.look({})
     np.testing.assert_array_equal(body.track().actions, [[500, 500.5]] * 4)
 

@@ -22,9 +22,9 @@ from vlatool.episodes.jobs import outcomes_of
 from vlatool.episodes.play import STEP_LIMIT, EpisodesJob, Played
 from vlatool.errors import DataError
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.files.edited import is_own, stamped
 from vlatool.files.messages import to_json
-from vlatool.files.work import Store, forget_all
+from vlatool.files.resumable_work import Store, remove_all_unused
+from vlatool.files.user_files import add_stamp, is_own_file
 from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.stage.cache import contents, prune
@@ -218,8 +218,8 @@ def test_what_no_episode_is_like_is_played_again_though_its_hash_is_right(bundle
     for file, steps in zip(sorted(cache.glob("streams/*/answer-*.json")), (-5, 10**30), strict=False):
         kept = json.loads(file.read_text().partition("\n")[0])
         kept["value"]["outcomes"][3]["steps"] = steps
-        file.write_text(stamped(json.dumps(kept) + "\n"))
-        assert is_own(file)
+        file.write_text(add_stamp(json.dumps(kept) + "\n"))
+        assert is_own_file(file)
     played()
     assert run(stage, bundles["good"]).rows == whole.rows
     assert played() == 20
@@ -249,7 +249,7 @@ def test_a_place_that_cannot_be_written_costs_nothing_but_a_sentence(bundles, wo
     told: list[str] = []
     report = run(evaluation(world), bundles["good"], told)
     assert report.rows == evaluation(world).run(bundles["good"], Context()).rows
-    (noted,) = [warning for warning in report.warnings if "cannot be kept" in warning]
+    (noted,) = [warning for warning in report.warnings if "cannot be stored" in warning]
     assert "VLATOOL_CACHE" in noted
     assert noted in told
 
@@ -268,12 +268,12 @@ def test_who_writes_the_result_removes_what_was_kept(bundles, world, cache):
 def test_what_another_run_uses_stays(tmp_path):
     with Store.open(tmp_path / "work") as one:
         one.put("a", [1.5, "x"])
-        forget_all([tmp_path / "work"])
+        remove_all_unused([tmp_path / "work"])
         assert one.get("a") == [1.5, "x"]
         with Store.open(tmp_path / "work") as other:
             assert other.get("a") == [1.5, "x"]
             assert other.get("b") is None
-    forget_all([tmp_path / "work"])
+    remove_all_unused([tmp_path / "work"])
     assert not (tmp_path / "work").exists()
 
 

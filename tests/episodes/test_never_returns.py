@@ -18,8 +18,8 @@ from vlatool.episodes.jobs import disturbances_of, run_jobs
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.files.work import Store
-from vlatool.machine.awaited import Page, awaited, new_page
+from vlatool.files.resumable_work import Store
+from vlatool.machine.watched_calls import Page, new_page, watched_call
 from vlatool.module.description import read_description
 from vlatool.stage.base import Context
 
@@ -157,12 +157,12 @@ def test_finished_episodes_are_taken_when_it_goes_on(tmp_path: Path, float_bundl
     folder = world(tmp_path / "world", "step()", f"os.path.exists({str(tmp_path / 'mended')!r}) or {SLEEPS}")
     jobs = [job(folder, (14, 15, 16, 17, 18)), job(folder, (16, 17), "push")]
     with Store.open(tmp_path / "store") as kept, pytest.raises(SourceError, match="at seed 17"):
-        run_jobs(float_bundle, jobs, "", Context(workers=workers, kept=kept))
+        run_jobs(float_bundle, jobs, "", Context(workers=workers, store=kept))
     (tmp_path / "mended").touch()
     (folder.parent / "calls").unlink()
     again = [replace(each, timeout_s=30.0) for each in jobs]
     with Store.open(tmp_path / "store") as kept:
-        outcomes = run_jobs(float_bundle, again, "", Context(workers=workers, kept=kept))
+        outcomes = run_jobs(float_bundle, again, "", Context(workers=workers, store=kept))
     seeds = [(outcome.task, outcome.seed) for outcome in outcomes]
     assert seeds == [*(("reach", seed) for seed in range(14, 19)), ("push", 16), ("push", 17)]
     played = [line.split()[2:] for line in (folder.parent / "calls").read_text().splitlines() if "reset()" in line]
@@ -241,5 +241,5 @@ def test_a_page_is_read_by_another_process_and_nothing_else_is_believed():
 
 
 def test_a_process_that_nobody_looks_at_calls_as_ever():
-    with limited("reset()", "reach", 1, 0.01), awaited("a", "b", "c", "d", 0.01):
+    with limited("reset()", "reach", 1, 0.01), watched_call("a", "b", "c", "d", 0.01):
         time.sleep(0.02)

@@ -129,7 +129,7 @@ def test_a_disturbance_that_changes_nothing_is_told(
     code = (folder / "environment.py").read_text()
     assert change[0] in code
     (folder / "environment.py").write_text(code.replace(*change, 1) if change[0] else code)
-    trust.name(folder)
+    trust.allow(folder)
     stage = ClosedLoop(policy=folder, episodes=6, disturb=("push",), strength=strength)
     told = " ".join(stage.run(bundles["good"], Context()).warnings)
     assert bool(re.search(IDLE, told)) == warned, told

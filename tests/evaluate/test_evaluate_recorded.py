@@ -10,7 +10,7 @@ from functools import partialmethod
 import numpy as np
 import pytest
 
-from vlatool.bundle.bundle import Bundle, restate, seal
+from vlatool.bundle.bundle import Bundle, replace_manifest, seal
 from vlatool.bundle.spec import TensorSpec
 from vlatool.data import evaluation_recording, recorded_observations
 from vlatool.errors import DataError, GraphError
@@ -264,7 +264,7 @@ def test_nothing_to_compare_with_gives_nothing():
 def test_what_a_stage_found_to_be_wrong_is_said(float_bundle, copied):
     bundle = copied(float_bundle)
     finding = {"name": "engine-difference", "message": "the engine computes something else."}
-    bundle = restate(bundle, replace(bundle.manifest, findings=(finding,)))
+    bundle = replace_manifest(bundle, replace(bundle.manifest, findings=(finding,)))
     warnings = Recorded().run(bundle, Context()).warnings
     assert "load refuses this bundle (engine-difference): the engine computes something else." in warnings
 

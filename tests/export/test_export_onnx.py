@@ -10,7 +10,7 @@ from vlatool.data import recorded_observations
 from vlatool.errors import GraphError, RecipeError, SourceError, SpecError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.measurement.jobs import LatencyJob
-from vlatool.measurement.worker import measure, opened
+from vlatool.measurement.worker import measure, open_policy
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.quantize.qat import Qat
 from vlatool.quantize.static_int8 import StaticInt8
@@ -168,7 +168,7 @@ def test_eager_torch_and_the_graphs_draw_the_same_noise(source, tmp_path: Path):
     made = export(bundle, tmp_path / "out")
     observation = {"state": np.array([0.1, -0.5, 2.0], np.float32)}
     job = LatencyJob((str(made.path), str(bundle.path)), iterations=40, warmup=1)
-    contestants = [opened(path, job) for path in job.bundles]
+    contestants = [open_policy(path, job) for path in job.bundles]
     graphs, eager = (each.policy.infer(observation).chunk for each in contestants)
     np.testing.assert_allclose(graphs, eager, rtol=1e-4, atol=1e-6)
     found = measure(contestants, job, lambda what, share: None)
@@ -178,7 +178,7 @@ def test_eager_torch_and_the_graphs_draw_the_same_noise(source, tmp_path: Path):
 def test_progress_is_told(plain, tmp_path: Path):
     told: list[str] = []
     (tmp_path / "out").mkdir()
-    context = Context(tell=lambda what, share: told.append(what))
+    context = Context(progress=lambda what, share: told.append(what))
     ExportOnnx().run(plain("return self.linear(x)"), tmp_path / "out", context)
     assert "exporting main" in told
 
@@ -385,7 +385,7 @@ def test_a_policy_in_another_float_is_exported_in_float32_and_told(tmp_path: Pat
     source = TorchModule(policy=tmp_path).run(None, folders[0], Context())
     context = Context()
     exported = ExportOnnx().run(source, folders[1], context)
-    assert f"layers compute in {name}; the graph is converted to float32" in context.said[0]
+    assert f"layers compute in {name}; the graph is converted to float32" in context.messages[0]
     graph = onnx.load(exported.path / "graphs/main.onnx").graph
     assert {tensor.data_type for tensor in graph.initializer} == {1}
     assert exported.manifest.graphs["main"].precision == {"float32": 1.0}

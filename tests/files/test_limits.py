@@ -1,7 +1,7 @@
 import pytest
 
 from vlatool.errors import BundleError, UsageError
-from vlatool.files.limits import LIMITS, check, limit
+from vlatool.files.limits import LIMITS, check_limit, limit
 
 
 def test_a_limit_is_its_default_until_the_environment_says_otherwise(monkeypatch):
@@ -20,12 +20,12 @@ def test_a_malformed_variable_is_told(monkeypatch, told):
 
 def test_more_than_allowed_names_the_limit_and_how_to_raise_it(monkeypatch):
     monkeypatch.setenv("VLATOOL_LIMITS", "files=2")
-    check("files", 2, "The bundle", BundleError)
+    check_limit("files", 2, "The bundle", BundleError)
     with pytest.raises(BundleError, match=r"The bundle has 3 files; the limit 'files' allows 2") as caught:
-        check("files", 3, "The bundle", BundleError)
+        check_limit("files", 3, "The bundle", BundleError)
     assert "VLATOOL_LIMITS=files=3" in caught.value.fix
 
 
 def test_a_number_of_thousands_of_digits_is_told():
     with pytest.raises(BundleError, match=r"more than 2\^33"):
-        check("repeat", 10**10000, "The step", BundleError)
+        check_limit("repeat", 10**10000, "The step", BundleError)

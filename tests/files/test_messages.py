@@ -17,9 +17,9 @@ from vlatool.files.messages import from_json, to_json
 ROUNDS = 40
 MODULES = (
     "vlatool.episodes.play", "vlatool.measurement.agreement", "vlatool.measurement.child",
-    "vlatool.measurement.cold_start", "vlatool.measurement.jobs", "vlatool.measurement.measured",
-    "vlatool.measurement.pairs", "vlatool.optimize.pipeline", "vlatool.remote._heard",
-    "vlatool.workers._seat",
+    "vlatool.measurement.cold_start", "vlatool.measurement.jobs", "vlatool.measurement.results",
+    "vlatool.measurement.pairs", "vlatool.optimize.pipeline", "vlatool.remote._validate_replies",
+    "vlatool.workers._remote_worker",
 )  # fmt: skip
 """Where messages are defined; what they are made of is followed from there."""
 NO_MESSAGES = {"_Asked"}

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import OutputError
+from vlatool.files.directory_writer import write_directory
 from vlatool.files.outputs import BUNDLE, REPORT, kind_of, refuse_inputs, refuse_replacing
-from vlatool.files.writing import writing
 
 
 @pytest.fixture
@@ -13,7 +13,7 @@ def work(tmp_path: Path, monkeypatch) -> Path:
     """A current directory that vlatool wrote, so that nothing else protects it."""
     place = tmp_path / "home/work"
     for folder in (place, place / "sub"):
-        with writing(folder) as draft:
+        with write_directory(folder) as draft:
             (draft / "report.json").touch()
     monkeypatch.chdir(place / "sub")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
@@ -28,15 +28,15 @@ def test_what_holds_the_current_or_the_home_directory_is_never_replaced(work: Pa
 
 
 def test_what_holds_the_cache_is_never_replaced(work: Path, tmp_path: Path):
-    with writing(tmp_path / "out") as draft:
+    with write_directory(tmp_path / "out") as draft:
         (draft / "report.json").touch()
     with pytest.raises(OutputError, match="is the cache, or holds it"):
-        refuse_replacing(tmp_path / "out", force=True, further={"the cache": tmp_path / "out/cache"})
+        refuse_replacing(tmp_path / "out", force=True, protected={"the cache": tmp_path / "out/cache"})
 
 
 @pytest.mark.parametrize("target", ["out", "nowhere"])
 def test_nothing_is_replaced_through_a_link(tmp_path: Path, target: str):
-    with writing(tmp_path / "out") as draft:
+    with write_directory(tmp_path / "out") as draft:
         (draft / "report.json").touch()
     (tmp_path / "link").symlink_to(target)
     with pytest.raises(OutputError, match="is a link"):
@@ -95,7 +95,7 @@ CONTENT = {BUNDLE: ("manifest.json", "manifest.sha256"), REPORT: ("report.json",
 
 
 def written(place: Path, kind: str) -> Path:
-    with writing(place, force=True) as draft:
+    with write_directory(place, force=True) as draft:
         for name in CONTENT[kind]:
             (draft / name).write_text(kind)
     return place

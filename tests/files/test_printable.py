@@ -1,6 +1,6 @@
 import pytest
 
-from vlatool.files.printable import TOLD, message_of, one_line, printable, without_password
+from vlatool.files.printable import MAX_CHARACTERS, mask_passwords, message_of, one_line, printable
 
 
 @pytest.mark.parametrize(
@@ -29,9 +29,9 @@ class _Mute(Exception):
 def test_an_exception_without_a_text_is_told():
     assert message_of(ValueError("a")) == "a"
     assert message_of(ValueError("\udcff")) == "?"
-    assert message_of(ValueError("z" * 10**7)) == "z" * TOLD + "... (10,000,000 characters)"
-    assert message_of(ValueError("z" * TOLD)) == "z" * TOLD
-    assert message_of(_Mute()) == "(its text cannot be told: ValueError)"
+    assert message_of(ValueError("z" * 10**7)) == "z" * MAX_CHARACTERS + "... (10,000,000 characters)"
+    assert message_of(ValueError("z" * MAX_CHARACTERS)) == "z" * MAX_CHARACTERS
+    assert message_of(_Mute()) == "(its text cannot be read: ValueError)"
 
 
 SECRET = "s3cr3t"
@@ -55,8 +55,8 @@ ADDRESSES = (
 
 @pytest.mark.parametrize("address", ADDRESSES)
 def test_no_address_tells_its_password(address: str):
-    assert SECRET not in without_password(address)
-    assert "***" in without_password(address)
+    assert SECRET not in mask_passwords(address)
+    assert "***" in mask_passwords(address)
 
 
 @pytest.mark.parametrize("text", [
@@ -64,4 +64,4 @@ def test_no_address_tells_its_password(address: str):
     "a sentence: with a colon", "user@host:~/venv/bin/python", "relative_error=0.04",
 ])  # fmt: skip
 def test_what_has_no_password_stays(text: str):
-    assert without_password(text) == text
+    assert mask_passwords(text) == text

@@ -48,7 +48,7 @@ def test_rows_are_those_of_the_array_in_any_order(tmp_path: Path, save: Callable
 
 
 def test_blocks_are_all_rows_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, save: Callable[..., None]):
-    monkeypatch.setattr("vlatool.files.rows.BLOCK", 700)
+    monkeypatch.setattr("vlatool.files.rows.BLOCK_BYTES", 700)
     save(tmp_path / "a.npz", image=frames())
     found = list(blocks(rows(tmp_path / "a.npz")))
     assert [first for first, _ in found][:3] == [0, 3, 6]

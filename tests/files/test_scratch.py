@@ -14,13 +14,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from vlatool.data.npz import NpzReader
 from vlatool.errors import BundleError, GraphError, OutputError, VlatoolError
 from vlatool.files import scratch as scratch_module
-from vlatool.files.edited import whole_file
+from vlatool.files.directory_writer import write_directory
+from vlatool.files.npz import open_rows
 from vlatool.files.scratch import scratch_directory
-from vlatool.files.writing import writing
-from vlatool.measurement.child import ended
+from vlatool.files.user_files import atomic_file
+from vlatool.measurement.child import end_error
 from vlatool.measurement.jobs import Limits
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
@@ -42,18 +42,18 @@ def refused_by_openvino(place: Path) -> None:
 def corrupt(place: Path) -> None:
     (place / "graphs").mkdir()
     (place / "graphs/main.onnx").write_bytes(b"PK not an archive")
-    NpzReader().read(place / "graphs/main.onnx")
+    open_rows(place / "graphs/main.onnx")
 
 
 def last_words(place: Path) -> None:
     code = "import sys; sys.exit(f'cannot map {sys.argv[1]}/graphs/main.onnx')"
     done = subprocess.run([sys.executable, "-c", code, str(place)], capture_output=True, text=True, check=False)
-    raise ended("the policy", done.returncode, done.stderr, Limits())
+    raise end_error("the policy", done.returncode, done.stderr, Limits())
 
 
 def a_child(place: Path) -> None:
     file = str(place / "graphs/main.onnx")
-    call("vlatool.stage._inside:run", {"stage": "sources.onnx", "options": {"model": file}, "source": ""}, print, file)
+    call("vlatool.stage._child:run", {"stage": "sources.onnx", "options": {"model": file}, "source": ""}, print, file)
 
 
 def named_in_the_fix(place: Path) -> None:
@@ -67,7 +67,7 @@ KINDS = (refused_by_onnxruntime, refused_by_openvino, corrupt, last_words, a_chi
 @pytest.mark.parametrize("out", ["out", "deep/run[1]"])
 def test_an_error_about_a_draft_names_the_output(tmp_path: Path, monkeypatch, kind: Callable[[Path], None], out: str):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(VlatoolError) as caught, writing(Path(out)) as draft:
+    with pytest.raises(VlatoolError) as caught, write_directory(Path(out)) as draft:
         kind(draft)
     told = str(caught.value)
     assert f"{out}/graphs/main.onnx" in told
@@ -77,7 +77,10 @@ def test_an_error_about_a_draft_names_the_output(tmp_path: Path, monkeypatch, ki
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_an_error_about_a_draft_in_the_cache_names_the_file_alone(tmp_path: Path, kind: Callable[[Path], None]):
-    with pytest.raises(VlatoolError) as caught, writing(tmp_path / "stages/export.onnx-0a1b", damaged=True) as draft:
+    with (
+        pytest.raises(VlatoolError) as caught,
+        write_directory(tmp_path / "stages/export.onnx-0a1b", damaged=True) as draft,
+    ):
         kind(draft)
     told = str(caught.value)
     assert "graphs/main.onnx" in told
@@ -86,7 +89,7 @@ def test_an_error_about_a_draft_in_the_cache_names_the_file_alone(tmp_path: Path
 
 def test_an_error_about_a_draft_in_the_cache_as_a_whole_names_its_stage(tmp_path: Path):
     place = tmp_path / "stages/export.onnx-0a1b"
-    with pytest.raises(BundleError) as caught, writing(place, damaged=True) as draft:
+    with pytest.raises(BundleError) as caught, write_directory(place, damaged=True) as draft:
         raise BundleError(f"{draft} is half.")
     assert caught.value.message == "the output of export.onnx is half."
 
@@ -94,20 +97,20 @@ def test_an_error_about_a_draft_in_the_cache_as_a_whole_names_its_stage(tmp_path
 def test_a_link_on_the_way_to_a_draft_hides_it_from_nobody(tmp_path: Path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
-    with pytest.raises(GraphError) as caught, writing(tmp_path / "link/out") as draft:
+    with pytest.raises(GraphError) as caught, write_directory(tmp_path / "link/out") as draft:
         raise GraphError(f"the library refuses {os.path.realpath(draft)}/main.onnx")
     assert caught.value.message == f"the library refuses {tmp_path}/link/out/main.onnx"
 
 
 def test_an_error_of_the_system_names_the_output(tmp_path: Path):
-    with pytest.raises(FileNotFoundError) as caught, writing(tmp_path / "out") as draft:
+    with pytest.raises(FileNotFoundError) as caught, write_directory(tmp_path / "out") as draft:
         (draft / "graphs/main.onnx").read_bytes()
     assert caught.value.filename == str(tmp_path / "out/graphs/main.onnx")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
 def test_a_full_disk_of_the_cache_says_where_the_cache_could_be(tmp_path: Path, number: int):
-    with pytest.raises(OutputError) as caught, writing(tmp_path / "stages/x-1", damaged=True) as draft:
+    with pytest.raises(OutputError) as caught, write_directory(tmp_path / "stages/x-1", damaged=True) as draft:
         raise OSError(number, os.strerror(number), str(draft / "a"))
     assert "VLATOOL_CACHE=DIR" in caught.value.fix
     assert "vlatool cache prune" in caught.value.fix
@@ -121,14 +124,14 @@ def test_a_cache_that_may_not_be_written_says_where_it_could_be(tmp_path: Path, 
         raise OSError(number, os.strerror(number), str(path))
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(OutputError) as caught, writing(tmp_path / "stages/x-1", damaged=True):
+    with pytest.raises(OutputError) as caught, write_directory(tmp_path / "stages/x-1", damaged=True):
         pytest.fail("the block must not run")
     assert caught.value.fix == "keep the cache elsewhere: VLATOOL_CACHE=DIR"
 
 
 def test_a_cache_below_a_file_says_where_it_could_be(tmp_path: Path):
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError) as caught, writing(tmp_path / "file/stages/x-1", damaged=True):
+    with pytest.raises(OutputError) as caught, write_directory(tmp_path / "file/stages/x-1", damaged=True):
         pytest.fail("the block must not run")
     assert "VLATOOL_CACHE=DIR" in caught.value.fix
 
@@ -144,10 +147,10 @@ def test_an_error_about_a_scratch_folder_names_the_file_alone(kind: Callable[[Pa
 
 
 def test_an_error_about_the_draft_of_a_file_names_the_file(tmp_path: Path):
-    with pytest.raises(OutputError) as caught, whole_file(tmp_path / "v.mp4") as draft:
+    with pytest.raises(OutputError) as caught, atomic_file(tmp_path / "v.mp4") as draft:
         raise OutputError(f"ffmpeg could not write the video: {draft}: it is full.", "write a .gif")
     assert caught.value.message == f"ffmpeg could not write the video: {tmp_path}/v.mp4: it is full."
-    with pytest.raises(OSError, match="full") as met, whole_file(tmp_path / "v.mp4") as draft:
+    with pytest.raises(OSError, match="full") as met, atomic_file(tmp_path / "v.mp4") as draft:
         raise OSError(errno.ENOSPC, "full", str(draft))
     assert met.value.filename == str(tmp_path / "v.mp4")
     assert [path.name for path in tmp_path.iterdir()] == ["temporary"]
@@ -230,7 +233,7 @@ def test_a_link_is_not_followed_and_a_held_lock_counts(temporary: Path, tmp_path
 def test_a_full_temporary_folder_is_blamed_and_not_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scratch_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=4096))
     says = f"Cannot write temporary files to {tmp_path}/temporary: the disk is full"
-    with pytest.raises(OutputError, match=says) as caught, writing(tmp_path / "out"), scratch_directory():
+    with pytest.raises(OutputError, match=says) as caught, write_directory(tmp_path / "out"), scratch_directory():
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert "TMPDIR" in caught.value.fix
     assert not (tmp_path / "out").exists()
@@ -240,12 +243,12 @@ def test_a_full_temporary_folder_is_blamed_and_not_the_output(tmp_path: Path, mo
 def test_a_disk_that_is_full_elsewhere_is_not_the_temporary_folders(tmp_path: Path, named: bool) -> None:
     where = (str(tmp_path / "out/file"),) if named else ()
     with pytest.raises(OutputError, match=f"Cannot write {tmp_path}/out: the disk is full"), \
-            writing(tmp_path / "out"), scratch_directory():  # fmt: skip
+            write_directory(tmp_path / "out"), scratch_directory():  # fmt: skip
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *where)
 
 
 def test_a_directory_that_is_written_among_temporary_files_is_one_of_them() -> None:
     with scratch_directory() as folder, pytest.raises(OutputError, match="Cannot write temporary files: ") as caught, \
-            writing(folder / "0-export.onnx"):  # fmt: skip
+            write_directory(folder / "0-export.onnx"):  # fmt: skip
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert "TMPDIR" in caught.value.fix

@@ -10,7 +10,6 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.data import EVALUATION
 from vlatool.gate import run as run_gate_module
 from vlatool.gate.claims import growth
 from vlatool.gate.inputs import TIMING, Inputs
@@ -121,8 +120,8 @@ def test_the_report_says_on_what_it_was_judged(cheated, tmp_path: Path, gate) ->
     config = gate_cheats.gate_file({"latency": None, "memory": None}, tmp_path / "gate.yaml")
     reports = [run_gate(made, base, read_gate(config), Context(), seed) for seed in (None, None, 5)]
     told = [{each["what"]: each["value"] for each in report.rows[1].details["measured with"]} for report in reports]
-    assert told[0]["evaluation data"] == f"sha256:{hash_file(base.path / EVALUATION)}"
-    assert told[0]["evaluation data"] != f"sha256:{hash_file(made.path / EVALUATION)}"
+    assert told[0]["evaluation data"] == f"sha256:{hash_file(base.path / 'data/evaluation.npz')}"
+    assert told[0]["evaluation data"] != f"sha256:{hash_file(made.path / 'data/evaluation.npz')}"
     assert told[0]["seed"] != told[1]["seed"], "nobody can know it before"
     assert told[2]["seed"] == 5
     assert reports[2].summary[-1].endswith("with the seed 5; --seed 5 draws them again.")

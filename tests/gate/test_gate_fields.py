@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from vlatool.bundle.bundle import Bundle, restate
+from vlatool.bundle.bundle import Bundle, replace_manifest
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import PolicySpec, TensorSpec
@@ -173,7 +173,7 @@ def test_a_field_of_the_candidates_own_changes_no_verdict(
     float_bundle: Bundle, claims_of_the_same, copied, name: str
 ) -> None:
     other = copied(float_bundle)
-    assert claims(restate(other, OWN[name](other.manifest)), float_bundle) == claims_of_the_same
+    assert claims(replace_manifest(other, OWN[name](other.manifest)), float_bundle) == claims_of_the_same
 
 
 def test_no_field_of_its_own_saves_a_candidate_that_is_wrong(float_bundle: Bundle, here, tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_no_field_of_its_own_saves_a_candidate_that_is_wrong(float_bundle: Bundl
     embellished = wrong.manifest
     for change in OWN.values():
         embellished = change(embellished)
-    assert claims(restate(wrong, embellished), float_bundle, gate) == found
+    assert claims(replace_manifest(wrong, embellished), float_bundle, gate) == found
 
 
 def test_the_documentation_says_of_each_field_who_decides() -> None:

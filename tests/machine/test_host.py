@@ -208,3 +208,20 @@ def test_processors_that_are_busy_are_counted_over_a_while(tmp_path, monkeypatch
 def test_processors_of_this_machine_are_between_none_and_all():
     found = host.busy_processors(seconds=0.05)
     assert found is None or 0 <= found <= host.online_cores()
+
+
+@pytest.mark.parametrize(
+    ("said", "driver"),
+    [
+        ("NVRM version: NVIDIA UNIX x86_64 Kernel Module  550.54.15  Tue Mar  5 22:23:56 UTC 2024\n", "550.54.15"),
+        ("NVRM version: NVIDIA UNIX Open Kernel Module for aarch64  540.3.0  Release Build  (bugfix)\n", "540.3.0"),
+    ],
+)
+def test_graphics_cards_and_their_driver(tmp_path: Path, said: str, driver: str) -> None:
+    assert (host.gpus(tmp_path), host.gpu_driver(tmp_path)) == ((), None)
+    cards = {
+        f"proc/driver/nvidia/gpus/0000:0{n}:00.0/information": f"Model: \t\t NVIDIA A{n}\nIRQ: 1\n" for n in (2, 1)
+    }
+    root = tree(tmp_path, {**cards, "proc/driver/nvidia/version": said})
+    assert host.gpus(root) == ("NVIDIA A1", "NVIDIA A2")
+    assert host.gpu_driver(root) == f"NVIDIA driver {driver}"

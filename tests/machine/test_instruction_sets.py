@@ -9,7 +9,15 @@ import pytest
 from vlatool.hardware.profile import load_profile
 from vlatool.machine import instruction_sets
 from vlatool.machine.host import ISA_FEATURES, isa
-from vlatool.machine.instruction_sets import RUNGS, BoardSet, about_onnx_runtime, board_set, compared, computed_in, rung
+from vlatool.machine.instruction_sets import (
+    RUNGS,
+    BoardSet,
+    about_onnx_runtime,
+    board_set,
+    compare_sets,
+    openvino_set,
+    rung,
+)
 
 NUC = ("avx2", "fma", "f16c", "avx_vnni")
 OLD = ("avx2", "fma", "f16c")
@@ -53,7 +61,7 @@ def test_every_feature_that_tells_sets_apart_is_read_from_the_processor():
     ],
 )
 def test_a_host_is_confined_where_it_has_the_set_of_the_board(board, host, to_set: str, lacks: str):
-    found = compared("board", board, host)
+    found = compare_sets("board", board, host)
     assert (found.to_set, found.lacks) == (to_set, lacks)
     assert found.plan() != "" or not found.wanted
 
@@ -64,7 +72,7 @@ def test_a_host_is_confined_where_it_has_the_set_of_the_board(board, host, to_se
      (NUC, ZEN5, "AVX2_VNNI", True), (NUC, ZEN4, "AVX2_VNNI", False)],
 )  # fmt: skip
 def test_a_process_is_confined_when_the_variable_says_so_and_the_processor_can(board, host, told: str, confined: bool):
-    found = compared("board", board, host, told)
+    found = compare_sets("board", board, host, told)
     assert found.confined is confined
     assert not found.to_set or not told, "what a person set is not set again"
 
@@ -73,20 +81,22 @@ def test_a_process_is_confined_when_the_variable_says_so_and_the_processor_can(b
     ("host", "told", "warned"), [(NUC, "AVX512_CORE_AMX", False), (ZEN4, "AVX512_CORE_AMX", True), (NUC, "AVX2", True)]
 )
 def test_a_name_above_what_the_processor_has_confines_nothing(host, told: str, warned: bool):
-    found = compared("nuc", NUC, host, told)
-    assert found.alike is (host == NUC and told != "AVX2")
+    found = compare_sets("nuc", NUC, host, told)
+    assert found.same_set is (host == NUC and told != "AVX2")
     assert bool(found.warnings()) is warned
     assert ("ONEDNN_MAX_CPU_ISA" in str(found.warnings())) is (told == "AVX2")
 
 
 def test_what_is_said_of_a_confined_run():
-    set_, engines = compared("nuc", NUC, ZEN5, "AVX2_VNNI").sentences()
+    set_, engines = compare_sets("nuc", NUC, ZEN5, "AVX2_VNNI").sentences()
     assert "confined to AVX2_VNNI, the instruction set of nuc: its errors are of that set" in set_
     assert "of the same instruction set on another core; its milliseconds are not the board's" in set_
     assert "this host's own set (AVX512_CORE_BF16), and no ratio between the two engines is given." in engines
     assert "VNNI and the board has none" not in engines
-    assert not compared("nuc", NUC, ZEN5, "AVX2_VNNI").warnings()
-    assert "It has VNNI and the board has none: int8 gains less" in compared("old", OLD, ZEN4, "AVX2").sentences()[1]
+    assert not compare_sets("nuc", NUC, ZEN5, "AVX2_VNNI").warnings()
+    assert (
+        "It has VNNI and the board has none: int8 gains less" in compare_sets("old", OLD, ZEN4, "AVX2").sentences()[1]
+    )
 
 
 @pytest.mark.parametrize(
@@ -101,7 +111,7 @@ def test_what_is_said_of_a_confined_run():
     ],
 )
 def test_a_host_without_the_set_says_so_and_what_its_figures_are_worth(board, host, says: str):
-    found = compared("nuc", board, host)
+    found = compare_sets("nuc", board, host)
     (warning,) = found.warnings()
     assert says in warning
     assert "speed-ups are not those of the board" in warning
@@ -111,13 +121,13 @@ def test_a_host_without_the_set_says_so_and_what_its_figures_are_worth(board, ho
 
 
 def test_a_set_that_a_person_chose_is_kept_and_told():
-    (warning,) = compared("nuc", NUC, ZEN5, "AVX512_CORE").warnings()
+    (warning,) = compare_sets("nuc", NUC, ZEN5, "AVX512_CORE").warnings()
     assert warning.startswith("ONEDNN_MAX_CPU_ISA=AVX512_CORE is set")
 
 
 def test_a_host_of_the_same_set_needs_nothing_and_says_that_the_core_is_another():
-    found = compared("nuc", NUC, NUC)
-    assert (found.to_set, found.warnings(), found.alike) == ("", (), True)
+    found = compare_sets("nuc", NUC, NUC)
+    assert (found.to_set, found.warnings(), found.same_set) == ("", (), True)
     assert "milliseconds are this host's" in found.sentences()[0]
 
 
@@ -168,6 +178,6 @@ def test_flags_of_every_core_count(tmp_path: Path):
 def test_what_openvino_computes_in_is_the_variable_or_the_processor(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
     monkeypatch.setattr(instruction_sets, "isa", lambda: list(NUC))
-    assert computed_in() == "AVX2_VNNI"
+    assert openvino_set() == "AVX2_VNNI"
     monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", "AVX2")
-    assert computed_in() == "AVX2"
+    assert openvino_set() == "AVX2"

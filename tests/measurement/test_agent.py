@@ -12,7 +12,7 @@ from vlatool.files.messages import from_json, to_json
 from vlatool.machine.processes import python_command
 from vlatool.measurement.agent import WORKER, measure
 from vlatool.measurement.jobs import LatencyJob, Limits
-from vlatool.measurement.measured import Measured
+from vlatool.measurement.results import Benchmark
 
 
 def quiet(what, share):
@@ -23,7 +23,7 @@ def test_a_measurement_holds_the_host_the_board_and_the_cold_starts(float_bundle
     told = []
     job = LatencyJob((str(float_bundle.path),), iterations=20, warmup=1, cold=1)
     found = measure(job, lambda what, share: told.append(what))
-    assert from_json(Measured, json.loads(json.dumps(to_json(found)))) == found
+    assert from_json(Benchmark, json.loads(json.dumps(to_json(found)))) == found
     assert found.host["cores"] >= 1
     assert {"opening", "measuring latency", "cold start of each in a fresh process"} <= set(told)
     (start,) = found.policies[0].cold
@@ -56,14 +56,14 @@ def test_the_agent_speaks_json_lines(float_bundle, tmp_path):
 
 def test_a_cold_start_that_fails_costs_nothing_else(float_bundle, monkeypatch):
     from vlatool.measurement import agent
-    from vlatool.measurement.rows import cold
+    from vlatool.measurement.rows import cold_rows
 
     def fails(*_):
         raise GraphError("the bundle has gone.")
 
     monkeypatch.setattr(agent, "cold_start", fails)
     found = measure(LatencyJob((str(float_bundle.path),), iterations=20, warmup=1, cold=1), quiet)
-    (one,) = cold(found.policies[0])
+    (one,) = cold_rows(found.policies[0])
     assert not one.known
     assert one.note == "the bundle has gone."
 

@@ -7,7 +7,7 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import BundleError, GraphError
-from vlatool.measurement.agreement import Followed, correlation, measure_agreement, run_agreement
+from vlatool.measurement.agreement import OutputAgreement, correlation, measure_agreement, run_agreement
 from vlatool.measurement.pairs import PairJob
 
 
@@ -69,7 +69,7 @@ def test_the_rounding_of_an_element_that_happens_to_stand_still_counts_little() 
 def test_a_fresh_process_says_how_int8_follows_float32(job: PairJob) -> None:
     found = measure_agreement(job)
     assert [(each.kind, each.output) for each in found.followed] == [("drawn", "action")]
-    assert isinstance(found.followed[0], Followed)
+    assert isinstance(found.followed[0], OutputAgreement)
     assert found.followed[0].correlation > 0.9
     assert (found.looked, found.strays, found.unsteady, found.skipped) == (30, 0, 0, 0)
     assert found.golden[0] == pytest.approx(0, abs=1e-5)

@@ -8,7 +8,7 @@ from _policies import Garbage, Memoising
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
-from vlatool.measurement.answers import AnswerCheck, Answers, expected_answers, remembered, varied
+from vlatool.measurement.answers import AnswerCheck, Answers, expected_answers, measure_caching, vary_observation
 from vlatool.runtime.policy import Policy
 
 
@@ -57,17 +57,17 @@ def test_a_slow_policy_is_asked_few_observations(policy, observations):
 
 
 def test_a_policy_that_remembers_is_caught_and_an_honest_one_is_not(policy, observations):
-    assert not remembered(policy, observations).remembers
+    assert not measure_caching(policy, observations).remembers
     memoising = Memoising(policy)
     expected_answers(memoising, observations)
-    found = remembered(memoising, observations)
+    found = measure_caching(memoising, observations)
     assert found.remembers
     assert found.ratio >= found.low > 1.10
     assert found.pairs == 40
 
 
 def test_observations_differ_a_little_where_they_can(policy, observations):
-    fresh = varied(observations[0], policy.spec, np.random.default_rng(0))
+    fresh = vary_observation(observations[0], policy.spec, np.random.default_rng(0))
     assert fresh["instruction"] == observations[0]["instruction"]
     for name in ("image", "proprio"):
         mine, theirs = np.asarray(fresh[name], float), np.asarray(observations[0][name], float)
@@ -84,4 +84,4 @@ def test_nothing_can_be_told_of_a_policy_that_takes_text_alone(policy, observati
             control_hz=10,
         )
 
-    assert remembered(Reader(), [{"words": "go"}]) is None
+    assert measure_caching(Reader(), [{"words": "go"}]) is None

@@ -13,7 +13,7 @@ from vlatool.measurement.child import (
     Result,
     answer,
     ask,
-    ended,
+    end_error,
     error_of,
     read_line,
     result_of,
@@ -58,15 +58,15 @@ def test_a_process_that_dies_is_named() -> None:
     ],
 )
 def test_how_a_process_ended_is_told(code, log, told) -> None:
-    error = ended("x", code, log, Limits(), "while it was measured")
+    error = end_error("x", code, log, Limits(), "while it was measured")
     assert isinstance(error, GraphError)
     assert told in error.message
 
 
 def test_a_process_under_a_limit_did_not_fit_only_where_memory_ended_it() -> None:
     limits = Limits(memory_mb=50)
-    assert isinstance(ended("x", -9, "", limits), GraphError), "something else killed it"
-    assert isinstance(ended("x", 1, "MemoryError", limits), GateFailed)
+    assert isinstance(end_error("x", -9, "", limits), GraphError), "something else killed it"
+    assert isinstance(end_error("x", 1, "MemoryError", limits), GateFailed)
     error = error_of(Raised("GraphError", "std::bad_alloc"), limits)
     assert isinstance(error, GateFailed)
     assert "more than 50 MB" in error.message
@@ -80,7 +80,7 @@ def test_what_is_no_error_of_vlatool_is_raised_as_the_other_one(name):
 
 def test_signals_have_names_where_there_are_some():
     assert [signal_name(code) for code in (-9, -40)] == ["SIGKILL", "signal 40"]
-    assert "SIGSEGV" in ended("x", -11, "", Limits()).message
+    assert "SIGSEGV" in end_error("x", -11, "", Limits()).message
 
 
 @pytest.mark.parametrize(

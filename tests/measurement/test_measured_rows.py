@@ -14,8 +14,8 @@ from _runs import QUIET, run_of
 from telemetry_boards import AGX_ORIN, NUC, ORIN_NANO, write
 
 from vlatool.measurement.cold_start import ColdStart
-from vlatool.measurement.measured import PolicyRun
-from vlatool.measurement.rows import measurements, raw, sustained, tables
+from vlatool.measurement.results import PolicyRun
+from vlatool.measurement.rows import measurements, raw, sustained_rows, tables
 from vlatool.telemetry import Absent, Gauge, Recorder, open_all
 
 
@@ -152,6 +152,6 @@ def test_memory_and_cold_start_by_part():
 
 
 def test_a_sustained_run_compares_its_end_with_its_start():
-    told = {each.name: each.value for each in sustained([1.0] * 500 + [1.5] * 500)}
+    told = {each.name: each.value for each in sustained_rows([1.0] * 500 + [1.5] * 500)}
     assert told == {"latency_start_p50": 1.0, "latency_sustained_p50": 1.5, "sustained_slowdown": 1.5}
     assert not any(math.isnan(value) for value in told.values())

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from vlatool.measurement.interleaved import latency_measurements
-from vlatool.measurement.paced import overloaded, paced_measurements, run_paced
+from vlatool.measurement.paced import is_overloaded, paced_measurements, run_paced
 
 
 class Loop:
@@ -96,7 +96,7 @@ def test_percentiles_of_few_ticks_are_refused_with_what_they_would_take():
 def test_nothing_is_bounded_where_many_ticks_share_an_inference():
     seen = Loop(25.0).run(1000).pace()
     assert seen.inferences < 600
-    assert overloaded(seen, 1000)
+    assert is_overloaded(seen, 1000)
     misses = paced_measurements(seen, 1000, 100.0)[0]
     assert (misses.value, misses.low, misses.high) == (1.0, None, None)
     wanted = latency_measurements([25.0] * 1000, refusals=True, most=0)

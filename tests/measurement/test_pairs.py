@@ -18,7 +18,16 @@ from vlatool.data import Drawer, read_recording, save_drawn
 from vlatool.errors import BundleError, GraphError
 from vlatool.measurement import turns
 from vlatool.measurement.pairs import FEWEST, PairJob, Pairs, measure_pairs
-from vlatool.measurement.turns import CONFIRM, Turns, halved, observation_of, place_of, run_job, sequence, wanted
+from vlatool.measurement.turns import (
+    CONFIRM,
+    Turns,
+    halve,
+    observation_count,
+    observation_of,
+    run_job,
+    sequence,
+    variant_index,
+)
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "validation/soak/attacks"))
 
@@ -55,7 +64,7 @@ def test_every_call_of_both_is_kept(job: PairJob) -> None:
     found = run_job(job)
     assert len(found.baseline_ms) == len(found.candidate_ms) == len(found.places) == 40
     assert min(found.baseline_ms + found.candidate_ms) > 0
-    assert len({observation_of(place)[0] for place in found.places}) == wanted(40) == 14
+    assert len({observation_of(place)[0] for place in found.places}) == observation_count(40) == 14
     assert (found.strays, found.unsteady) == (0, 0)
     assert found.looked > 5
 
@@ -99,11 +108,11 @@ def test_half_of_a_block_is_exact_another_half_each_time(count: int) -> None:
     order = random.Random(3)
     seen = set()
     for _ in range(60):
-        places = halved(range(count), order)
+        places = halve(range(count), order)
         assert [observation_of(place)[0] for place in places] == list(range(count))
         exact = {number for number, exact in map(observation_of, places) if exact}
         assert len(exact) in {count // 2, (count + 1) // 2}
-        seen |= {place_of(number, number in exact) for number in range(count)}
+        seen |= {variant_index(number, number in exact) for number in range(count)}
     assert seen == set(range(2 * count)), "each observation has been both"
 
 

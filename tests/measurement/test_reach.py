@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vlatool.errors import GraphError
-from vlatool.measurement.reach import MACS, SIZE, Product, reached, share_of_reach
+from vlatool.measurement.reach import MACS, SIZE, Product, measure_reach, share_of_reach
 
 
 @pytest.mark.parametrize("engine", ["ort_cpu", "openvino"])
@@ -28,12 +28,12 @@ def test_the_product_in_int8_is_near_it_and_does_not_saturate() -> None:
 def test_a_speed_is_that_of_its_multiply_accumulates(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = iter(range(0, 10**12, 10**9 // 4))
     monkeypatch.setattr("vlatool.measurement.reach.time.perf_counter_ns", lambda: next(ticks))
-    assert reached("ort_cpu", "float32", 1) == pytest.approx(MACS / 0.25 / 1e9)
+    assert measure_reach("ort_cpu", "float32", 1) == pytest.approx(MACS / 0.25 / 1e9)
 
 
 def test_a_dtype_that_an_engine_lacks_is_refused() -> None:
     with pytest.raises(GraphError, match="bfloat16"):
-        reached("ort_cpu", "bfloat16", 1)
+        measure_reach("ort_cpu", "bfloat16", 1)
 
 
 def test_the_share_adds_up_what_each_dtype_would_take() -> None:

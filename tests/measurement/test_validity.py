@@ -8,7 +8,7 @@ from _runs import QUIET, run_of
 from vlatool.measurement.answers import AnswerCheck, Memory
 from vlatool.measurement.clock_drift import canary_ms, drift
 from vlatool.measurement.jobs import LatencyJob, Limits
-from vlatool.measurement.measured import GraphEngine, PolicyRun
+from vlatool.measurement.results import GraphEngine, PolicyRun
 from vlatool.measurement.validity import findings, validity
 from vlatool.telemetry import Change, Gauge
 

@@ -16,7 +16,7 @@ from vlatool.measurement.answers import AnswerCheck
 from vlatool.measurement.interleaved import Contestant, latency_measurements
 from vlatool.measurement.jobs import LatencyJob, WorkerJob
 from vlatool.measurement.validity import findings
-from vlatool.measurement.worker import measure, opened, run_job
+from vlatool.measurement.worker import measure, open_policy, run_job
 from vlatool.runtime.policy import Policy
 
 
@@ -120,7 +120,7 @@ def test_nothing_to_run_is_refused(float_bundle, copied):
     bare = copied(float_bundle)
     seal(bare.path, replace(bare.manifest, graphs={}, program=(), source={}))
     with pytest.raises(BundleError, match="has nothing to run"):
-        opened(str(bare.path), job(bare))
+        open_policy(str(bare.path), job(bare))
 
 
 def test_the_process_waits_for_the_word_and_says_what_it_found(float_bundle: Bundle):

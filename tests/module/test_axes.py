@@ -11,11 +11,11 @@ from torch import nn
 from torch.nn import functional
 
 from vlatool.errors import SourceError
-from vlatool.module._resized import Resizer
+from vlatool.module._resizer import Resizer
 from vlatool.module.axes import Member, Walk
-from vlatool.module.cut import RETRACE, cut, traced
 from vlatool.module.edits import Edit
 from vlatool.module.factors import Factors
+from vlatool.module.unit_removal import RETRACE, remove_units, trace_module
 
 WIDTH, HEADS = 24, 4
 
@@ -56,7 +56,7 @@ def units(walk: Walk) -> dict[str, int]:
 
 
 def walked(module: nn.Module, *feeds: torch.Tensor) -> Walk:
-    return Walk(traced(module.eval(), feeds))
+    return Walk(trace_module(module.eval(), feeds))
 
 
 @pytest.mark.parametrize("form", ["chunk", "split"])
@@ -76,7 +76,7 @@ def test_heads_are_found_in_reshapes(form: str):
 def test_a_head_that_goes_is_a_head_that_says_nothing(form: str):
     torch.manual_seed(0)
     module, tokens = Attention(form).eval(), torch.randn(1, 5, WIDTH)
-    small = cut(module, [tokens], [Edit("main", "joint.weight", "units 0.1", (0, 3))])
+    small = remove_units(module, [tokens], [Edit("main", "joint.weight", "units 0.1", (0, 3))])
     with torch.no_grad():
         module.output.weight.view(WIDTH, HEADS, -1)[:, 1:3] = 0
         torch.testing.assert_close(small(tokens), module(tokens))
@@ -112,7 +112,7 @@ def test_channels_are_coupled_through_normalisation_depth_residual_film_and_flat
     assert coupled >= {"norm.running_var 0.0", "deep.weight 0.0", "second.weight 0.0", "second.weight 1.0",
                        "film.weight 0.1", "last.weight 1.0"}  # fmt: skip
     keep = (1, 2, 5)
-    small = cut(module, list(feeds), [Edit("main", "first.weight", "units 0.0", keep)])
+    small = remove_units(module, list(feeds), [Edit("main", "first.weight", "units 0.0", keep)])
     with torch.no_grad():
         gone = [unit for unit in range(8) if unit not in keep]
         module.last.weight.view(5, 8, 36)[:, gone] = 0
@@ -199,7 +199,7 @@ def test_units_of_odd_operators_go_without_a_trace(make: type[nn.Module], shape:
         edits.append(Edit("main", first.weight, first.units, keep))
         for member in members:
             silence(whole.get_parameter(member.weight), member, keep)
-    small = cut(module, [feed], edits)
+    small = remove_units(module, [feed], edits)
     with torch.no_grad():
         torch.testing.assert_close(small(feed), whole(feed))
 
@@ -265,7 +265,7 @@ def test_a_cut_that_cannot_run_is_not_the_policys_fault(monkeypatch: pytest.Monk
     monkeypatch.setattr(Resizer, "resize", lambda self, node: None)
     module = nn.Sequential(nn.Linear(4, 8), nn.Unflatten(1, (8, 1)), nn.Flatten(), nn.Linear(8, 3))
     with pytest.raises(RuntimeError, match="what pruning left of the module cannot run: "):
-        cut(module, [torch.randn(1, 4)], [Edit("main", "0.weight", "units 0.0", (0, 2))])
+        remove_units(module, [torch.randn(1, 4)], [Edit("main", "0.weight", "units 0.0", (0, 2))])
 
 
 def test_a_tied_weight_is_one_axis_of_both_names_and_stays_tied():
@@ -281,7 +281,7 @@ def test_a_tied_weight_is_one_axis_of_both_names_and_stays_tied():
     module, feed = Tied(), torch.randn(1, 4)
     (members,) = walked(module, feed).members().values()
     assert {each.weight for each in members} >= {"b.weight", "c.weight"}
-    small = cut(module, [feed], [Edit("main", "a.weight", "units 0.0", (0, 2, 4))])
+    small = remove_units(module, [feed], [Edit("main", "a.weight", "units 0.0", (0, 2, 4))])
     assert small.get_parameter("b.weight") is small.get_parameter("c.weight")
     assert small.get_parameter("b.weight").shape == (3, 3)
 
@@ -303,7 +303,7 @@ def test_a_module_for_one_observation_is_traced_again_for_a_batch():
             return self.down(self.up(x).relu()).reshape(len(x), 2, 2)
 
     torch.manual_seed(0)
-    small = cut(One().eval(), [torch.randn(1, 4)], [Edit("main", "up.weight", "units 0.0", (0, 2, 4))])
+    small = remove_units(One().eval(), [torch.randn(1, 4)], [Edit("main", "up.weight", "units 0.0", (0, 2, 4))])
     again = getattr(small, RETRACE)(3)
     x = torch.randn(3, 4)
     torch.testing.assert_close(again(x), torch.cat([small(row[None]) for row in x]))
@@ -342,7 +342,7 @@ def test_units_of_torchs_attention_go_whatever_the_batch_is(whole: bool, to_othe
         whole_one = copy.deepcopy(module)
         for member in members:
             silence(whole_one.get_parameter(member.weight), member, keep)
-        small = cut(copy.deepcopy(module), [feed], [Edit("main", first.weight, units, keep)])
+        small = remove_units(copy.deepcopy(module), [feed], [Edit("main", first.weight, units, keep)])
         assert not hasattr(small, RETRACE), "one module for any batch"
         with torch.no_grad():
             torch.testing.assert_close(small(batch), whole_one(batch), msg=f"{first.weight} {units}")
@@ -365,7 +365,7 @@ def silence(weight: torch.Tensor, member: Member, keep: tuple[int, ...]) -> None
 def test_an_edit_that_does_not_fit_is_refused(edit: Edit, says: str):
     module = nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 3))
     with pytest.raises(SourceError, match=says):
-        cut(module, [torch.randn(1, 4)], [edit])
+        remove_units(module, [torch.randn(1, 4)], [edit])
 
 
 def test_what_cannot_be_traced_is_told():
@@ -376,7 +376,7 @@ def test_what_cannot_be_traced_is_told():
             return x
 
     with pytest.raises(SourceError, match=r"torch\.export cannot trace Loop") as caught:
-        traced(Loop(), [torch.ones(1, 2)])
+        trace_module(Loop(), [torch.ones(1, 2)])
     assert "vlatool prune depth" in caught.value.fix
 
 
@@ -402,7 +402,9 @@ def test_factors_are_divided_alike():
 def test_a_forward_may_take_what_is_kept_as_further_arguments(count: int, forward: Callable[..., torch.Tensor]):
     module = type("Further", (nn.Sequential,), {"forward": forward})()
     module.up, module.down = nn.Linear(4, 6), nn.Linear(6, 2)
-    small = cut(module.eval(), [torch.randn(1, 4)] * count, [Edit("main", "up.weight", "units 0.0", (0, 2, 4))])
+    small = remove_units(
+        module.eval(), [torch.randn(1, 4)] * count, [Edit("main", "up.weight", "units 0.0", (0, 2, 4))]
+    )
     batch = [torch.randn(3, 4) for _ in range(count)]
     with torch.no_grad():
         module.down.weight[:, [1, 3, 5]] = 0
@@ -425,7 +427,7 @@ def test_a_cut_module_computes_in_the_dtype_that_a_training_asks_for(convert: Ca
 
     torch.manual_seed(0)
     module = Converting().eval()
-    small = cut(module, [torch.randn(1, 4)], [Edit("main", "up.weight", "units 0.0", (0, 2, 4))])
+    small = remove_units(module, [torch.randn(1, 4)], [Edit("main", "up.weight", "units 0.0", (0, 2, 4))])
     with torch.no_grad():
         module.down.weight[:, [1, 3, 5]] = 0
     x = torch.randn(3, 4)

@@ -14,19 +14,19 @@ from torch import nn
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import SourceError
-from vlatool.module.cut import RETRACE
 from vlatool.module.edits import (
     EDITS,
     Edit,
     apply,
-    edited,
+    apply_bundle,
+    concatenate_edits,
     is_changed,
-    joined_edits,
     load_tensors,
     read_edits,
     read_tensors,
     write_module,
 )
+from vlatool.module.unit_removal import RETRACE
 
 
 def mlp() -> nn.Module:
@@ -94,12 +94,12 @@ def changed(source_bundle: Bundle, tmp_path: Path) -> Bundle:
 
 def test_what_is_written_is_made_again(changed: Bundle):
     assert is_changed(changed)
-    again = edited({"main": mlp()}, changed)["main"]
+    again = apply_bundle({"main": mlp()}, changed)["main"]
     x = torch.randn(4, 3)
     wanted = mlp()
     apply({"main": wanted}, read_edits(changed))
     torch.testing.assert_close(again(x), wanted(x))
-    structure = edited({"main": mlp()}, changed, weights=False)["main"]
+    structure = apply_bundle({"main": mlp()}, changed, weights=False)["main"]
     assert structure[0].out_features == 2
 
 
@@ -137,7 +137,7 @@ def test_a_bundle_without_changes_has_none(source_bundle: Bundle):
     assert not is_changed(source_bundle)
     assert read_edits(source_bundle) == ()
     module = mlp()
-    assert edited({"main": module}, source_bundle)["main"] is module
+    assert apply_bundle({"main": module}, source_bundle)["main"] is module
 
 
 @pytest.mark.parametrize("edit", [
@@ -171,13 +171,13 @@ def test_weights_of_another_shape_are_refused(changed: Bundle):
         changed.manifest, files={name: each for name, each in changed.manifest.files.items() if name != EDITS}
     )
     with pytest.raises(SourceError, match=r"has the shape \[2, 3\] in .*main.safetensors; the module's is \[6, 3\]"):
-        edited({"main": mlp()}, Bundle(changed.path, other))
+        apply_bundle({"main": mlp()}, Bundle(changed.path, other))
 
 
 def test_a_file_that_is_not_safetensors_is_refused(changed: Bundle):
     (changed.path / "module/main.safetensors").write_bytes(b"\xff" * 64)
     with pytest.raises(SourceError, match=r"main\.safetensors cannot be read as safetensors"):
-        edited({"main": mlp()}, changed)
+        apply_bundle({"main": mlp()}, changed)
 
 
 class Pair(nn.Module):
@@ -208,9 +208,9 @@ def test_units_of_what_is_left_are_those_of_another_trace(one: bool, monkeypatch
     monkeypatch.setattr("vlatool.module.edits.first_feeds", lambda modules, bundle: {"main": [x]})
     before = [Edit("main", "joint.weight", "units 0.1", (1,)), Edit("main", "other.weight", "units 0.0", (0,))]
     after = [Edit("main", "joint.weight", "units 0.1", (0, 2, 3)), Edit("main", "out.weight", "units 0.0", (0, 5))]
-    joined = joined_edits(before, after)
+    joined = concatenate_edits(before, after)
     assert [edit.axis for edit in joined] == ["units 0.1", "units 0.0", "units@2 0.1", "units@2 0.0"]
-    assert [edit.axis for edit in joined_edits(joined, after[:1])][4:] == ["units@3 0.1"]
+    assert [edit.axis for edit in concatenate_edits(joined, after[:1])][4:] == ["units@3 0.1"]
     bundle = Bundle(Path(), cast(Any, None))
     first = apply({"main": copy.deepcopy(module)}, before, bundle)
     wanted = apply(first, after, bundle)["main"]

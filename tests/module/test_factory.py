@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import MissingExtra, SourceError
-from vlatool.module.factory import call_factory, factory_file, import_factory, split_factory, yielded
+from vlatool.module.factory import call_factory, factory_file, import_factory, iterate_function, split_factory
 from vlatool.stats.intervals import wilson
 
 
@@ -199,12 +199,12 @@ def test_what_a_function_yields_is_gone_through_with_its_neighbours_at_hand(tmp_
     write(tmp_path, "STEP = 2\n", "neighbour.py")
     write(tmp_path, "def count(end):\n    from neighbour import STEP\n    yield from range(0, end, STEP)\n")
     before = list(sys.path)
-    values = yielded("policy.py:count", tmp_path, {"end": 5})
+    values = iterate_function("policy.py:count", tmp_path, {"end": 5})
     assert next(values) == 0
     assert sys.path == before, "between two values nothing is different"
     assert list(values) == [2, 4]
     write(tmp_path, "def listed():\n    return [3, 4]\n")
-    assert list(yielded("policy.py:listed", tmp_path, {})) == [3, 4]
+    assert list(iterate_function("policy.py:listed", tmp_path, {})) == [3, 4]
 
 
 @pytest.mark.parametrize(("body", "says"), [
@@ -217,12 +217,12 @@ def test_what_a_function_yields_is_gone_through_with_its_neighbours_at_hand(tmp_
 def test_a_function_that_does_not_yield_is_told(tmp_path: Path, body: str, says: str):
     write(tmp_path, f"def count():\n    {body}\n")
     with pytest.raises(SourceError, match=says):
-        list(yielded("policy.py:count", tmp_path, {}))
+        list(iterate_function("policy.py:count", tmp_path, {}))
 
 
 def test_a_value_that_is_not_asked_for_ends_nothing(tmp_path: Path):
     write(tmp_path, "def count():\n    while True:\n        yield 1\n")
-    values = yielded("policy.py:count", tmp_path, {})
+    values = iterate_function("policy.py:count", tmp_path, {})
     assert [next(values), next(values)] == [1, 1]
     values.close()
 
@@ -230,4 +230,4 @@ def test_a_value_that_is_not_asked_for_ends_nothing(tmp_path: Path):
 def test_a_package_that_is_missed_when_a_value_is_made(tmp_path: Path):
     write(tmp_path, "def count():\n    import no_such_package\n    yield 1\n")
     with pytest.raises(MissingExtra, match=r"'policy\.py:count' needs the package 'no_such_package'"):
-        list(yielded("policy.py:count", tmp_path, {}))
+        list(iterate_function("policy.py:count", tmp_path, {}))

@@ -13,8 +13,8 @@ from torch.nn import functional
 
 from vlatool.errors import SourceError
 from vlatool.module.axes import Walk
-from vlatool.module.cut import cut, traced
 from vlatool.module.edits import Edit, edits_from
+from vlatool.module.unit_removal import remove_units, trace_module
 
 cat = torch.cat
 
@@ -90,7 +90,7 @@ def test_units_of_segments_go_where_they_are_written_and_read(name: str):
     torch.manual_seed(0)
     between, parts, wanted = CASES[name]
     module, x = Joined(between, **parts), torch.randn(1, 3, 4)
-    walk = Walk(traced(module, [x]))
+    walk = Walk(trace_module(module, [x]))
     groups = {leaf: members for leaf, members in walk.members().items()
               if any((each.weight, each.axis) == ("read.weight", 1) for each in members)}  # fmt: skip
     assert (walk.unknown, sorted(walk.factors.sizes[leaf] for leaf in groups)) == (set(), wanted)
@@ -100,29 +100,29 @@ def test_units_of_segments_go_where_they_are_written_and_read(name: str):
         edits.append(Edit("main", members[0].weight, members[0].units, keep))
         for member in members:
             silence(whole, member, set(range(walk.factors.sizes[leaf])) - set(keep))
-    small = cut(module, [x], edits) if edits else module
+    small = remove_units(module, [x], edits) if edits else module
     batch = torch.randn(2, 3, 4)
     with torch.no_grad():
         assert_same(small(batch), whole(batch), name)
 
 
 def test_units_of_a_part_that_nothing_reads_go_too():
-    walk = Walk(traced(Joined(lambda s, a, b, x: b[..., :5]), [torch.randn(1, 3, 4)]))
+    walk = Walk(trace_module(Joined(lambda s, a, b, x: b[..., :5]), [torch.randn(1, 3, 4)]))
     assert sorted(walk.factors.sizes[leaf] for leaf in walk.members()) == [5, 8, 12, 13]
 
 
 @pytest.mark.parametrize("form", ["cat", "stack"])
 def test_an_edit_names_units_of_a_segment(form: str):
     module, x = nn.Sequential(Both(form), nn.Linear(2 * 6, 3)), torch.randn(1, 4)
-    units = {member.units: max(member.numbers) + 1 for members in Walk(traced(module, [x])).members().values()
+    units = {member.units: max(member.numbers) + 1 for members in Walk(trace_module(module, [x])).members().values()
              for member in members if member.weight == "1.weight"}  # fmt: skip
     wanted = {"units 1.0.0.0": 6, "units 1.0.1.0": 6} if form == "cat" else {"units 1.1": 6}
     assert units == wanted
     for axis in units:
         read = edits_from(f'[{{"graph": "main", "module": "1.weight", "axis": "{axis}", "keep": [1]}}]', "edits")
-        assert cut(copy.deepcopy(module), [x], read)(x).shape == (1, 3)
+        assert remove_units(copy.deepcopy(module), [x], read)(x).shape == (1, 3)
     with pytest.raises(SourceError, match="cannot be chosen from"):
-        cut(module, [x], [Edit("main", "1.weight", "units 1.0.2.0", (0,))])
+        remove_units(module, [x], [Edit("main", "1.weight", "units 1.0.2.0", (0,))])
 
 
 class Both(nn.Module):
@@ -143,7 +143,7 @@ def test_a_path_that_no_unit_can_have_is_refused(axis: str):
 
 def test_what_is_frozen_is_named_by_all_that_keep_it():
     module = Joined(lambda s, a, b, x: s["n"](cat([a, b], -1).cumsum(-1)), n=nn.LayerNorm(30))
-    walk = Walk(traced(module, [torch.randn(1, 3, 4)]))
+    walk = Walk(trace_module(module, [torch.randn(1, 3, 4)]))
     keepers = [set().union(*(names for _, names in walk.terms(product))) for product in range(4)]
     both = {"aten.cumsum", "aten.layer_norm"}
     assert keepers == [{*both, "the policy's inputs"}, {*both, "the policy's inputs"}, both, {"the policy's outputs"}]
@@ -151,7 +151,7 @@ def test_what_is_frozen_is_named_by_all_that_keep_it():
 
 def test_work_of_each_segment_is_a_term_of_its_own():
     module = Joined(lambda s, a, b, x: cat([x, a, b], -1))
-    walk = Walk(traced(module, [torch.randn(1, 3, 4)]))
+    walk = Walk(trace_module(module, [torch.randn(1, 3, 4)]))
     sizes = {leaf: walk.factors.sizes[leaf] for leaf in walk.members()}
     terms = walk.terms(2)
     assert sorted((sorted(sizes[leaf] for leaf in leaves), macs) for (leaves, _), macs in terms.items()) == [

@@ -11,7 +11,7 @@ from torch import nn
 from vlatool.bundle.program import ProgramStep
 from vlatool.module import torchlib
 from vlatool.module.to_onnx import OPSET, exported_by_torch
-from vlatool.module.torchlib import build, built_once
+from vlatool.module.torchlib import build, shared_table
 
 STEP = ProgramStep(graph="main", feeds={"x": "x"}, gives={"y": "y"})
 
@@ -35,7 +35,7 @@ def builds(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         return original.__get__(None, kind)(**options)
 
     monkeypatch.setattr(ONNXRegistry, "from_torchlib", classmethod(counted))
-    monkeypatch.setattr(torchlib, "_built", {})
+    monkeypatch.setattr(torchlib, "_tables", {})
     return seen
 
 
@@ -51,7 +51,7 @@ def test_exports_share_the_table_and_are_what_they_were(builds: list[Any], monke
 
 def test_a_table_is_the_callers_own(builds: list[Any]) -> None:
     registry = torchlib._registry()
-    with built_once():
+    with shared_table():
         one = registry.from_torchlib(opset_version=OPSET)
         name, functions = next(iter(one.functions.items()))
         functions.append("added")
@@ -68,5 +68,5 @@ def test_a_torch_without_such_a_table_exports_as_it_did(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(_registration, "ONNXRegistry", type("Other", (), {}))
     assert torchlib._registry() is None
-    with built_once():
+    with shared_table():
         build(OPSET)

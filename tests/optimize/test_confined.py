@@ -176,7 +176,7 @@ def test_a_child_has_the_variable_from_its_start_and_its_server_too(monkeypatch:
     monkeypatch.delenv(MAX_CPU_ISA, raising=False)
     for environment, told in (({MAX_CPU_ISA: "AVX2"}, b"AVX2"), (None, None)):
         before = dict(children._servers)
-        with children.Apart("policy.py", environment=environment):
+        with children.Child("policy.py", environment=environment):
             key = next(
                 kind for kind in children._servers if kind[0] == str(os.getpid()) and kind[-1] == (told or b"").decode()
             )

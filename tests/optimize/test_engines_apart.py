@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from vlatool.machine.instruction_sets import compared
+from vlatool.machine.instruction_sets import compare_sets
 from vlatool.optimize.choice_apart import choose_apart, on_board
 from vlatool.optimize.judge import Judged
 from vlatool.optimize.summary import about_int8, in_int8
 from vlatool.optimize.timings import IN_OPENVINO, REFERENCE, joined, placed
 from vlatool.report import Measurement, Row
 
-SET = compared("old", ("avx2",), ("avx2", "avx512f", "avx512_vnni"), "AVX2")
+SET = compare_sets("old", ("avx2",), ("avx2", "avx512f", "avx512_vnni"), "AVX2")
 ENGINES = {"ort": "ort_cpu", "fast": "openvino", "slow": "openvino"}
 BOARD = ("ort_cpu", "openvino")
 
@@ -142,14 +142,14 @@ def test_only_what_multiplies_in_int8_tells_how_int8_does(float_bundle):
 
 def test_a_board_without_vnni_and_without_a_plan_is_told_too_and_one_with_vnni_nothing():
     assert "no int8 plan of OpenVINO could be made" in about_int8({}, ENGINES, SET)[0]
-    assert about_int8({}, ENGINES, compared("nuc", ("avx_vnni",), ("avx_vnni", "avx512f"), "AVX2_VNNI")) == ()
+    assert about_int8({}, ENGINES, compare_sets("nuc", ("avx_vnni",), ("avx_vnni", "avx512f"), "AVX2_VNNI")) == ()
 
 
 @pytest.mark.parametrize(
     ("host", "told"), [(("avx2", "avx_vnni"), ""), (("avx2", "avx512f", "avx512_vnni"), "AVX512_CORE_VNNI")]
 )
 def test_what_was_timed_in_another_set_does_not_say_how_int8_does_on_the_board(host: tuple[str, ...], told: str):
-    where = compared("old", ("avx2", "avx512f"), host, told)
+    where = compare_sets("old", ("avx2", "avx512f"), host, told)
     (said,) = about_int8({"fast": judged("fast", 20.0, 40.0, None).row}, ENGINES, where)
     assert said.startswith("old has no VNNI")
     assert "wins" not in said

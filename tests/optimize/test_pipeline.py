@@ -22,14 +22,14 @@ from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.cli._run import exported
+from vlatool.cli._run import export_source
 from vlatool.errors import RecipeError, SourceError
 from vlatool.hardware.profile import load_profile
 from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
 from vlatool.report import Report, read_report
 from vlatool.runtime import load
-from vlatool.sources import brings_calibration, source_stage, sourced
+from vlatool.sources import brings_calibration, source_bundle, source_stage
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
@@ -97,9 +97,22 @@ def recipe(tmp_path):
     return write
 
 
+@pytest.fixture(scope="session")
+def shared_cache(tmp_path_factory) -> Path:
+    """A cache that the runs of several tests add to."""
+    return tmp_path_factory.mktemp("optimize") / "cache"
+
+
 @pytest.fixture
-def run(model, tmp_path):
-    """Optimize the ONNX file; every run of a test shares one cache."""
+def run(model, tmp_path, shared_cache):
+    """Optimize the ONNX file; what another test has made or measured is not made again."""
+    numbers = iter(range(99))
+    return lambda *more: optimize(model, tmp_path / f"out{next(numbers)}", shared_cache, *more)
+
+
+@pytest.fixture
+def run_apart(model, tmp_path):
+    """Optimize the ONNX file; every run of the test shares one cache, and no other test has it."""
     numbers = iter(range(99))
     return lambda *more: optimize(model, tmp_path / f"out{next(numbers)}", tmp_path / "cache", *more)
 
@@ -242,8 +255,8 @@ def test_the_summary_says_which_engine_the_robot_needs(run, recipe):
 # ---- repeat
 
 
-def test_the_recipe_of_the_result_makes_the_same_graphs_again_without_the_cache(run, recipe, model, tmp_path):
-    first = run(*NEAREST, *recipe(STATIC))
+def test_the_recipe_of_the_result_makes_the_same_graphs_again_without_the_cache(run_apart, recipe, model, tmp_path):
+    first = run_apart(*NEAREST, *recipe(STATIC))
     assert first.code == 1
     written = read_recipe(first.out / "recipe.yaml")
     assert list(written.candidates) == ["mine"]
@@ -254,20 +267,20 @@ def test_the_recipe_of_the_result_makes_the_same_graphs_again_without_the_cache(
     assert (again.out / "recipe.yaml").read_bytes() == (first.out / "recipe.yaml").read_bytes()
 
 
-def test_a_second_run_writes_nothing_new_into_the_cache(run):
-    first = run(*NEAREST)
+def test_a_second_run_writes_nothing_new_into_the_cache(run_apart):
+    first = run_apart(*NEAREST)
     before = stamps(first.cache)
-    second = run(*NEAREST)
+    second = run_apart(*NEAREST)
     assert stamps(first.cache) == before
     assert (second.out / "manifest.json").read_bytes() == (first.out / "manifest.json").read_bytes()
     assert [row.raw for row in second.report.rows] == [row.raw for row in first.report.rows]
 
 
-def test_fresh_measures_again_and_keeps_what_was_made(run, recipe):
+def test_fresh_measures_again_and_keeps_what_was_made(run_apart, recipe):
     mine = recipe(DYNAMIC)
-    first = run(*NEAREST, *mine)
+    first = run_apart(*NEAREST, *mine)
     before = stamps(first.cache)
-    assert run(*NEAREST, *mine, "--fresh").row("mine").raw != first.row("mine").raw
+    assert run_apart(*NEAREST, *mine, "--fresh").row("mine").raw != first.row("mine").raw
     after = stamps(first.cache)
     changed = {name.split("/")[1].rpartition("-")[0] for name in after if after[name] != before.get(name)}
     assert changed == {"benchmark.latency"}
@@ -281,12 +294,12 @@ def test_fresh_measures_again_and_keeps_what_was_made(run, recipe):
         *small_or_full([], [("sources.onnx", "manifest.json"), ("evaluate.recorded", "report.json")]),
     ],
 )
-def test_a_damaged_entry_of_the_cache_is_made_again(run, recipe, stage, file):
+def test_a_damaged_entry_of_the_cache_is_made_again(run_apart, recipe, stage, file):
     mine = recipe(DYNAMIC)
-    first = run(*NEAREST, *mine)
+    first = run_apart(*NEAREST, *mine)
     (damaged, *_rest) = sorted(first.cache.glob(f"stages/{stage}-*/{file}"))
     damaged.write_bytes(damaged.read_bytes()[:-20])
-    second = run(*NEAREST, *mine)
+    second = run_apart(*NEAREST, *mine)
     assert second.code == first.code
     assert f"the cached {stage} is damaged" in second.stderr
     assert (second.out / "manifest.json").read_bytes() == (first.out / "manifest.json").read_bytes()
@@ -294,10 +307,10 @@ def test_a_damaged_entry_of_the_cache_is_made_again(run, recipe, stage, file):
         Bundle.open(damaged.parents[file.count("/")])
 
 
-def test_an_option_of_one_candidate_leaves_the_others_in_the_cache(run, recipe):
-    first = run(*NEAREST, *recipe(DYNAMIC))
+def test_an_option_of_one_candidate_leaves_the_others_in_the_cache(run_apart, recipe):
+    first = run_apart(*NEAREST, *recipe(DYNAMIC))
     before = stamps(first.cache)
-    run(*NEAREST, *recipe(DYNAMIC.replace("{}", "{per_channel: false}")))
+    run_apart(*NEAREST, *recipe(DYNAMIC.replace("{}", "{per_channel: false}")))
     assert {name: stamp for name, stamp in stamps(first.cache).items() if name in before} == before
 
 
@@ -354,14 +367,14 @@ def test_without_any_accuracy_nothing_is_inside(run, recipe, model):
 
 
 def test_with_calibration_data_alone_the_error_against_float32_on_a_held_out_half_is_the_accuracy(
-    run, recipe, model, tmp_path
+    run_apart, recipe, model, tmp_path
 ):
     (model.parent / "evaluation.npz").unlink()
     with np.load(model.parent / "calibration.npz") as data:
         kept = {name: data[name] for name in data.files if name != "action"}
     np.savez(model.parent / "calibration.npz", **kept)
     asked = recipe("candidates: {mine: [quantize.static_int8: {}]}")
-    made = run("--max-drop", "100%", "--max-distance", "100%", "--no-search", *asked)
+    made = run_apart("--max-drop", "100%", "--max-distance", "100%", "--no-search", *asked)
     assert made.code == 0, made.stderr
     row = made.row("mine")
     assert row.get("error_baseline").samples == 12
@@ -504,8 +517,9 @@ def test_calibration_data_is_found_beside_the_description(policy_dir, model):
 
 
 def test_a_source_with_graphs_is_not_exported_again(model, tmp_path):
-    bundle = sourced(str(model), tmp_path, Context())
-    assert exported(str(model), tmp_path, Context()).path == bundle.path
+    stage = source_stage(str(model))
+    bundle = source_bundle(stage, tmp_path, Context())
+    assert export_source(stage, tmp_path, Context()).path == bundle.path
     assert list(bundle.manifest.graphs) == ["main"]
 
 

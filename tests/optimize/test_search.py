@@ -11,11 +11,13 @@ from _arithmetic import full_range_or_less
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.hardware.profile import load_profile
+from vlatool.machine import target
+from vlatool.machine.target import target_of
 from vlatool.optimize import search as search_module
 from vlatool.optimize.budget import Budget
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Limits
-from vlatool.optimize.search import Search, Trial, processor_has, variants_for
+from vlatool.optimize.search import Search, Trial, variants_for
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engines.openvino import BF16
 from vlatool.sensitivity.layers import LayerError
@@ -49,12 +51,12 @@ def test_bfloat16_is_tried_only_where_the_processor_has_it() -> None:
     nuc = variants_for(load_profile("intel-nuc-13-pro"), calibrated=True)
     assert "openvino_int8" in nuc
     assert "openvino_bf16" not in nuc
-    assert not processor_has(load_profile("intel-nuc-13-pro"), *BF16)
+    assert not target_of(load_profile("intel-nuc-13-pro")).has(*BF16)
 
 
 def test_convolutions_are_tried_only_where_the_processor_has_matrix_units(monkeypatch: pytest.MonkeyPatch) -> None:
     def options(*features: str) -> list[dict[str, Any]]:
-        monkeypatch.setattr(search_module, "isa", lambda: features)
+        monkeypatch.setattr(target, "isa", lambda: features)
         return [each for (stage,) in variants_for(None, calibrated=True).values() for each in stage.values()]
 
     assert not any("convolutions" in each for each in options("avx512_vnni", "avx512_bf16"))

@@ -18,7 +18,7 @@ from vlatool.stage.base import Context
 @pytest.fixture(autouse=True)
 def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stages run without a child of their own."""
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
 
 
 RECOVER: Any = ({"distill.policy": {}},)

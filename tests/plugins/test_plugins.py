@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from _console import Console
 from _environment import environment_beside
 
@@ -29,11 +31,17 @@ absent = acme_robotics.no_such_file
 
 [vlatool.engines]
 acme = acme_robotics.engine
+openvino-provider = acme_robotics.openvino_provider
+ggml-provider = acme_robotics.ggml_provider
 absent = acme_robotics.no_such_engine
 
 [vlatool.sources]
 acme = acme_robotics.source
+acme-checkpoint = acme_robotics.checkpoint
 a-first = acme_robotics.no_such_source
+
+[vlatool.data]
+acme-log = acme_robotics.log
 
 [vlatool.profiles]
 acme = acme_robotics.boards
@@ -102,7 +110,7 @@ def test_doctor_says_what_it_adds(run: Run):
         assert added in finding
     for broken in ("'absent' (vlatool.quantize)", "'absent' (vlatool.engines)", "'a-first' (vlatool.sources)"):
         assert f"{broken}, cannot be imported" in finding
-    assert told["engine acme_robotics"]["finding"] == "acme-robotics 1.2: Acme"
+    assert told["engine acme_robotics"]["finding"] == "acme-robotics 1.2: Azure, CPU"
 
 
 def test_its_profile_is_found_by_name(run: Run):
@@ -115,8 +123,104 @@ def test_its_method_its_source_and_its_engine_run(run: Run, onnx_file: Path, tmp
     ok(run("quantize", "rounded", str(tmp_path / "tiny.acme"), "-o", str(tmp_path / "out"), "--bits", "8"))
     made = json.loads((tmp_path / "out/manifest.json").read_text())["made_by"]
     assert (made["stage"], made["options"]) == ("quantize.rounded", {"bits": 8})
-    told = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20"))
-    assert "latency_p50" in told or "p50" in told
+    done = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20", "--json"))
+    (row,) = json.loads(done)["rows"]
+    assert row["details"]["engine"][0]["providers"].startswith("AzureExecutionProvider {}; CPUExecutionProvider {}; ")
+
+
+@pytest.fixture
+def log(policy_template: Path, tmp_path: Path) -> Path:
+    """The recording of the tiny policy as the package's robot logs it: a directory, of which one file is large."""
+    folder = tmp_path / "a.log"
+    (folder / "more").mkdir(parents=True)
+    with np.load(policy_template / "calibration.npz") as stored:
+        arrays = dict(stored)
+    large = {"image": arrays.pop("image")}
+    for name, values in large.items():
+        (folder / f"{name}.raw").write_bytes(values.tobytes())
+    about = {name: {"shape": values.shape, "dtype": str(values.dtype)} for name, values in large.items()}
+    small = {name: values.tolist() for name, values in arrays.items()}
+    times = [0.1 * number for number in range(len(large["image"]))]
+    (folder / "log.json").write_text(json.dumps({"large": about, "small": small, "times": times}))
+    (folder / "more/notes.txt").write_text("windy\n")
+    return folder
+
+
+@pytest.fixture
+def checkpoint(policy_dir: Path, log: Path) -> Path:
+    """The tiny policy as the package's trainer leaves it: no policy.yaml and no .npz."""
+    described = yaml.safe_load((policy_dir / "policy.yaml").read_text())
+    acme = {"model": "tiny", "revision": "1.2.0", "tensors": described["spec"], "code": "policy.py:make", "log": "log"}
+    (policy_dir / "acme.json").write_text(json.dumps({**acme, "simulation": described["environment"]}))
+    for name in ("policy.yaml", "calibration.npz", "evaluation.npz"):
+        (policy_dir / name).unlink()
+    log.rename(policy_dir / "log")
+    return policy_dir
+
+
+def test_its_directories_are_a_source_and_a_recording(run: Run, checkpoint: Path, tmp_path: Path):
+    float32, int8 = tmp_path / "float32", tmp_path / "int8"
+    ok(run("export", str(checkpoint), "-o", str(float32)))
+    bundle = Bundle.open(float32)
+    assert {name for name in bundle.manifest.files if name.startswith("data/")} == {
+        "data/calibration/image.raw", "data/calibration/log.json", "data/calibration/more/notes.txt",
+    }  # fmt: skip
+    ok(run("quantize", "static-int8", str(checkpoint), "-o", str(int8)))
+    samples = json.loads((int8 / "manifest.json").read_text())["made_by"]["calibration"]["samples"]
+    told = ok(run("evaluate", str(int8), "--baseline", str(float32), "--json"))
+    assert "held out of it" in json.loads(told)["warnings"][0]
+    whole = ok(run("evaluate", str(int8), "--data", str(checkpoint / "log"), "--json"))
+    assert json.loads(whole)["title"] == f"tiny on {2 * samples} recorded observations"
+    ok(run("evaluate", "closed-loop", str(float32), "--policy", str(checkpoint), "--episodes", "2"))
+    assert "static_int8" in ok(run("optimize", str(checkpoint), "--dry-run", "-o", str(tmp_path / "o")))
+    assert "identical" in ok(run("rebuild", str(int8), "--check", "--trust", str(checkpoint)))
+    (checkpoint / "log/more/notes.txt").write_text("calm!\n")
+    done = run("rebuild", str(int8), "--check", "--source", str(checkpoint))
+    assert f"The source {checkpoint} is not what {int8} was made from: log: got sha256:" in " ".join(
+        done.stderr.split()
+    )
+    (checkpoint / "log/log.json").unlink()
+    assert "log is of an unknown format" in run("export", str(checkpoint), "-o", str(tmp_path / "again")).stderr
+
+
+def test_its_recording_is_a_file_of_a_stage_with_all_that_is_in_it(run: Run, float_bundle: Bundle, log: Path):
+    out = log.parent / "int8"
+    ok(run("quantize", "static-int8", str(float_bundle.path), "--calibration", str(log), "-o", str(out)))
+    made = json.loads((out / "manifest.json").read_text())["made_by"]
+    assert list(made["files"]) == ["a.log"]
+    assert made["options"]["calibration"] == f"a.log sha256:{made['files']['a.log'][:16]}"
+    again = ("rebuild", str(out), "--source", str(float_bundle.path), "--file", str(log), "--check")
+    assert "identical" in ok(run(*again))
+    (log / "more/notes.txt").write_text("calm!\n")
+    done = run(*again)
+    assert "quantize.static_int8 was given the file a.log with sha256:" in done.stderr
+
+
+def test_two_sources_that_are_certain_are_both_named(run: Run, checkpoint: Path, policy_template: Path, tmp_path: Path):
+    shutil.copy(policy_template / "policy.yaml", checkpoint)
+    for line in (("export", "-o", str(tmp_path / "out")), ("optimize", "--dry-run", "-o", str(tmp_path / "out"))):
+        done = run(line[0], str(checkpoint), *line[1:])
+        assert done.returncode == 3
+        assert "is ambiguous" in done.stderr
+        for each in ("acme_checkpoint (a directory with an acme.json)", "torch_module (a directory with a policy.yaml"):
+            assert each in " ".join(done.stderr.split())
+    ok(run("export", str(checkpoint / "policy.yaml"), "-o", str(tmp_path / "named")))
+
+
+def test_what_no_source_reads_is_told_what_each_of_them_needs(run: Run, tmp_path: Path):
+    (tmp_path / "act").mkdir()
+    for name in ("config.json", "model.safetensors"):
+        (tmp_path / "act" / name).write_text("{}")
+    told = " ".join(run("export", str(tmp_path / "act"), "-o", str(tmp_path / "out")).stderr.split())
+    assert "act is not a bundle: it has no manifest.json" in told
+    assert "(found: config.json, model.safetensors); it looks like a checkpoint of another library" in told
+    for each in ("acme (a .acme file)", "acme_checkpoint (a directory with an acme.json)", "onnx (a .onnx file)"):
+        assert each in told
+
+
+def test_its_directory_is_completed(run: Run, checkpoint: Path):
+    code = f"from vlatool.cli._complete import sources; print(sources({str(checkpoint.parent)!r} + '/ti'))"
+    assert ok(run(code=code)) == f"['{checkpoint}']\n"
 
 
 def test_its_format_of_videos_is_found_by_the_suffix(run: Run, float_bundle: Bundle, policy_dir: Path, tmp_path: Path):
@@ -169,6 +273,24 @@ def test_a_search_begins_with_its_method_and_its_engines_plans(run: Run):
     found = ok(run(code=code))
     assert "'rounded'" in found
     assert "'acme_float16'" in found
+    assert "acme_int8" not in found
+
+
+def test_its_engine_knows_the_board_that_a_search_is_for(run: Run):
+    code = "from vlatool.hardware.profile import load_profile; from vlatool.optimize.search import variants_for; "
+    assert "acme_int8" in ok(run(code=f"{code}print(*variants_for(load_profile('acme-board'), True))"))
+
+
+def test_what_its_engine_is_built_against_is_in_keys_and_records(run: Run, float_bundle: Bundle):
+    code = (
+        "from unittest import mock; from vlatool.quantize.float16 import Float16; from vlatool.runtime import engine\n"
+        "key, acme = Float16().key('a'), engine.engine_class('acme'); print(engine.identities())\n"
+        "with mock.patch.object(acme, 'providers', acme.providers[1:]): print(key == Float16().key('a'))"
+    )
+    identity, same = ok(run(code=code)).splitlines()
+    assert "'acme': 'AzureExecutionProvider {}; CPUExecutionProvider {}; onnxruntime " in identity
+    assert "acme-robotics 1.2" in identity
+    assert same == "False"
 
 
 def test_its_section_is_in_every_format_of_a_report(run: Run):
@@ -224,5 +346,6 @@ def test_it_replaces_nothing_of_vlatools_own(run: Run):
 
 def test_the_guide_shows_these_files():
     guide = (ROOT / "docs/guides/add-a-method.md").read_text()
-    for name in ("rounded", "engine", "source", "section", "every_step", "halved"):
+    files = ("rounded", "openvino_provider", "ggml_provider", "source", "checkpoint", "log", "section", "every_step")
+    for name in (*files, "halved"):
         assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide

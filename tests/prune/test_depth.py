@@ -216,7 +216,7 @@ def test_a_block_that_changes_shapes_is_named(source_bundle: Bundle):
 
 def test_how_many_blocks_stay_is_said(source_bundle: Bundle):
     said: list[str] = []
-    context = Context(said=said)
+    context = Context(messages=said)
     Depth(blocks=1, samples=4).change({"main": Net().eval()}, source_bundle, context)
     Depth(keep=(0, 2), samples=4).change({"main": Net().eval()}, source_bundle, context)
     assert said == ["kept 1 of 4 blocks of trunk: 0", "kept 2 of 4 blocks of trunk: 0, 2"]

@@ -37,7 +37,7 @@ LAYER = "blocks.0.mlp.1.weight"
 @pytest.fixture(autouse=True)
 def in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
 
 
 def grown(source: Bundle, out: Path, **options: object) -> Bundle:

@@ -71,7 +71,7 @@ def deep(policy_dir: Path, tmp_path: Path) -> Bundle:
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(latency, "LatencyMeter", Counted)
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
 
 
 @pytest.mark.parametrize("share", small_or_full([0.7], [0.9, 0.7, 0.5]))

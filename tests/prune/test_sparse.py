@@ -114,7 +114,7 @@ def test_what_gives_the_action_stays_dense_whatever_it_is_called(source_bundle: 
     assert list(select_layers(modules, source_bundle, ("last",), ()).prunable) == ["last"]
     context = Context()
     Magnitude().change(modules, source_bundle, context)
-    assert context.said == ["left dense: head.0, head.2, last (--include names what else may go)"]
+    assert context.messages == ["left dense: head.0, head.2, last (--include names what else may go)"]
     assert int((policy.last.weight == 0).sum()) == 0
 
 

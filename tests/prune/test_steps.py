@@ -18,7 +18,7 @@ from vlatool.errors import DataError, RecipeError, SourceError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.gate.config import AccuracyClaim, Gate
 from vlatool.gate.same import check
-from vlatool.module import stage, stored
+from vlatool.module import sharded_weights, stage
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune.steps import Steps, with_fewer_steps
 from vlatool.rebuild.rebuild import rebuild
@@ -105,7 +105,7 @@ def test_weights_in_shards_stay_there(sharded: Bundle, one: Bundle, tmp_path: Pa
 
 def test_weights_in_large_shards_are_not_read(sharded: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     read = list[str]()
-    monkeypatch.setattr(stored, "read_tensor", lambda _reader, tensor, _dtype: read.append(tensor.name))
+    monkeypatch.setattr(sharded_weights, "read_tensor", lambda _reader, tensor, _dtype: read.append(tensor.name))
     monkeypatch.setattr("vlatool.module.torch_policy.shard_files", lambda *_: read.append("all") or [])
     monkeypatch.setattr(stage, "MAX_RUN_BYTES", 0)
     (tmp_path / "out").mkdir()

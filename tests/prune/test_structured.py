@@ -21,9 +21,9 @@ from vlatool.errors import BundleError, FallsShort, RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.graph.workload import workload
 from vlatool.module.axes import Walk
-from vlatool.module.cut import cut, traced
 from vlatool.module.edits import read_edits
 from vlatool.module.torch_policy import load_modules, torch_policy
+from vlatool.module.unit_removal import remove_units, trace_module
 from vlatool.prune._selection import Selection
 from vlatool.prune._unit_groups import find_groups, rank_units
 from vlatool.prune.structured import Structured
@@ -152,7 +152,7 @@ def test_what_was_asked_and_reached_is_said_and_recorded(pruned: Bundle, source_
     assert (record["asked"], record["without_rule"]) == (0.1, [])
     assert 0.09 <= record["reached"] <= 0.15
     assert record["reached"] == round(1 - record["macs"][1] / record["macs"][0], 4)
-    assert f"asked for 10.0% less work, reached {record['reached']:.1%} (" in context.said[0]
+    assert f"asked for 10.0% less work, reached {record['reached']:.1%} (" in context.messages[0]
     assert [line.split(",")[0] for line in removed_by(again)] == [
         f"prune.structured: asked for {asked}% less work" for asked in ("30.0", "10.0")
     ]
@@ -162,7 +162,7 @@ def test_what_was_asked_and_reached_is_said_and_recorded(pruned: Bundle, source_
 def test_a_step_that_is_too_much_is_put_back_where_nearly_enough_is_gone(ratio: float, stays: int):
     """Each step takes a quarter of 96 in 100: 24 are nearly 25 enough, 48 are nearly twice of it."""
     module = nn.Sequential(nn.Linear(3, 16, bias=False), nn.Linear(16, 3, bias=False), nn.Linear(3, 1), nn.Linear(1, 1))
-    walks = {"main": Walk(traced(module, [torch.randn(1, 3)]))}
+    walks = {"main": Walk(trace_module(module, [torch.randn(1, 3)]))}
     groups = find_groups(walks, Selection(("0.weight",), ()), 4, "steps")
     Structured(ratio=ratio, multiple=4).choose(walks, groups, {"main": 1}, Context())
     assert groups[0].remaining == stays
@@ -254,13 +254,13 @@ def test_what_is_said_of_experts_and_groups_is_what_is_reached(
     """Whether the last step stays, or is put back because nearly enough is gone without it."""
     torch.manual_seed(0)
     module, feed = make().eval(), torch.randn(shape)
-    walks, whole = {"main": Walk(traced(module, [feed]))}, counted(module, [feed])
+    walks, whole = {"main": Walk(trace_module(module, [feed]))}, counted(module, [feed])
     said = {}
     for ratio in (nearly, 0.45, 0.9):
         groups = find_groups(walks, Selection((), ()), 8, make.__name__)
         rank_units(groups, "random", {"main": module}, source=None, samples=0)  # type: ignore[arg-type]
         done = Structured(ratio=ratio, multiple=8).choose(walks, groups, {"main": 1}, Context())
-        left = counted(cut(copy.deepcopy(module), [feed], done.edits), [feed])
+        left = counted(remove_units(copy.deepcopy(module), [feed], done.edits), [feed])
         assert done.record["pruned"]["macs"] == [whole, left]
         said[ratio] = done.record["pruned"]["reached"]
         assert said[ratio] == round(1 - left / whole, 4)

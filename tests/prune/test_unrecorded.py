@@ -8,7 +8,6 @@ import pytest
 from _deep import write_deep
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import CALIBRATION
 from vlatool.module.torch_policy import load_modules
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
@@ -35,9 +34,13 @@ def two_blocks(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 def test_random_observations_are_told(
     two_blocks: Bundle, stage: str, options: dict[str, object], looks: bool, recorded: bool
 ):
-    files = {name: file for name, file in two_blocks.manifest.files.items() if recorded or name != CALIBRATION}
+    files = {
+        name: file for name, file in two_blocks.manifest.files.items() if recorded or name != "data/calibration.npz"
+    }
     source = replace(two_blocks, manifest=replace(two_blocks.manifest, files=files))
     context = Context()
     build_stage(stage, {"samples": 3, **options}).change(load_modules(source), source, context)
-    told = [line for line in context.said if line.startswith("nothing is recorded: chosen by 3 random observations")]
+    told = [
+        line for line in context.messages if line.startswith("nothing is recorded: chosen by 3 random observations")
+    ]
     assert len(told) == (looks and not recorded)

@@ -210,7 +210,7 @@ def test_values_beyond_float16_are_named_and_stay_in_float32(float_bundle, copie
     assert {each.sample for each in found.values()} == {0}
     out = bundle.path.with_name("half")
     out.mkdir()
-    half = Float16(samples=4).run(bundle, out, Context(tell=lambda what, _share: told.append(what)))
+    half = Float16(samples=4).run(bundle, out, Context(progress=lambda what, _share: told.append(what)))
     assert drift(half) < 3e-3
     (first, *_) = half.manifest.made_by["float16"]["beyond"]
     assert first["graph"] == "main"

@@ -127,7 +127,7 @@ def test_what_rounding_costs_is_learnt_away(policy_dir: Path, tmp_path: Path, we
     tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context())
     errors = []
     for name, start in (("plain", source_bundle), ("trained", tuned)):
-        for number, (stage, given) in enumerate(Qat(weights=weights).then()):
+        for number, (stage, given) in enumerate(Qat(weights=weights).following_stages()):
             start = run_transform(build_stage(stage, given), start, tmp_path / f"{name}{number}", Context())
         errors.append(error(load(start.path), whole, source_bundle))
     assert errors[1] < 0.8 * errors[0]
@@ -177,7 +177,7 @@ def test_statistics_of_normalisations_stay_and_the_export_is_what_was_trained(tm
     (policy / "policy.py").write_text(NORMALISED)
     (policy / "policy.yaml").write_text(NORMALISED_YAML)
     np.savez(policy / "calibration.npz", seen=np.random.default_rng(0).normal(size=(40, 4, 6)).astype(np.float32))
-    trust.name(policy)
+    trust.allow(policy)
     source = run_transform(TorchModule(policy=policy), None, tmp_path / "source", Context())
     options = {"steps": 8, "batch": 6, "average": 0.5, "episodes": 0, "student_episodes": 0, "learning_rate": 0.01}
     tuned = run_transform(build_stage("quantize.qat", {**options, "threads": 1}), source, tmp_path / "tuned", Context())

@@ -25,7 +25,7 @@ def products(monkeypatch):
     def say(how: str) -> None:
         for engine in (OrtCpuSession, OpenvinoSession):
             monkeypatch.setattr(engine, "arithmetic", staticmethod(lambda: how))
-        monkeypatch.setattr("vlatool.quantize._base.products_apart", lambda engine: how)
+        monkeypatch.setattr("vlatool.quantize._base.int8_arithmetic", lambda engine: how)
 
     return say
 

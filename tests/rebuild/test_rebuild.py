@@ -21,8 +21,8 @@ from vlatool.errors import BundleError, SourceError, VlatoolError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.rebuild.differences import Compared, compare_bundles, explain, listed
-from vlatool.rebuild.rebuild import Rebuilt, build_record, rebuild, version_changes
+from vlatool.rebuild.differences import FileMatch, compare_bundles, explain, name_list
+from vlatool.rebuild.rebuild import RebuildResult, build_record, rebuild, version_changes
 from vlatool.report import Report
 from vlatool.sources import source_stage
 from vlatool.sources.onnx import OnnxFile
@@ -56,7 +56,7 @@ def dynamic_bundle(onnx_policy: Path, tmp_path_factory: pytest.TempPathFactory) 
 def again(tmp_path: Path):
     """Make a bundle again."""
 
-    def run(bundle: Bundle, source: Path | str | None = None, **settings: Any) -> Rebuilt:
+    def run(bundle: Bundle, source: Path | str | None = None, **settings: Any) -> RebuildResult:
         settings.setdefault("cache", tmp_path / "empty_cache")
         return rebuild(bundle, QUIET, source=None if source is None else str(source), **settings)
 
@@ -396,8 +396,8 @@ def test_graphs_that_differ_in_nodes_and_notes_are_told_apart(float_bundle, tmp_
 
 
 def test_a_long_list_is_cut():
-    assert listed(["a", "b"]) == "a, b"
-    assert listed(list("abcdefg")) == "a, b, c, d, e and 2 more"
+    assert name_list(["a", "b"]) == "a, b"
+    assert name_list(list("abcdefg")) == "a, b, c, d, e and 2 more"
 
 
 # ---- determinism
@@ -441,7 +441,7 @@ def test_the_same_command_in_another_process_gives_the_same_bytes(policy_templat
     ],
 )
 def test_the_file_that_others_were_made_from_is_the_first_difference(differing, first):
-    files = tuple(Compared(name, 1, False, "other") for name in sorted(differing))
-    found = Rebuilt(Bundle(Path("b"), None), "", "", files, ()).first_difference  # type: ignore[arg-type]
+    files = tuple(FileMatch(name, 1, False, "other") for name in sorted(differing))
+    found = RebuildResult(Bundle(Path("b"), None), "", "", files, ()).first_difference  # type: ignore[arg-type]
     assert found is not None
     assert found.file == first

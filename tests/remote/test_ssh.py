@@ -39,8 +39,8 @@ from vlatool.errors import (
     TargetError,
     UsageError,
 )
-from vlatool.remote import _bootstrap, _connection, _place, _push, ssh
-from vlatool.remote._heard import Python
+from vlatool.remote import _bootstrap, _connection, _push, _run_directory, ssh
+from vlatool.remote._validate_replies import Python
 
 pytestmark = pytest.mark.skipif(shutil.which("ssh") is None, reason="there is no ssh")
 SPEC = {
@@ -161,7 +161,7 @@ def there(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     agent = tmp_path / "stand_in_agent.py"
     agent.write_text(AGENT)
     monkeypatch.setattr(ssh, "AGENT", "stand_in_agent")
-    monkeypatch.setattr(ssh, "FURTHER", (agent,))
+    monkeypatch.setattr(ssh, "FURTHER_MODULES", (agent,))
     found = Target(server, tmp_path)
     yield found
     found.check()
@@ -549,9 +549,9 @@ def test_a_command_that_is_ended_ends_the_run_there(there, bundle, tmp_path, num
 
 
 def test_the_same_files_give_the_same_bytes_and_no_owner_or_time(large, tmp_path):
-    one, other = (list(_push.load_of([large], ssh.PACKAGE).packed()) for _ in range(2))
+    one, other = (list(_push.payload_of([large], ssh.PACKAGE).archives()) for _ in range(2))
     assert one == other
-    assert sum(size for _, size in one) == _push.load_of([large], ssh.PACKAGE).size
+    assert sum(size for _, size in one) == _push.payload_of([large], ssh.PACKAGE).size
     with tarfile.open(fileobj=io.BytesIO(one[0][0])) as pack:
         members = pack.getmembers()
     assert {(each.uid, each.gid, each.uname, each.mtime, each.mode) for each in members} == {(0, 0, "", 0, 0o600)}
@@ -580,7 +580,7 @@ def test_only_files_below_the_directory_are_unpacked(tmp_path, name, kind):
         member = tarfile.TarInfo(name)
         member.type, member.linkname = kind, "/etc/passwd"
         pack.addfile(member)
-    with pytest.raises(_place.Refused, match="is not a file below the directory"):
+    with pytest.raises(_run_directory.Refused, match="is not a file below the directory"):
         _bootstrap.unpack(packed.getvalue(), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -589,10 +589,10 @@ def test_only_directories_of_dead_runs_are_removed(tmp_path):
     for name in ("vlatool-run-dead", "vlatool-run-without-lock", "vlatool-run-alive", "another"):
         (tmp_path / name).mkdir()
     (tmp_path / "vlatool-run-link").symlink_to(tmp_path / "another")
-    (tmp_path / "vlatool-run-dead" / _place.LOCK).touch()
-    with (tmp_path / "vlatool-run-alive" / _place.LOCK).open("w") as lock:
+    (tmp_path / "vlatool-run-dead" / _run_directory.LOCK).touch()
+    with (tmp_path / "vlatool-run-alive" / _run_directory.LOCK).open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        _place.sweep(tmp_path)
+        _run_directory.sweep(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["another", "vlatool-run-alive", "vlatool-run-link"]
 
 
@@ -813,12 +813,12 @@ NONSENSE = [
     ("say('x' * 3_000_000)", "target_message_bytes"),
     ("sys.stdout.write(marker + 'x' * 3_000_000); sys.stdout.flush(); time.sleep(2)", "target_message_bytes"),
     ("say('[]')", "a message is a list"),
-    ("say('{')", "makes no sense"),
-    ("say('[' * 100_000)", "makes no sense"),
+    ("say('{')", "Invalid reply from"),
+    ("say('[' * 100_000)", "Invalid reply from"),
     ("""say('{"a": ' * 40 + '1' + '}' * 40)""", "more than 32 levels"),
     ("""say('{"python": {"version": [3, 11, NaN]}}')""", "NaN is not a number"),
     ("""say('{"python": {"version": [3, 11, 1e999]}}')""", "a number is too large"),
-    ("say('{\"python\": ' + '9' * 5000 + '}')", "makes no sense"),
+    ("say('{\"python\": ' + '9' * 5000 + '}')", "Invalid reply from"),
     ("say('{}'); say('{\"python\": {}}')", "'python' lacks 'command'"),
     ("say('{}'); python(version='3')", "'python.version' is '3', not a list"),
     ("say('{}'); python(version=[3, 11])", "'python.version' has 2 values, not 3"),
@@ -826,7 +826,7 @@ NONSENSE = [
     ("say('{}'); python(packages={'numpy': 1})", "'python.packages.numpy' is 1, not text"),
     ("[python(packages={}) for _ in range(70)]; time.sleep(2)", "more than 64 Pythons"),
     ("say('{}'); python(); say('{\"ready\": 1}'); time.sleep(2)", "'ready' is 1, not text"),
-    ("say('{}'); python(); say('{\"refused\": \"no room\", \"text\": \"x\"}'); time.sleep(2)", "makes no sense"),
+    ("say('{}'); python(); say('{\"refused\": \"no room\", \"text\": \"x\"}'); time.sleep(2)", "Invalid reply from"),
     ("say('{}'); python(); say('{\"refused\": \"no room\", \"text\": \"{}\"}'); time.sleep(2)", "lacks 'free'"),
     ("until_measuring(); say('{\"ended\": 1}')", "'ended' is 1, not a mapping"),
     ("until_measuring(); say('{\"ended\": {\"code\": \"0\", \"log\": \"\"}}')", "'ended.code' is '0'"),

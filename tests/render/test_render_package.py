@@ -10,7 +10,7 @@ from _render_reports import KINDS, optimize
 
 from vlatool import registry
 from vlatool.errors import OutputError, UsageError
-from vlatool.files.writing import writing
+from vlatool.files.directory_writer import write_directory
 from vlatool.render import FILES, _format, render, write_reports
 from vlatool.render.charts import samples, svg
 from vlatool.render.sections import details, trade_off
@@ -56,7 +56,7 @@ def test_a_disk_that_fills_up_names_the_output_and_not_its_draft(tmp_path: Path,
         monkeypatch.setattr(Path, "write_text", full)
         write_reports(optimize(), draft)
 
-    with pytest.raises(OutputError) as caught, writing(tmp_path / "out") as place:
+    with pytest.raises(OutputError) as caught, write_directory(tmp_path / "out") as place:
         filled(place)
     assert caught.value.message == f"Cannot write {tmp_path / 'out'}: the disk is full."
     assert not list(tmp_path.iterdir())

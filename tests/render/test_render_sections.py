@@ -109,7 +109,7 @@ def test_a_section_that_fails_is_told_as_its_packages(
     plant: Callable[..., None], monkeypatch: pytest.MonkeyPatch, theirs: bool
 ) -> None:
     plant()
-    monkeypatch.setattr(registry, "owner", lambda module: "acme 1.2" if theirs and "planted" in module else "")
+    monkeypatch.setattr(registry, "plugin_of", lambda module: "acme 1.2" if theirs and "planted" in module else "")
     registry.load("sections", "planted").build = lambda self, report: [Section("t", (Text("x"),), 1, "guessed")]
     with pytest.raises(PluginError if theirs else ValueError, match="allowed: measured, predicted") as caught:
         render(benchmark(), "terminal")

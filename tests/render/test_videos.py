@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from vlatool.errors import MissingExtra, OutputError, UsageError
-from vlatool.files.edited import is_own
+from vlatool.files.user_files import is_own_file
 from vlatool.render import video
 from vlatool.render.video import Picture, Video, check_video, write_video
 from vlatool.render.videos import gif, mp4
@@ -133,7 +133,7 @@ def test_an_mp4_shows_every_picture_and_holds_the_last(tmp_path: Path):
 def test_a_video_is_known_again_until_somebody_changes_it(tmp_path: Path, suffix: str):
     path = tmp_path / f"a.{suffix}"
     write_video(Video(moving, 12, 20.0), path)
-    assert is_own(path)
+    assert is_own_file(path)
     with pytest.raises(OutputError, match="exists already"):
         check_video(path, force=False)
     check_video(path, force=True)

@@ -86,12 +86,12 @@ def drive_late(policy: Any, observation: Any) -> str:
     """Act with ``late`` through three chunks, each of an inference that takes two control steps."""
     import numpy as np
 
-    from vlatool.runtime.control import controller
+    from vlatool.runtime.control import build_controller
     from vlatool.runtime.interface import Controller, Policy
 
     spec, delay = policy.spec, 2
     executed = spec.execute or spec.chunk
-    late = controller(policy, ["late"], delay)
+    late = build_controller(policy, ["late"], delay)
     assert isinstance(policy, Policy)
     assert isinstance(late, Controller)
     policy.reset(3)

@@ -17,7 +17,7 @@ import pytest
 import tomllib
 
 from vlatool.episodes.play import EpisodesJob, Worker
-from vlatool.errors import InstallationError, install, refuse_two_distributions
+from vlatool.errors import InstallationError, pip_install, refuse_two_distributions
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = tomllib.loads((ROOT / "robot/pyproject.toml").read_text())
@@ -163,5 +163,5 @@ def test_the_fix_for_both_says_to_remove_both(tmp_path: Path):
 
 
 def test_an_extra_is_of_the_distribution_that_is_installed():
-    assert install("ort") == "pip install 'vlatool[ort]'"
-    assert install("ort", "vlatool-runtime") == "pip install 'vlatool-runtime[ort]'"
+    assert pip_install("ort") == "pip install 'vlatool[ort]'"
+    assert pip_install("ort", "vlatool-runtime") == "pip install 'vlatool-runtime[ort]'"

@@ -12,7 +12,7 @@ import pytest
 from _policies import NumberedPolicy, spec_of
 
 from vlatool.episodes.controls import Blind
-from vlatool.episodes.disturbed import DELAY, DROPPED, DisturbedController
+from vlatool.episodes.disturbances import DELAY, DROPPED_FRAMES, DisturbedController
 from vlatool.episodes.frames import FrameRecorder, Noisy
 from vlatool.runtime import ChunkQueue, load
 from vlatool.runtime.control.late import LateController
@@ -53,7 +53,7 @@ def test_an_open_bundle_is_a_policy_and_gives_actions(float_bundle, observation)
 
 
 WRAPPERS = (
-    lambda inner: DisturbedController(inner, SPEC, DROPPED, 2.0),
+    lambda inner: DisturbedController(inner, SPEC, DROPPED_FRAMES, 2.0),
     lambda inner: DisturbedController(inner, SPEC, DELAY, 1.0),
     lambda inner: Noisy(inner, SPEC.action, 0.1, ANSWERS),
 )

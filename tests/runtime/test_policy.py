@@ -217,7 +217,7 @@ def test_a_broken_graph_is_told_without_a_traceback_of_the_engine(float_bundle, 
 
 def test_the_engine_runs_on_the_cpu_and_knows_its_inputs(float_bundle):
     session = OrtCpuSession(float_bundle.path / "graphs/main.onnx")
-    assert session.providers == ["CPUExecutionProvider"]
+    assert session._session.get_providers() == ["CPUExecutionProvider"]
     assert str(session.takes["image"]) == "uint8 [1, 8, 8, 3]"
     assert session.outputs == ["action"]
     assert OrtCpuSession.version().count(".") == 2

@@ -135,7 +135,7 @@ def test_a_missing_file(tmp_path: Path):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ("[" * 100_000, "too deep inside each other"),
+        ("[" * 100_000, "nested too deep"),
         ('{"kind": "words", "kind": "words"}', "'kind' occurs twice"),
         ({**WORDS, "pad": True}, "'pad' and 'unknown'"),
         ({**WORDS, "unknown": 2**64}, "'pad' and 'unknown'"),

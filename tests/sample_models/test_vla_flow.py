@@ -31,7 +31,7 @@ Imported = SimpleNamespace
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     out = tmp_path_factory.mktemp("flow-source")
-    return TorchModule(policy=FLOW).named().run(None, out, Context())
+    return TorchModule(policy=FLOW).trust_code().run(None, out, Context())
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,7 @@ def test_one_layer_alone_is_the_bundle_with_that_layer_alone(quantized, float_bu
 
 def test_the_rows_are_complete_and_the_worst_is_first(float_bundle, observations):
     told = []
-    context = Context(tell=lambda text, share: told.append(share))
+    context = Context(progress=lambda text, share: told.append(share))
     found = sensitivities(float_bundle, StaticInt8(samples=8), None, observations, context)
     assert [each.error for each in found] == sorted((each.error for each in found), reverse=True)
     assert len(found) == len({each.name for each in found}) == 8

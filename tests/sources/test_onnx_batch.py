@@ -16,7 +16,7 @@ HEAD = '<ir_version: 10, opset_import: ["": 20]> '
 def bundle_of(folder: Path, text: str, said: list[str] | None = None) -> Bundle:
     onnx.save(onnx.parser.parse_model(HEAD + text), folder / "a.onnx")
     (folder / "out").mkdir()
-    tell = Context((lambda words, _share: said.append(words)) if said is not None else Context().tell)
+    tell = Context((lambda words, _share: said.append(words)) if said is not None else Context().progress)
     return OnnxFile(model=folder / "a.onnx").run(None, folder / "out", tell)
 
 

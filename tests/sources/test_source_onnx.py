@@ -261,7 +261,7 @@ def test_an_old_opset_is_raised_so_that_int8_can_be_written(tmp_path: Path, opse
     context = Context()
     bundle = OnnxFile(model=path).run(None, tmp_path / "out", context)
     assert bundle.manifest.graphs["main"].opset == 13
-    assert context.said == [f"converted from opset {opset} to 13; the same on 32 observations"]
+    assert context.messages == [f"converted from opset {opset} to 13; the same on 32 observations"]
     assert len(find_layers(onnx.load(bundle.path / "graphs/main.onnx"), ("MatMul",))) == 1
 
 
@@ -280,7 +280,7 @@ def test_an_old_opset_that_onnx_cannot_raise_stays_and_is_told(tmp_path: Path) -
     with pytest.raises(GraphError, match="opset 9; int8 needs opset 13") as caught:
         find_layers(onnx.load(path), ("MatMul",))
     assert "--opset" in caught.value.fix
-    assert opset == 13 or context.said[0].startswith("opset 9 stays")
+    assert opset == 13 or context.messages[0].startswith("opset 9 stays")
 
 
 @pytest.mark.parametrize("batch", ["batch", None, -1, 0])
@@ -334,7 +334,7 @@ def test_a_directory_with_an_onnx_file_is_told_to_name_the_file(tmp_path: Path, 
             "  control_hz: 9\n"
         )
     with pytest.raises(SourceError, match=r"holds ONNX files \(walker.onnx\)") as caught:
-        source_stage(str(tmp_path))
+        source_stage(str(tmp_path)).check(None, None)
     assert str(path) in caught.value.fix
     assert "--factory" not in str(caught.value)
     assert not is_bundle(str(tmp_path))

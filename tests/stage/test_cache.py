@@ -11,9 +11,9 @@ from _tiny import observations
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.evaluate.recorded import Recorded
-from vlatool.files.kept import FILES
-from vlatool.files.locks import hold, release
-from vlatool.files.work import work_directory
+from vlatool.files.blob_store import FILES
+from vlatool.files.locks import acquire, release
+from vlatool.files.resumable_work import work_directory
 from vlatool.graph.workload import workload
 from vlatool.graph.workload_file import LAYOUT_VERSION, write_workload
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -132,10 +132,10 @@ def test_a_list_that_names_files_elsewhere_removes_none_there(cache: Path, tmp_p
     folder = cache / "stages" / "quantize.mine-0123456789abcdef"
     (folder / "in").mkdir(parents=True)
     (folder / "in/link.txt").symlink_to(victim)
-    from vlatool.files.written import LEDGER, Listing, _told
+    from vlatool.files.ownership import LEDGER, Listing, _ledger_bytes
 
     names = ("../../../victim.txt", str(victim), "in/link.txt")
-    (folder / LEDGER).write_bytes(_told(Listing.of(dict.fromkeys(names, "0" * 64))))
+    (folder / LEDGER).write_bytes(_ledger_bytes(Listing.of(dict.fromkeys(names, "0" * 64))))
     age(cache)
     prune(cache, older_than_s=0)
     assert victim.read_text() == "mine"
@@ -153,8 +153,8 @@ def test_what_this_process_uses_stays(kept: Bundle, cache: Path, float_bundle: B
 HOLD = """
 import sys
 from pathlib import Path
-from vlatool.files.locks import hold
-print(hold(Path(sys.argv[1])), flush=True)
+from vlatool.files.locks import acquire
+print(acquire(Path(sys.argv[1])), flush=True)
 sys.stdin.read()
 """
 
@@ -179,8 +179,8 @@ def test_what_was_just_made_stays(kept: Bundle, cache: Path):
 
 def test_what_took_long_to_flush_was_just_made(cache: Path, float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch):
     """Its folder is as old as the last file in it, but nobody has had the time to lock it."""
-    monkeypatch.setattr("vlatool.files.writing._flush", lambda folder: os.utime(folder, (0, 0)))
-    monkeypatch.setattr("vlatool.stage.run.hold", lambda path: False)
+    monkeypatch.setattr("vlatool.files.directory_writer._flush", lambda folder: os.utime(folder, (0, 0)))
+    monkeypatch.setattr("vlatool.stage.run.acquire", lambda path: False)
     made = cached_transform(DynamicInt8(), float_bundle, cache, Context())
     assert prune(cache, older_than_s=DAY).entries == ()
     assert Bundle.open(made.path)
@@ -188,7 +188,7 @@ def test_what_took_long_to_flush_was_just_made(cache: Path, float_bundle: Bundle
 
 def test_an_entry_that_is_gone_cannot_be_held(kept: Bundle, cache: Path):
     prune(cache, older_than_s=0)
-    assert not hold(kept.path)
+    assert not acquire(kept.path)
 
 
 def test_a_shared_recording_goes_with_the_last_stage_that_holds_it(cache: Path, float_bundle: Bundle, copied: Any):
@@ -247,9 +247,11 @@ def test_what_another_process_removes_meanwhile_is_no_entry(kept: Bundle, cache:
     (cache / FILES).mkdir()
     gone = {folder: cache / folder / name for folder, name in (
         ("stages", "export.onnx-" + "0" * 16), ("workloads", "0" * 32 + ".json"), (FILES, "c" * 64))}  # fmt: skip
-    below = cache_module._below
+    below = cache_module._children
     monkeypatch.setattr(
-        cache_module, "_below", lambda folder: below(folder) + [gone[name] for name in gone if name == folder.name]
+        cache_module,
+        "_children",
+        lambda folder: below(folder) + [gone[name] for name in gone if name == folder.name],
     )
     before = {path.relative_to(cache).as_posix() for path in below(cache / "stages")}
     found = contents(cache)

@@ -10,7 +10,7 @@ import pytest
 from _arithmetic import products
 from onnx import numpy_helper
 
-from vlatool.bundle.bundle import Bundle, hash_file, restate, seal
+from vlatool.bundle.bundle import Bundle, hash_file, replace_manifest, seal
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import PolicySpec, TensorSpec
@@ -259,7 +259,7 @@ def test_a_bundle_with_a_finding_is_refused_unless_it_is_overruled_by_name(float
 def test_what_was_wrong_with_the_source_stays_but_its_engine_is_looked_at_anew(float_bundle, copied, tmp_path):
     source = copied(float_bundle)
     told = ({"name": ENGINE_DIFFERENCE, "message": "m"}, {"name": "other", "message": "o"})
-    source = restate(source, replace(source.manifest, findings=told))
+    source = replace_manifest(source, replace(source.manifest, findings=told))
     assert again(source, tmp_path / "made").manifest.findings == told[1:]
 
 

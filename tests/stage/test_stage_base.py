@@ -15,6 +15,7 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.machine import instruction_sets
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, Measure, Stage, Transform, source_of
@@ -60,10 +61,10 @@ def test_options_are_those_that_differ_from_the_defaults_and_build_the_stage_aga
 
 def test_what_was_given_builds_the_stage_again_and_says_what_was_not():
     stage = build_stage("quantize.qat", {"layout": "ort", "steps": 8})
-    again = build_stage(stage.name(), stage.model_copy(update={"batch": 2}).given())
+    again = build_stage(stage.name(), stage.model_copy(update={"batch": 2}).explicit_options())
     assert again == stage.model_copy(update={"batch": 2})
     assert again.model_fields_set == {"layout", "steps", "batch"}
-    assert build_stage("quantize.qat", {}).given() == {}
+    assert build_stage("quantize.qat", {}).explicit_options() == {}
 
 
 def test_every_wrong_option_is_listed():
@@ -135,6 +136,16 @@ def test_the_key_follows_what_openvino_computes_in_and_that_of_an_export_does_no
     assert [len(set(each)) for each in zip(*keys, strict=True)] == [3, 3, 3, 1]
 
 
+def test_the_key_follows_what_an_engine_beside_the_processor_is_built_against(monkeypatch):
+    stages, drivers = (StaticInt8(), Latency(), ExportOnnx()), ("", "driver 1", "driver 1", "driver 2")
+    keys: list[list[str]] = []
+    for driver in drivers:
+        monkeypatch.setattr(OpenvinoSession, "identity", classmethod(lambda _, found=driver: found))
+        keys.append([stage.key("a") for stage in stages])
+    assert keys[1] == keys[2]
+    assert [len(set(each)) for each in zip(*keys, strict=True)] == [3, 3, 1]
+
+
 def test_the_key_follows_the_content_of_files_and_not_their_age(tmp_path: Path):
     data = tmp_path / "c.npz"
     stage = StaticInt8(calibration=data)
@@ -191,7 +202,7 @@ def test_made_by_names_stage_options_versions_and_seed():
 
 
 def test_a_context_may_be_silent():
-    Context().tell("working", 0.5)
+    Context().progress("working", 0.5)
 
 
 def test_a_plain_stage_checks_nothing_and_reads_nothing():

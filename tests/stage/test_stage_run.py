@@ -8,7 +8,7 @@ from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, GraphError, OutputError
 from vlatool.evaluate.recorded import Recorded
-from vlatool.files.writing import writing
+from vlatool.files.directory_writer import write_directory
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage.base import Context
@@ -37,7 +37,7 @@ def test_a_stage_runs_into_place_and_nothing_is_left_beside_it(float_bundle, tmp
 
 
 def test_an_output_that_exists_is_kept_without_force_and_replaced_with_it(float_bundle, tmp_path):
-    with writing(tmp_path / "out") as draft:
+    with write_directory(tmp_path / "out") as draft:
         (draft / "old").touch()
     with pytest.raises(OutputError, match="exists already"):
         run_transform(DynamicInt8(), float_bundle, tmp_path / "out", Context())

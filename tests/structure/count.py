@@ -22,9 +22,11 @@ from imports import ROOT, circles, modules, private_imports
 ENTRIES = {
     "quantization method": ("vlatool.quantize", ""),
     "kind of source": ("vlatool.sources", ""),
+    "source of a directory": ("vlatool.sources", '"a directory with'),
     "engine": ("vlatool.engines", ""),
-    "engine on another provider": ("vlatool.engines", "ExecutionProvider"),
+    "engine on another provider": ("vlatool.engines", "\n    providers = "),
     "reader of recordings": ("vlatool.data", ""),
+    "reader of a directory": ("vlatool.data", '"a directory with'),
     "controller": ("vlatool.control", "def act("),
     "policy wrapper": ("vlatool.control", "def infer("),
     "gate claim": ("vlatool.claims", ""),

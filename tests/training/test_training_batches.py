@@ -14,8 +14,8 @@ from vlatool.episodes.frames import file_of
 from vlatool.training.batches import Batches
 from vlatool.training.frames import Frames
 from vlatool.training.group import Group
-from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Settings, Trainer
+from vlatool.training.objective import Objective
 
 ROWS = 40
 
@@ -32,7 +32,7 @@ def frames(tmp_path: Path) -> Frames:
     return frames
 
 
-def lesson() -> Lesson:
+def objective() -> Objective:
     torch.manual_seed(0)
     module = nn.Sequential(nn.Linear(3, 8), nn.LayerNorm(8), nn.GELU(), nn.Linear(8, 1)).eval()
 
@@ -40,12 +40,12 @@ def lesson() -> Lesson:
         x = torch.from_numpy(rows["x"])
         return ((module(x)[:, 0] - x.sum(1)) ** 2).mean()
 
-    return Lesson("l2", {"main": module}, loss)
+    return Objective("l2", {"main": module}, loss)
 
 
 def trained(frames: Frames, folder: Path, accumulate: int) -> tuple[list[float], torch.Tensor]:
     folder.mkdir()
-    taught = lesson()
+    taught = objective()
     trainer = Trainer(taught.modules, Settings(60, learning_rate=0.01, average=0.9), folder)
     trainer.train(60, Batches(taught.loss, frames, 20, accumulate, Group()), lambda _step, _loss: None)
     trainer.finish()

@@ -1,4 +1,4 @@
-"""What a training computes on: which device is taken, and that nothing of a lesson stays behind on another one.
+"""What a training computes on: which device is taken, and that nothing of a objective stays behind on another one.
 
 No GPU is needed: on torch's ``meta`` device operations check that all tensors are on one device, and compute nothing.
 """
@@ -140,18 +140,18 @@ def test_nothing_of_a_lesson_stays_on_another_device(tmp_path: Path, kind: str, 
     training = build_stage(stage, options)
     assert isinstance(training, TrainingStage)
     modules = load_modules(source)
-    teacher, lesson = training.prepared(modules, source)
+    teacher, objective = training.prepare_objective(modules, source)
     rows = rows_of(source, teacher.program.noise)
     expert = {"expert." + name[len(LABEL) :]: value for name, value in rows.items() if name.startswith(LABEL)}
-    losses = [(lesson.loss, rows)] + ([(lesson.expert, rows | expert)] if lesson.expert else [])
+    losses = [(objective.loss, rows)] + ([(objective.expert, rows | expert)] if objective.expert else [])
     for loss, given in losses:
         assert loss(given).device.type == "cpu", "and looked whether modules take batches"
-    with on_meta(lesson.trained, teacher.program.modules):
+    with on_meta(objective.trainable, teacher.program.modules):
         for loss, given in losses:
             far = loss(given)
             assert far.device.type == "meta"
             far.backward()
-    weights = [value for module in lesson.modules.values() for value in module.parameters()]
+    weights = [value for module in objective.modules.values() for value in module.parameters()]
     assert any(value.grad is not None and value.grad.device.type == "meta" for value in weights)
 
 

@@ -19,15 +19,15 @@ def test_it_counts_the_steps_of_this_run_and_the_pauses():
     clock = Clock()
     forecast = Forecast(steps=200, done=100, now=clock)
     clock.seconds += 50  # the first step is slow
-    assert forecast.left(101) == ""
+    assert forecast.time_left(101) == ""
     for step in range(102, 124):
         clock.seconds += 2.0
-        told = forecast.left(step)
+        told = forecast.time_left(step)
     assert told == "3 min left", (200 - 123) * 2.0
     with forecast.pause():
         clock.seconds += 60
     clock.seconds += 2.0
-    assert forecast.left(124) == "6 min left", "and the pauses that are to come"
+    assert forecast.time_left(124) == "6 min left", "and the pauses that are to come"
 
 
 @pytest.mark.parametrize(("seconds", "words"), [

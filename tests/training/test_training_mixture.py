@@ -49,17 +49,17 @@ def trained(folder: Path, stops: tuple[int, ...] = (), mixed: bool = True) -> Tr
 
 def test_it_is_the_sum_of_its_terms(tmp_path: Path):
     mixed, plain = trained(tmp_path / "mixed"), trained(tmp_path / "plain", mixed=False)
-    assert [step for step, *_ in mixed.looks] == LOOKED_AT
-    assert plain.looks == []
+    assert [step for step, *_ in mixed.gradient_norms] == LOOKED_AT
+    assert plain.gradient_norms == []
     assert mixed.losses == pytest.approx(plain.losses, rel=1e-5)
     assert mixed.losses[0] == plain.losses[0]
 
 
 def test_a_run_that_is_killed_goes_on_to_the_same_looks(tmp_path: Path):
     whole, pieces = trained(tmp_path / "whole"), trained(tmp_path / "pieces", (1, 2, 12))
-    assert pieces.looks == whole.looks
+    assert pieces.gradient_norms == whole.gradient_norms
     assert pieces.losses == whole.losses
-    assert len(whole.looks) == 3
+    assert len(whole.gradient_norms) == 3
 
 
 def test_the_norms_are_those_of_the_terms(tmp_path: Path):
@@ -74,7 +74,7 @@ def test_the_norms_are_those_of_the_terms(tmp_path: Path):
         wanted.append(float(torch.cat([value.grad.flatten() for value in module.parameters()]).norm()))
     module.zero_grad()
     trainer.train(1, Mixture(terms), lambda _step, _loss: None)
-    ((step, *norms),) = trainer.looks
+    ((step, *norms),) = trainer.gradient_norms
     assert step == 1
     assert norms == pytest.approx(wanted, rel=1e-5)
 
@@ -92,7 +92,7 @@ def test_a_term_may_leave_weights_alone(tmp_path: Path):
         trainer = trainer_of(module, tmp_path / str(order), steps=1)
         before = [value.detach().clone() for value in module.parameters()]
         trainer.train(1, Mixture(terms[:: 1 - 2 * order]), lambda _step, _loss: None)
-        ((_, first, second),) = trainer.looks
+        ((_, first, second),) = trainer.gradient_norms
         assert first > 0
         assert second > 0
         assert all(not torch.equal(old, new) for old, new in zip(before, module.parameters(), strict=True))

@@ -13,12 +13,12 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.data import BEGINS, Recording
 from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.stage.base import Context
 from vlatool.training.frames import Frames
 from vlatool.training.lanes import Lanes
-from vlatool.training.rounds import LABEL, label
-from vlatool.training.sequences import Sequences, Unroll, answered, episode_begins, whole_episodes
+from vlatool.training.rounds import LABEL, write_labels
+from vlatool.training.sequences import Sequences, Unroll, episode_begins, outputs_and_labels, select_episodes
 
 LENGTHS = (1, 7, 3, 12, 2, 5)
 
@@ -56,7 +56,7 @@ def test_windows_stay_in_an_episode_and_each_row_is_as_likely(tmp_path: Path, wi
     lead = starts - begins[starts] if burn_in is None else np.minimum(burn_in, starts - begins[starts])
     assert (starts - firsts == lead).all()
     seen = sum(np.bincount(np.arange(first, end), minlength=30) for _, first, end in places[:20_000])
-    assert seen.sum() == frames.weigh(places[:20_000])
+    assert seen.sum() == frames.row_count(places[:20_000])
     assert seen.max() / seen.min() < 1.2
 
 
@@ -72,7 +72,7 @@ def test_whole_episodes_are_spread_over_the_rounds_that_are_asked_for(tmp_path: 
     frames = sequences(tmp_path, 4)
     assert frames.sample((0, 1), 1000)[:, 1:].tolist() == [[0, 1], [1, 8], [8, 11], [11, 23], [23, 25], [25, 30]]
     assert frames.sample((1,), 10)[:, 0].tolist() == [11, 25]
-    kept = frames.kept(15)
+    kept = frames.sample_rows(15)
     assert len(kept["x"]) <= 15
     assert kept[BEGINS][0]
     assert np.flatnonzero(np.diff(kept["x"][:, 0]) != 1).tolist() == (np.flatnonzero(kept[BEGINS])[1:] - 1).tolist()
@@ -115,17 +115,17 @@ def test_a_student_that_is_its_teacher_answers_in_windows_what_the_labels_say(tm
     sizes = tuple(1 + number % 5 for number in range(40))
     rounds(tmp_path, sizes)
     program = BatchedProgram(STEPS, {"main": Noisy(alone)})
-    assert label(tmp_path / "round-000", ["x"], ["y"], program, (0,), Context()) == ["y"]
+    assert write_labels(tmp_path / "round-000", ["x"], ["y"], program, (0,), Context()) == ["y"]
     frames = Sequences(tmp_path, Unroll(3))
     frames.read(0)
     for places in (frames.draw(np.random.default_rng(0), 90), frames.sample((0,), 1000)):
-        given, wanted = answered(program, frames.batch(places), "y", LABEL)
+        given, wanted = outputs_and_labels(program, frames.batch(places), "y", LABEL)
         assert given.requires_grad
-        assert len(given) == frames.weigh(places)
+        assert len(given) == frames.row_count(places)
         assert torch.allclose(given, wanted, atol=1e-5)
     apart = Sequences(tmp_path, Unroll(3, 0))
     apart.read(0)
-    given, wanted = answered(program, apart.batch(apart.draw(np.random.default_rng(0), 90)), "y", LABEL)
+    given, wanted = outputs_and_labels(program, apart.batch(apart.draw(np.random.default_rng(0), 90)), "y", LABEL)
     assert not torch.allclose(given, wanted, atol=1e-5), "without a burn-in, windows begin at zero"
 
 
@@ -135,10 +135,10 @@ def test_gradients_pass_through_a_window_and_not_through_what_leads_to_it(tmp_pa
     with torch.no_grad():
         module.map.weight.fill_(0.0)
     program = BatchedProgram(STEPS, {"main": module})
-    label(tmp_path / "round-000", ["x"], ["y"], program, (0,), Context())
+    write_labels(tmp_path / "round-000", ["x"], ["y"], program, (0,), Context())
     frames = Sequences(tmp_path, Unroll(3))
     frames.read(0)
-    given, _ = answered(program, frames.batch(np.array([[0, 10, 13]])), "y", LABEL)
+    given, _ = outputs_and_labels(program, frames.batch(np.array([[0, 10, 13]])), "y", LABEL)
     (slope,) = torch.autograd.grad(given[-1].sum(), [module.map.bias])
     assert float(slope) == pytest.approx(1 + 0.9 + 0.81)
 
@@ -148,11 +148,11 @@ def test_episodes_of_a_recording(tmp_path: Path):
     numbers = np.array([4, 4, 4, 1, 1, 1, 4, 4, 4])
     whole = Recording(tmp_path / "r.npz", rows, None, numbers)
     assert np.flatnonzero(episode_begins(whole)).tolist() == [0, 3, 6]
-    chosen = whole.only(numbers == 4)
+    chosen = whole.subset(numbers == 4)
     assert np.flatnonzero(episode_begins(chosen)).tolist() == [0, 3], "two of the same number that do not touch"
-    assert len(episode_begins(whole.only(np.arange(9) < 5))) == 5, "the end of one may be missing"
+    assert len(episode_begins(whole.subset(np.arange(9) < 5))) == 5, "the end of one may be missing"
     with pytest.raises(DataError, match=r"too few episodes to hold whole ones out \(3\)"):
-        episode_begins(whole.only(np.arange(9) > 4))
+        episode_begins(whole.subset(np.arange(9) > 4))
     with pytest.raises(DataError, match="does not say where episodes begin"):
         episode_begins(Recording(tmp_path / "r.npz", rows, None, None))
 
@@ -160,6 +160,6 @@ def test_episodes_of_a_recording(tmp_path: Path):
 @pytest.mark.parametrize(("share", "used"), [(1.0, 9), (0.5, 6), (0.01, 3), (0.34, 6)])
 def test_a_share_of_the_episodes(share: float, used: int):
     begins = np.arange(9) % 3 == 0
-    chosen = whole_episodes(begins, share, np.random.default_rng(0).permutation)
+    chosen = select_episodes(begins, share, np.random.default_rng(0).permutation)
     assert chosen.sum() == used
     assert (chosen.reshape(3, 3).sum(1) % 3 == 0).all()

@@ -14,8 +14,8 @@ from torch import nn
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import RecipeError, SourceError
-from vlatool.module.batched import run_module
-from vlatool.module.cut import RETRACE
+from vlatool.module.batched_program import run_module
+from vlatool.module.unit_removal import RETRACE
 from vlatool.training.group import Group
 from vlatool.training.shards import Parts, Shards, shards_of
 
@@ -91,7 +91,7 @@ def test_a_step_is_that_of_whole_weights(group: Group):
             optimizer.zero_grad()
             for part in (rows[:2], rows[2:]):  # gradients of parts are added
                 module(part).square().sum().backward()
-            held.summed(0.0, group)
+            held.sum_gradients(0.0, group)
             optimizer.step()
     assert float(shards.norm(group)) == pytest.approx(float(whole.norm(group)), rel=1e-5)
     for name, value in whole.held.items():
@@ -128,7 +128,7 @@ def test_a_weight_used_while_its_block_does_not_run_is_told(group: Group):
     net, _ = nets()
     shards = Parts({"main": net}, group)
     step = ProgramStep("main", {"x": "x"}, {"y": "y"})
-    with pytest.raises(SourceError, match=r"mixed torch.Tensor and DTensor") as caught, shards.looking():
+    with pytest.raises(SourceError, match=r"mixed torch.Tensor and DTensor") as caught, shards.probing_batches():
         run_module(Aside(net), step, [torch.zeros(1, 6)])
     assert "leave --shard out" in caught.value.fix
 
@@ -136,10 +136,10 @@ def test_a_weight_used_while_its_block_does_not_run_is_told(group: Group):
 def test_a_look_that_fails_within_a_block_leaves_nothing_behind(group: Group):
     net, _ = nets()
     shards = Parts({"main": net}, group)
-    with shards.looking(), pytest.raises(RuntimeError):
+    with shards.probing_batches(), pytest.raises(RuntimeError):
         net.blocks[1](torch.zeros(1, 5))
     net(torch.zeros(1, 3)).sum().backward()
-    shards.summed(0.0, group)
+    shards.sum_gradients(0.0, group)
     assert all(value.grad is not None for value in shards.held.values())
 
 

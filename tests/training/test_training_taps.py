@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from vlatool.bundle.program import ProgramStep
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.training.taps import Form, Taps
 
 
@@ -52,7 +52,7 @@ def taps(repeat: int = 1, **options) -> tuple[Taps, dict[str, torch.Tensor], dic
     program = BatchedProgram([step], {"main": Net(**options).eval()})
     random = np.random.default_rng(0)
     x = torch.from_numpy(random.standard_normal((4, 5, 3)).astype(np.float32))
-    return Taps(program, PLACES), {"x": x}, drawn(program.noise, 4, random)
+    return Taps(program, PLACES), {"x": x}, draw_noise(program.noise, 4, random)
 
 
 def rows(values: dict[str, torch.Tensor], start: int, end: int) -> dict[str, torch.Tensor]:
@@ -66,13 +66,13 @@ def test_batches_give_what_single_rows_give(kind: str, repeat: int):
     for alone in (False, True):
         tap, inputs, noise = taps(repeat, kind=kind, alone=alone)
         tap.program.look(inputs, noise)
-        assert tap.program.together(4) is not alone
+        assert tap.program.runs_at_once(4) is not alone
         forms = tap.forms(rows(inputs, 0, 1), rows(noise, 0, 1))
         assert {form.calls for form in forms.values()} == {repeat}
         with tap.open(4):
             tap.program.run(inputs, noise)
-        taken.append(tap.taken(4))
-        assert not tap.taken(4), "what was taken is gone"
+        taken.append(tap.take(4))
+        assert not tap.take(4), "what was taken is gone"
     assert list(taken[0]) == PLACES
     shape = (4 * repeat, 5, 1, 3) if kind == "map" else (4 * repeat, 5, 3)
     for place in PLACES:
@@ -82,7 +82,7 @@ def test_batches_give_what_single_rows_give(kind: str, repeat: int):
         single.forms(rows(ones, 0, 1), rows(drawn_once, 0, 1))
         with single.open(1):
             single.program.run(rows(ones, 2, 3), rows(drawn_once, 2, 3))
-        torch.testing.assert_close(single.taken(1)[place], taken[0][place][2 * repeat : 3 * repeat])
+        torch.testing.assert_close(single.take(1)[place], taken[0][place][2 * repeat : 3 * repeat])
 
 
 def test_gradients_flow_and_nothing_is_kept_outside():
@@ -90,11 +90,11 @@ def test_gradients_flow_and_nothing_is_kept_outside():
     tap.program.look(inputs, noise)
     with tap.open(4):
         tap.program.run(inputs, noise)
-    tap.taken(4)[PLACES[0]].sum().backward()
+    tap.take(4)[PLACES[0]].sum().backward()
     assert tap.program.modules["main"].blocks[0].linear.weight.grad is not None
     assert tap.program.modules["main"].blocks[1].linear.weight.grad is None
     tap.program.run(inputs, noise)
-    assert tap.taken(4) == {}
+    assert tap.take(4) == {}
 
 
 def test_forms_say_what_cannot_be_compared():

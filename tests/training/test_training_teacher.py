@@ -22,13 +22,13 @@ from vlatool.user_code import trust
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
-    with trust.nothing_named():
+    with trust.forget_named():
         yield write_deep(tmp_path / "wide", layers=3, width=24)
 
 
 @pytest.mark.parametrize("name", ["", "policy.yaml"])
 def test_a_policy_teaches_as_its_bundle_does(folder: Path, name: str, tmp_path: Path):
-    stage = PolicyDistillation(teacher=folder / name).named()
+    stage = PolicyDistillation(teacher=folder / name).trust_code()
     check_teacher(folder / name)
     made = run_transform(TorchModule(policy=folder), None, tmp_path / "bundle", Context())
     assert teacher_bundle(folder / name).hash == made.hash == teacher_bundle(made.path).hash
@@ -43,7 +43,7 @@ def test_its_code_runs_where_the_user_named_it(folder: Path):
             read(folder)
         assert f"--trust {folder.resolve()}" in caught.value.fix
     assert not trust.is_named(folder)
-    stage.named().check(None, None)
+    stage.trust_code().check(None, None)
 
 
 def test_what_it_is_made_of_is_part_of_the_key(folder: Path):
@@ -70,7 +70,7 @@ def test_a_policy_of_the_users_learns_from_another_one(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """Both typed as folders, with nothing else named or trusted."""
-    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
     student, out = write_deep(tmp_path / "narrow"), tmp_path / "out"
     short = ("--steps", "30", "--batch", "8", "--average", "0", "--learning-rate", "0.01", "--threads", "1")
     with pytest.raises(SystemExit) as caught:

@@ -11,8 +11,8 @@ import pytest
 
 from vlatool.errors import DataError, RecipeError, SourceError
 from vlatool.training import torchrun
-from vlatool.training.crew import check_launch
-from vlatool.training.torchrun import Follower, Launch, check_shared, follow, launched, leading, shown
+from vlatool.training.launcher import check_launch
+from vlatool.training.torchrun import Follower, Launch, check_shared, current_launch, follow, lead, write_token
 
 SAID = {"RANK": "1", "WORLD_SIZE": "4", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "10.0.0.7",
         "MASTER_PORT": "29500"}  # fmt: skip
@@ -26,14 +26,14 @@ def said(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 
 
 def test_what_torchrun_says_is_read(said: pytest.MonkeyPatch):
-    assert launched() == Launch(1, 4, 1, 2, "10.0.0.7", 29500)
-    assert not Launch(1, 4, 1, 2, "10.0.0.7", 29500).here
-    assert Launch(1, 4, 1, 2, "127.0.0.1", 29500).here
-    assert Launch(1, 2, 1, 2, "10.0.0.7", 29500).here
+    assert current_launch() == Launch(1, 4, 1, 2, "10.0.0.7", 29500)
+    assert not Launch(1, 4, 1, 2, "10.0.0.7", 29500).on_one_machine
+    assert Launch(1, 4, 1, 2, "127.0.0.1", 29500).on_one_machine
+    assert Launch(1, 2, 1, 2, "10.0.0.7", 29500).on_one_machine
     said.setenv("WORLD_SIZE", "1")
-    assert launched() is None
+    assert current_launch() is None
     said.delenv("WORLD_SIZE")
-    assert launched() is None
+    assert current_launch() is None
 
 
 @pytest.mark.parametrize(("name", "value", "words"), [
@@ -48,7 +48,7 @@ def test_what_torchrun_says_is_read(said: pytest.MonkeyPatch):
 def test_what_torchrun_would_not_say_is_refused(said: pytest.MonkeyPatch, name: str, value: str, words: str):
     said.setenv(name, value)
     with pytest.raises(RecipeError, match=words) as caught:
-        launched()
+        current_launch()
     assert "unset RANK and WORLD_SIZE" in caught.value.fix
 
 
@@ -59,11 +59,11 @@ def test_another_number_of_processes_is_refused(rank: int, size: int):
 
 
 def test_a_folder_that_is_not_seen_is_told(tmp_path: Path):
-    job = {"place": str(tmp_path), "rank": 1, "size": 2, **shown(tmp_path)}
+    job = {"place": str(tmp_path), "rank": 1, "size": 2, **write_token(tmp_path)}
     check_shared(job)
     with pytest.raises(RecipeError, match=r"Process 2 of 2 on .* runs torch [\d.]+.*, the first process 0\.1"):
         check_shared({**job, "versions": {"torch": "0.1"}})
-    (tmp_path / torchrun.MEETING).write_text("of another training")
+    (tmp_path / torchrun.RENDEZVOUS).write_text("of another training")
     with pytest.raises(RecipeError, match=f"does not see the folder .* {tmp_path}") as caught:
         check_shared(job)
     assert "VLATOOL_CACHE" in caught.value.fix
@@ -99,10 +99,10 @@ def following(launch: Launch, ready: Callable[[], None]) -> tuple[threading.Thre
 
 def test_a_process_follows_until_the_command_is_over_and_tells_what_it_meets(monkeypatch: pytest.MonkeyPatch):
     first, second = pair(monkeypatch)
-    with leading(first):
+    with lead(first):
         thread, raised = following(second, lambda: None)
         with Follower(first, 1) as other, pytest.raises(SourceError, match=r"Process 2 of 2 \(.+\): .*AttributeError"):
-            other.call("vlatool.training.peer:unknown", {}, None)
+            other.call("vlatool.training.rank_process:unknown", {}, None)
     thread.join(20)
     assert not thread.is_alive()
     assert not raised
@@ -113,7 +113,7 @@ def test_what_a_process_meets_before_it_follows_is_told(monkeypatch: pytest.Monk
         raise DataError("no policy here", "copy it")
 
     first, second = pair(monkeypatch)
-    with leading(first):
+    with lead(first):
         thread, raised = following(second, fails)
         with pytest.raises(DataError, match=r"Process 2 of 2 \(.+\): no policy here") as caught, Follower(first, 1):
             pass
@@ -127,7 +127,7 @@ def test_a_process_that_does_not_come_or_is_gone_is_told(monkeypatch: pytest.Mon
     monkeypatch.setattr(torchrun, "START_S", 0.3)
     monkeypatch.setattr(torchrun, "LEFT_S", 0.2)
     silent = pytest.raises(SourceError, match="Process 2 of 2 of the training does not answer")
-    with leading(first), silent as caught, Follower(first, 1):
+    with lead(first), silent as caught, Follower(first, 1):
         pass
     assert "goes on from the last checkpoint" in caught.value.fix
     with pytest.raises(SourceError, match=r"The store of torchrun at 127.0.0.1:\d+ does not answer"):

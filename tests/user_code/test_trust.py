@@ -32,7 +32,7 @@ pathlib.Path(__file__).with_name("ran").touch()
 def nothing_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Each test begins with a user who trusts nothing."""
     monkeypatch.setenv("VLATOOL_TRUST", str(tmp_path / "settings" / "trusted.json"))
-    with trust.nothing_named():
+    with trust.forget_named():
         yield
 
 
@@ -48,7 +48,7 @@ def mine(policy_dir: Path) -> Path:
 def bundle(mine: Path, tmp_path: Path) -> Bundle:
     """The source bundle of that policy, as somebody else may have sent it."""
     (tmp_path / "bundle").mkdir()
-    with trust.nothing_named():
+    with trust.forget_named():
         return TorchModule(policy=mine).run(None, tmp_path / "bundle", Context())
 
 
@@ -118,7 +118,7 @@ def test_what_is_trusted_runs_until_it_changes(vlatool, mine, bundle, tmp_path: 
     status, _, err = vlatool("export", bundle.path, "-o", tmp_path / "one", "--trust", mine)
     assert status == 0, err
     assert ran(mine)
-    assert stat.S_IMODE(trust.place().stat().st_mode) == 0o600
+    assert stat.S_IMODE(trust.trust_file().stat().st_mode) == 0o600
     (mine / "ran").unlink()
     status, _, err = vlatool("export", bundle.path, "-o", tmp_path / "two")
     assert status == 0, err
@@ -133,7 +133,7 @@ def test_what_is_trusted_runs_until_it_changes(vlatool, mine, bundle, tmp_path: 
 def test_a_policy_that_is_named_needs_no_trust(vlatool, mine, tmp_path: Path) -> None:
     assert vlatool("export", mine, "-o", tmp_path / "out")[0] == 0
     assert ran(mine)
-    assert not trust.place().exists()
+    assert not trust.trust_file().exists()
 
 
 def test_rebuild_takes_the_source_from_the_command_line(vlatool, mine, tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def forged(bundle: Bundle, **source: Any) -> Bundle:
     ],
 )
 def test_the_policys_own_description_says_what_runs(mine, bundle, source, says: str) -> None:
-    trust.name(mine)
+    trust.allow(mine)
     with pytest.raises(SourceError, match=says):
         load_modules(forged(bundle, **source))
     assert not ran(mine)
@@ -186,7 +186,7 @@ def test_a_package_that_a_trusted_description_names_may_run(
     described = (policy_dir / "policy.yaml").read_text()
     (policy_dir / "policy.yaml").write_text(described.replace("policy.py:make", "installed_policy:make"))
     (tmp_path / "bundle").mkdir()
-    with trust.nothing_named():
+    with trust.forget_named():
         bundle = TorchModule(policy=policy_dir).run(None, tmp_path / "bundle", Context())
     with pytest.raises(SourceError, match="you did not"):
         load_modules(bundle)
@@ -229,9 +229,9 @@ def test_a_recipe_names_no_policy(vlatool, mine, policy_template, tmp_path: Path
     ],
 )
 def test_a_file_of_trust_that_is_not_the_users_is_not_believed(tmp_path: Path, text: str, mode: int, says: str) -> None:
-    trust.place().parent.mkdir()
-    trust.place().write_text(text)
-    trust.place().chmod(mode)
+    trust.trust_file().parent.mkdir()
+    trust.trust_file().write_text(text)
+    trust.trust_file().chmod(mode)
     with pytest.raises(SourceError, match=says):
         trust.require(tmp_path, "something")
 
@@ -240,18 +240,18 @@ def test_the_hash_is_of_all_that_may_hold_code(tmp_path: Path, monkeypatch: pyte
     for name in ("a.py", "b/c.so", "weights.pt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("1")
-    hashes = {trust.content(tmp_path)}
+    hashes = {trust.content_hash(tmp_path)}
     for name in ("a.py", "b/c.so", "weights.pt", "new.yaml"):
         (tmp_path / name).write_text("2")
-        hashes.add(trust.content(tmp_path))
+        hashes.add(trust.content_hash(tmp_path))
     assert len(hashes) == 5
     (tmp_path / "data.npz").write_text("any")
     (tmp_path / "__pycache__").mkdir()
     (tmp_path / "__pycache__/a.cpython-311.pyc").write_text("any")
-    assert trust.content(tmp_path) in hashes
+    assert trust.content_hash(tmp_path) in hashes
     os.rename(tmp_path / "a.py", tmp_path / "z.py")
-    assert trust.content(tmp_path) not in hashes
-    monkeypatch.setattr(trust, "MOST_FILES", 2)
+    assert trust.content_hash(tmp_path) not in hashes
+    monkeypatch.setattr(trust, "MAX_FILES", 2)
     with pytest.raises(UsageError, match="more than 2 files"):
         trust.trust(tmp_path)
 
@@ -328,19 +328,19 @@ def test_bytecode_beside_a_trusted_policy_is_not_run(
      "node_modules/a.js", "lib/new.so"],
 )  # fmt: skip
 def test_all_that_can_be_imported_is_in_the_hash(linking: Path, name: str) -> None:
-    before = trust.content(linking)
+    before = trust.content_hash(linking)
     (linking / name).parent.mkdir(parents=True, exist_ok=True)
     (linking / name).write_bytes(b"X = 2")
-    assert trust.content(linking) != before
+    assert trust.content_hash(linking) != before
 
 
 def test_what_python_caches_is_not_in_the_hash(linking: Path) -> None:
-    before = trust.content(linking)
+    before = trust.content_hash(linking)
     (linking / "__pycache__").mkdir(exist_ok=True)
     (linking / "__pycache__/helper.cpython-399.opt-1.pyc").write_bytes(b"X = 2")
     (linking / ".git").mkdir()
     (linking / ".git/index").write_bytes(b"X = 2")
-    assert trust.content(linking) == before
+    assert trust.content_hash(linking) == before
 
 
 def test_links_in_a_circle_end_and_where_they_lead_is_in_the_hash(linking: Path, tmp_path: Path) -> None:
@@ -348,14 +348,14 @@ def test_links_in_a_circle_end_and_where_they_lead_is_in_the_hash(linking: Path,
     (linking / "b").mkdir()
     (linking / "circle").symlink_to(linking)
     (linking / "turn").symlink_to("a")
-    before = trust.content(linking)
+    before = trust.content_hash(linking)
     (linking / "turn").unlink()
     (linking / "turn").symlink_to("b")
-    assert trust.content(linking) != before
+    assert trust.content_hash(linking) != before
 
 
 def test_a_folder_of_too_many_files_is_not_trusted(linking: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trust, "MOST_FILES", 20)
+    monkeypatch.setattr(trust, "MAX_FILES", 20)
     (linking / ".venv").mkdir()
     for number in range(20):
         (linking / f".venv/{number}.py").touch()
@@ -366,10 +366,10 @@ def test_a_folder_of_too_many_files_is_not_trusted(linking: Path, monkeypatch: p
 
 def test_a_folder_that_cannot_be_read_is_not_trusted(linking: Path) -> None:
     (linking / "unreadable").symlink_to("unreadable")
-    trust.content(linking)  # a link to nowhere is no file
+    trust.content_hash(linking)  # a link to nowhere is no file
     (linking / "closed.py").write_text("")
     (linking / "closed.py").chmod(0)
     if os.access(linking / "closed.py", os.R_OK):
         pytest.skip("this user may read everything")
     with pytest.raises(UsageError, match=r"closed.py cannot be read"):
-        trust.content(linking)
+        trust.content_hash(linking)

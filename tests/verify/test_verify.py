@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlatool.bundle.bundle import Bundle, restate
+from vlatool.bundle.bundle import Bundle, replace_manifest
 from vlatool.cli import main
 from vlatool.errors import SourceError, UsageError
 from vlatool.render.formats.terminal import TerminalRenderer
@@ -98,7 +98,7 @@ def against(policy_dir: Path):
 def _trusted(policy_template: Path) -> None:
     from vlatool.user_code import trust
 
-    trust.name(policy_template)
+    trust.allow(policy_template)
 
 
 def found(bundle: Bundle, against: str, **options: Any) -> Report:
@@ -218,14 +218,14 @@ def raw(observation):
     said = " ".join(found(bundles["source"], against(network, more=some)).summary)
     assert "'proprio' and 'instruction' are the same, the network's output is not" in said
     assert "and at 'image', which preprocess() does not return" in said
-    assert "cannot be told" not in said
+    assert "is not certain" not in said
 
 
 def test_what_cannot_be_told_is_not_told(bundles, against):
     report = found(bundles["source"], against(("NETWORK = make().eval()", "NETWORK = make(layers=1)\n"
                                                "for each in NETWORK.parameters():\n    each.data *= 1.2")))  # fmt: skip
     said = " ".join(report.summary)
-    assert "It cannot be told for certain which stage differs" in said
+    assert "Which stage differs is not certain" in said
     assert "define preprocess(observation) and raw(observation)" in said
 
 
@@ -320,10 +320,10 @@ def test_without_a_recording_both_run_on_random_observations(copied, bundles, ag
     from dataclasses import replace
 
     files = {name: each for name, each in bundle.manifest.files.items() if not name.startswith("data/")}
-    report = found(restate(bundle, replace(bundle.manifest, files=files)), against(), samples=3)
+    report = found(replace_manifest(bundle, replace(bundle.manifest, files=files)), against(), samples=3)
     assert report.verdict == "pass"
     assert "3 random observations" in report.title
-    assert any("there is no recording" in each for each in report.warnings)
+    assert any("nothing is recorded" in each for each in report.warnings)
 
 
 def test_a_recording_of_ones_own_is_used(bundles, against, policy_dir):

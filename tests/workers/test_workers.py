@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import OutputError, SourceError, UsageError
-from vlatool.workers import Folder, Work, asked_for, launcher
-from vlatool.workers._shipped import Arriving, Places, blocks, parcel_of
+from vlatool.workers import Folder, Work, launcher, parse_workers
+from vlatool.workers._file_transfer import IncomingParcel, PathTranslation, blocks, parcel_of
 
 
 @pytest.mark.parametrize(("text", "asked"), [
     ("4", ("processes", 4)), ("ray", ("ray", 0)), ("ray:8", ("ray", 8)), ("processes:2", ("processes", 2)),
 ])  # fmt: skip
 def test_workers_are_a_number_or_a_launcher(text: str, asked: tuple[str, int]):
-    assert asked_for(text) == asked
+    assert parse_workers(text) == asked
 
 
 @pytest.mark.parametrize(("text", "says"), [
@@ -25,7 +25,7 @@ def test_workers_are_a_number_or_a_launcher(text: str, asked: tuple[str, int]):
 ])  # fmt: skip
 def test_what_is_neither_is_told(text: str, says: str):
     with pytest.raises(UsageError, match=says):
-        asked_for(text)
+        parse_workers(text)
 
 
 def test_answers_are_in_order_and_are_told_as_they_come():
@@ -51,7 +51,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def arrived(parcel, size: int = 1 << 20) -> Path:
-    arriving = Arriving(parcel)
+    arriving = IncomingParcel(parcel)
     for block in blocks(parcel):
         for at in range(0, len(block), size):
             arriving.add(block[at : at + size])
@@ -84,7 +84,7 @@ def test_what_was_damaged_there_is_sent_again(folder: Path):
 
 def test_half_of_it_is_nothing(folder: Path):
     parcel = parcel_of(Folder(str(folder)))
-    arriving = Arriving(parcel)
+    arriving = IncomingParcel(parcel)
     arriving.add(next(blocks(parcel))[: 1 << 20])
     with pytest.raises((OutputError, OSError)) as caught:
         arriving.end()
@@ -100,8 +100,10 @@ def test_too_much_is_refused_by_the_name_of_its_limit(folder: Path, monkeypatch:
 
 
 def test_paths_are_those_of_the_other_side():
-    places = Places([("/a", "/cache/1"), ("/a/out/b", "/cache/2")])
+    places = PathTranslation([("/a", "/cache/1"), ("/a/out/b", "/cache/2")])
     asked = {"bundle": "/a/out/b", "file": "/a/e.py:make", "other": "/ab", "seeds": [1, 2], "text": "see /a/e.py"}
-    assert places.named(asked) == {**asked, "bundle": "/cache/2", "file": "/cache/1/e.py:make"}
-    back = Places([("/cache/1", "/a"), ("/cache/2", "/a/out/b")])
-    assert back.told({"message": "/cache/1/e.py failed, not /cache/2"}) == {"message": "/a/e.py failed, not /a/out/b"}
+    assert places.translate(asked) == {**asked, "bundle": "/cache/2", "file": "/cache/1/e.py:make"}
+    back = PathTranslation([("/cache/1", "/a"), ("/cache/2", "/a/out/b")])
+    assert back.rewrite({"message": "/cache/1/e.py failed, not /cache/2"}) == {
+        "message": "/a/e.py failed, not /a/out/b"
+    }

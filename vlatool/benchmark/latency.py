@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field, PrivateAttr
 
 from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.bundle.unexported import export_command
+from vlatool.bundle.module_bundle import export_command
 from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
@@ -21,11 +21,11 @@ from vlatool.graph.workload import WORKLOAD_TABLE, Workload, summarize_workload,
 from vlatool.graph.zeros import zero_share
 from vlatool.machine.host import fingerprint
 from vlatool.measurement import agent
-from vlatool.measurement.interleaved import MOST
+from vlatool.measurement.interleaved import MAX_CALLS
 from vlatool.measurement.jobs import LatencyJob, Limits
-from vlatool.measurement.measured import Measured, PolicyRun
-from vlatool.measurement.reach import LIKELY, POSSIBLE, REPEATS, SIZE, share_of_reach
-from vlatool.measurement.rows import measurements, raw, sustained, tables
+from vlatool.measurement.reach import LIKELY_SHARE, POSSIBLE, REPEATS, SIZE, share_of_reach
+from vlatool.measurement.results import Benchmark, PolicyRun
+from vlatool.measurement.rows import measurements, raw, sustained_rows, tables
 from vlatool.measurement.validity import findings, validity
 from vlatool.report import Finding, Measurement, Report, Row
 from vlatool.runtime.engine import engine_class
@@ -57,7 +57,7 @@ class Latency(Measure):
 
     against: tuple[Path, ...] = Field((), description="further bundles, measured in the same run; compared with BUNDLE")
     iterations: int | None = Field(
-        None, ge=20, le=MOST, description="inferences of each policy, at least; 200, and with --rate 20, if unset"
+        None, ge=20, le=MAX_CALLS, description="inferences of each policy, at least; 200, and with --rate 20, if unset"
     )
     duration: float = Field(10.0, ge=0, le=LONGEST_S, description="seconds that each policy is timed for, at least")
     warmup: int = Field(10, ge=1, description="inferences before the first that counts")
@@ -106,11 +106,11 @@ class Latency(Measure):
                 "--rate paces one policy; measure the further ones in runs of their own.",
                 "leave --against out, or leave --rate out to compare them back to back",
             )
-        if self.rate * self.duration > MOST:
+        if self.rate * self.duration > MAX_CALLS:
             raise UsageError(
                 f"--rate {self.rate:g} for {self.duration:g} s are {self.rate * self.duration:,.0f} ticks; "
-                f"allowed: {MOST:,}, each of which is kept.",
-                f"give a lower --rate, or a --duration of at most {MOST / self.rate:.3g} s",
+                f"allowed: {MAX_CALLS:,}, each of which is kept.",
+                f"give a lower --rate, or a --duration of at most {MAX_CALLS / self.rate:.3g} s",
             )
         if self.rate and (self.iterations or FEWEST_TICKS) > self.rate * LONGEST_S:
             raise UsageError(
@@ -162,11 +162,11 @@ class Latency(Measure):
             if self.memory_mb and not bundle.manifest.graphs:
                 raise UsageError(f"The memory of eager torch is not limited: {bundle.path} has no graph.", "export it")
         job = self._job(bundles)
-        if context.elsewhere is None:
-            return self._report(bundles, job, agent.measure(job, context.tell), HERE)
-        answer = context.elsewhere(to_json(job), [bundle.path for bundle in bundles], context.tell)
+        if context.measure_remotely is None:
+            return self._report(bundles, job, agent.measure(job, context.progress), HERE)
+        answer = context.measure_remotely(to_json(job), [bundle.path for bundle in bundles], context.progress)
         try:
-            measured = from_json(Measured, answer, "answer")
+            measured = from_json(Benchmark, answer, "answer")
             where = str(measured.host.get("board") or measured.host.get("cpu") or "the target")
             return self._report(bundles, job, measured, where)
         except (LookupError, TypeError, ValueError, ArithmeticError) as error:
@@ -191,14 +191,14 @@ class Latency(Measure):
             reach=self.reach and not self.memory_mb,  # what a policy may take is not for a product
         )
 
-    def _report(self, bundles: Sequence[Bundle], job: LatencyJob, run: Measured, where: str) -> Report:
+    def _report(self, bundles: Sequence[Bundle], job: LatencyJob, run: Benchmark, where: str) -> Report:
         reference, *others = run.policies
         if self.memory_mb or self.cores:
             where += f", limited{f' as {self._board}' if self._board else ''}"
         rows = []
         for bundle, policy in zip(bundles, run.policies, strict=True):
             numbers = measurements(run, policy, reference if others else None, self.rate)
-            numbers += sustained(policy.samples) if self.sustained else []
+            numbers += sustained_rows(policy.samples) if self.sustained else []
             if bundle.manifest.graphs:
                 numbers.append(Measurement("size", bundle.graph_bytes / 1e6, "MB", note="graphs on disk"))
             work = _work(bundle)
@@ -294,7 +294,7 @@ def _ms(row: Row) -> str:
     return f"{value:.3g} ms" if value < 1000 else f"{value:,.0f} ms"
 
 
-def _sparse(bundles: Sequence[Bundle], rows: Sequence[Row], run: Measured) -> Iterator[Finding]:
+def _sparse(bundles: Sequence[Bundle], rows: Sequence[Row], run: Benchmark) -> Iterator[Finding]:
     """Say of each policy with more zeros than the first one whether the engine gains by them, as was measured."""
     dense = zero_share(bundles[0]) if len(bundles) > 1 else 1.0
     for bundle, row, policy in list(zip(bundles, rows, run.policies, strict=True))[1:]:
@@ -317,7 +317,7 @@ def _beyond(rows: Sequence[Row]) -> Iterator[Finding]:
     """Say where a policy seems to be faster than its work at the speed of the large product."""
     for row in rows:
         found = row.get("reach_share")
-        if found is None or found.value <= LIKELY:
+        if found is None or found.value <= LIKELY_SHARE:
             continue
         what = f"{row.name} seems to do its work {found.value:,.3g} times as fast as the large product"
         if found.value > POSSIBLE:

@@ -73,13 +73,13 @@ class Overhead(Measure):
         whole: list[float] = []
         rounds = -(-self.iterations // ROUND)
         for number in range(rounds + 1):
-            context.tell("measuring rounds", number / (rounds + 1))
+            context.progress("measuring rounds", number / (rounds + 1))
             for kind in (0, 1) if number % 2 else (1, 0):
                 if kind:
                     whole.append(_median_us(policy.infer, observations))
                 else:
                     bare.append(_median_us(run, feeds))
-        context.tell("measuring calls in turn", None)
+        context.progress("measuring calls in turn", None)
         in_turn = _in_turn_us(policy.infer, observations, run, feeds, rounds * ROUND)
         differences = np.array(whole[1:]) - np.array(bare[1:])
         return self._report(source, differences, in_turn, float(np.median(bare[1:])))

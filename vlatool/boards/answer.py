@@ -12,10 +12,10 @@ from vlatool.boards.report import boards_report
 from vlatool.boards.select import Choice, Wants, choose, in_the_cloud
 from vlatool.boards.simulate import Change, bounds, changes, parts_of, timeline
 from vlatool.boards.torch_workload import counted_apart
-from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.errors import DataError, OutputError, SourceError, UsageError, instead, nearest
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import DataError, OutputError, SourceError, UsageError, fix_for, suggest
 from vlatool.export.onnx import ExportOnnx
-from vlatool.files.written import note_file
+from vlatool.files.ownership import add_to_ledger
 from vlatool.graph.workload import PRECISIONS, Workload, workload
 from vlatool.graph.workload_file import digest, read_workload, refuse_foreign_file, write_workload
 from vlatool.hardware.platforms import load_platform
@@ -28,7 +28,7 @@ from vlatool.module.description import read_location
 from vlatool.module.edits import is_changed
 from vlatool.module.origin import origin_of
 from vlatool.report import Report
-from vlatool.sources import sourced
+from vlatool.sources import open_source, source_bundle
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_transform
 
@@ -64,7 +64,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     for precision in asked.precisions:
         if precision not in PRECISIONS:
             raise UsageError(
-                f"--precision is '{precision}'; {nearest(precision, PRECISIONS)}.", instead(precision, PRECISIONS)
+                f"--precision is '{precision}'; {suggest(precision, PRECISIONS)}.", fix_for(precision, PRECISIONS)
             )
     if asked.platform:
         sheet = load_platform(asked.platform)
@@ -84,7 +84,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     model = load_model().condition(measured_questions(calibration))
     owned = [board for board in boards if board.price_usd_per_hour is None]
     rented = [board for board in boards if board.price_usd_per_hour is not None]
-    context.tell("predicting", None)
+    context.progress("predicting", None)
     cloud = _cheapest(rented, load, model, asked) if asked.cloud else None
     choices = choose(owned or rented, load, model, asked)
     return boards_report(source, load, choices, asked, cloud, context.command)
@@ -101,9 +101,7 @@ def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wa
 
 def opened(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or the source bundle of a policy."""
-    if (Path(source) / MANIFEST).is_file():
-        return Bundle.open(Path(source))
-    return sourced(source, cache_directory(), context)
+    return source_bundle(open_source(source), cache_directory(), context)
 
 
 def counted(bundle: Bundle, context: Context) -> Workload:
@@ -132,10 +130,10 @@ def _counted_source(bundle: Bundle, context: Context) -> Workload:
 
     A factory that reads its own weights cannot fill modules that have none, and may look at their values.
     """
-    context.tell("counting the policy's work, without its weights", None)
+    context.progress("counting the policy's work, without its weights", None)
     with contextlib.suppress(SourceError):  # what is wrong with the policy itself, the export says
-        return counted_apart(bundle, context.tell)
-    context.tell("it cannot be counted so; exporting the policy to count its graphs", None)
+        return counted_apart(bundle, context.progress)
+    context.progress("it cannot be counted so; exporting the policy to count its graphs", None)
     return _counted_export(bundle, context)
 
 
@@ -172,7 +170,7 @@ def carry_count(source: str, context: Context) -> Path:
     load = counted(bundle, context)
     try:
         write_workload(file, load, digest(bundle))
-        note_file(file)
+        add_to_ledger(file)
     except OSError as error:
         raise OutputError(f"{file} cannot be written: {error.strerror}.", "make the folder writable") from error
     return file
@@ -206,8 +204,8 @@ def simulated(
     asked = Candidate(profile, name, engine or profile.engine, precision)
     if precision and precision not in asked.figures.dtypes:
         raise UsageError(
-            f"--precision is '{precision}'; {nearest(precision, asked.figures.dtypes)}.",
-            instead(precision, asked.figures.dtypes),
+            f"--precision is '{precision}'; {suggest(precision, asked.figures.dtypes)}.",
+            fix_for(precision, asked.figures.dtypes),
         )
     bundle = opened(source, context)
     spec, load = bundle.manifest.spec, counted(bundle, context)

@@ -19,7 +19,7 @@ from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
 from vlatool.graph.workload import GraphWorkload, Tally, Workload, part_of
 from vlatool.graph.workload_file import from_values, to_values
-from vlatool.module.faked import faked_modules, run_faked
+from vlatool.module.fake_weights import meta_float32_modules, run_on_fake_tensors
 from vlatool.user_code import children
 
 PRELOAD = ("torch", "torch._dynamo", __name__)
@@ -61,7 +61,7 @@ def torch_workload(bundle: Bundle) -> Workload:
     require("torch", "build")
     with warnings.catch_warnings():  # a factory that loads its weights loads them into nothing
         warnings.simplefilter("ignore")
-        modules = faked_modules(bundle)
+        modules = meta_float32_modules(bundle)
     graphs: dict[str, GraphWorkload] = {}
     runs: Counter[str] = Counter()
     seen: dict[str, _Seen] = {}
@@ -74,7 +74,7 @@ def torch_workload(bundle: Bundle) -> Workload:
         return _watching(seen[step.graph])
 
     try:
-        run_faked(bundle, modules, visit)
+        run_on_fake_tensors(bundle, modules, visit)
     except SourceError:
         raise
     except Exception as error:  # the seam: a policy's forward raises what it likes

@@ -1,1 +1,1 @@
-"""A bundle: what its manifest says, its spec, its files."""
+"""Bundles: manifest, spec, program and files."""

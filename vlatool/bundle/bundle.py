@@ -13,17 +13,18 @@ from typing import Any
 
 from vlatool.bundle.manifest import FileRecord, Manifest, check_files
 from vlatool.errors import BundleError
+from vlatool.files import verified_read
 from vlatool.files.json import read_json
-from vlatool.files.limits import check, limit
-from vlatool.files.sealed import FIX, LITTER, held, open_inside, read_all, read_sealed, unlisted, verify_sealed
-from vlatool.files.written import LEDGER, hash_once
+from vlatool.files.limits import check_limit, limit
+from vlatool.files.ownership import LEDGER, cached_hash
+from vlatool.files.verified_read import DESKTOP_FILES, FIX
 
 MANIFEST = "manifest.json"
 DIGEST = "manifest.sha256"
 """The SHA-256 of the manifest, as ``sha256sum`` writes it: what protects everything that the manifest says."""
 LOCATION = "location.json"
 REPORTS = "reports"
-UNRECORDED = (REPORTS, "recipe.yaml", MANIFEST, DIGEST, "SIGNATURE", LOCATION, LEDGER)
+UNRECORDED_NAMES = (REPORTS, "recipe.yaml", MANIFEST, DIGEST, "SIGNATURE", LOCATION, LEDGER)
 """Names at the top of a bundle that the manifest holds no hash of: they are written about the bundle."""
 ASSETS = "assets"
 
@@ -47,20 +48,20 @@ class Bundle:
         """Read the manifest, check it against its digest, and check every file before anything else is parsed.
 
         Args:
-            path: The directory.
-            verify: Check that the files are those of the manifest, with their sizes and SHA-256, and no others.
+            path: the directory.
+            verify: whether to check that the files are exactly those of the manifest, by size and SHA-256.
 
         Raises:
             BundleError: when the directory is missing or no bundle, or a file is missing, changed, unknown or a link.
             SpecError: for an impossible spec or program.
         """
-        bundle = cls.described(path)
+        bundle = cls.open_lazily(path)
         if verify:
             bundle.verify()
         return bundle
 
     @classmethod
-    def described(cls, path: str | os.PathLike[str]) -> Bundle:
+    def open_lazily(cls, path: str | os.PathLike[str]) -> Bundle:
         """Read the manifest, check it against its digest; the files are checked when they are read (``read``).
 
         Raises:
@@ -69,15 +70,15 @@ class Bundle:
         """
         root = Path(path)
         bundle = cls(root, Manifest.from_dict(_read_manifest(root)))
-        check("bundle_bytes", bundle.size_bytes, f"{root}: what the manifest records", BundleError)
+        check_limit("bundle_bytes", bundle.size_bytes, f"{root}: what the manifest records", BundleError)
         return bundle
 
     def verify(self, prefix: str = "", but: str = "") -> None:
         """Check every file that was not verified by reading it, and that nothing else is there.
 
         Args:
-            prefix: Check the content only of files whose names start with it.
-            but: Leave out those whose names start with this; none when empty.
+            prefix: prefix of the names of the files whose content is checked.
+            but: prefix of the names that are left out; none when empty.
 
         Raises:
             BundleError: when a file is missing, changed, a link, or not in the manifest.
@@ -85,7 +86,7 @@ class Bundle:
         self.check_tree()
         names = [name for name in self.manifest.files if name.startswith(prefix) and not (but and name.startswith(but))]
         for name in [name for name in names if name not in self._verified]:
-            verify_sealed(self.path, name, *self._record(name))
+            verified_read.verify_file(self.path, name, *self._record(name))
 
     def check_tree(self) -> None:
         """Refuse what the manifest does not record, and a manifest that names files which it does not record.
@@ -95,7 +96,7 @@ class Bundle:
         """
         check_files(self.manifest)
         try:
-            stranger = unlisted(self.path, set(self.manifest.files), UNRECORDED[1:], REPORTS)
+            stranger = verified_read.find_unlisted(self.path, set(self.manifest.files), UNRECORDED_NAMES[1:], REPORTS)
         except OSError as error:
             raise BundleError(
                 f"{self.path} cannot be read: {error.strerror}.",
@@ -113,8 +114,8 @@ class Bundle:
         """Return the content of a recorded file: the very bytes that were verified, read once.
 
         Args:
-            name: As in the manifest.
-            allowed: Name of the limit on its size.
+            name: name in the manifest.
+            allowed: name of the limit on its size.
 
         Raises:
             BundleError: when the manifest does not record it, it is larger than the limit, or it is not what the
@@ -122,8 +123,8 @@ class Bundle:
         """
         sha256, size = self._record(name)
         if allowed:
-            check(allowed, size, f"{self.path / name}", BundleError)
-        content = read_sealed(self.path, name, sha256, size)
+            check_limit(allowed, size, f"{self.path / name}", BundleError)
+        content = verified_read.read_verified(self.path, name, sha256, size)
         self._verified.add(name)
         return content
 
@@ -132,15 +133,15 @@ class Bundle:
         return self.read(f"{ASSETS}/{name}", allowed)
 
     @contextlib.contextmanager
-    def held(self, folder: str, names: Iterable[str]) -> Iterator[Path]:
+    def verified_folder(self, folder: str, names: Iterable[str]) -> Iterator[Path]:
         """Verify files that an engine opens by name, and give the directory ``folder`` while they stay as they are.
 
         Raises:
             BundleError: when a file is not what the manifest says, or changed before the block ended.
         """
         files = {name: self._record(name) for name in names}
-        with held(self.path, folder, files) as place:
-            yield place
+        with verified_read.verified_directory(self.path, folder, files) as path:
+            yield path
         self._verified.update(files)
 
     def _record(self, name: str) -> tuple[str, int]:
@@ -188,16 +189,16 @@ def seal(directory: Path, manifest: Manifest) -> Bundle:
     files = {}
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
-        if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in LITTER:
+        if path.is_file() and name.partition("/")[0] not in UNRECORDED_NAMES and path.name not in DESKTOP_FILES:
             status = path.stat()
             linked = status.st_nlink > 1  # shared among stages of the cache, and read-only
-            files[name] = FileRecord(hash_once(path) if linked else hash_file(path), status.st_size)
+            files[name] = FileRecord(cached_hash(path) if linked else hash_file(path), status.st_size)
     sealed = replace(manifest, files=files)
     write_manifest(directory, sealed)
     return Bundle(directory, sealed)
 
 
-def restate(bundle: Bundle, manifest: Manifest) -> Bundle:
+def replace_manifest(bundle: Bundle, manifest: Manifest) -> Bundle:
     """Write another manifest for a bundle whose files stay as they are, and return it."""
     write_manifest(bundle.path, manifest)
     return Bundle(bundle.path, manifest)
@@ -240,7 +241,7 @@ def _read_manifest(root: Path) -> Any:
             "make one with: vlatool export SOURCE -o BUNDLE",
         )
     content = _read_small(root, MANIFEST, limit("manifest_bytes"))
-    check("manifest_bytes", len(content), f"{path}", BundleError)
+    check_limit("manifest_bytes", len(content), f"{path}", BundleError)
     _check_digest(root, content)
     return read_json(content, f"{path}", BundleError, "export the policy again", strict=True)
 
@@ -259,5 +260,5 @@ def _check_digest(root: Path, content: bytes) -> None:
 
 def _read_small(root: Path, name: str, most: int) -> bytes:
     """Return the content of a file that is not recorded: up to ``most`` bytes, and one more when it has more."""
-    with open_inside(root, name) as handle:
-        return read_all(handle, min(os.fstat(handle).st_size, most))
+    with verified_read.open_inside(root, name) as handle:
+        return verified_read.read_all(handle, min(os.fstat(handle).st_size, most))

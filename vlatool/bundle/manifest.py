@@ -10,8 +10,8 @@ from typing import Any
 from vlatool.bundle.program import ProgramStep, check_program, program_from
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import BundleError
-from vlatool.files.limits import check
-from vlatool.files.typed import finite, known, listed, mapping, outside, shown, text, whole
+from vlatool.files.limits import check_limit
+from vlatool.files.validate import finite_number, integer, known_keys, mapping, path_problem, sequence, short_repr, text
 
 SCHEMA = 1
 GOLDEN_TOLERANCE = 0.05
@@ -33,11 +33,11 @@ class Graph:
     """One ONNX file of a policy.
 
     Args:
-        file: Path inside the bundle.
-        precision: Share of the multiply-accumulates that run in each dtype, as exported (0-1); ``int4 weights`` where
+        file: path inside the bundle.
+        precision: share of the multiply-accumulates that run in each dtype, as exported (0-1); ``int4 weights`` where
             the weights alone are int4.
-        opset: Opset of the default ONNX domain.
-        compute: Dtype in which the engine computes what is not quantized: ``bfloat16``, or float32 when empty.
+        opset: opset of the default ONNX domain.
+        compute: dtype in which the engine computes what is not quantized: ``bfloat16``, or float32 when empty.
     """
 
     file: str
@@ -48,12 +48,12 @@ class Graph:
     def __post_init__(self) -> None:
         _inside(self.file)
         for name, share in mapping(self.precision, f"The precision of {self.file}", BundleError).items():
-            if not 0 <= finite(share, f"The share of {name} in {self.file}", BundleError) <= 1.001:
-                raise BundleError(f"The share of {name} in {self.file} is {shown(share)}; allowed: 0 to 1.")
-        whole(self.opset, f"The opset of {self.file}", BundleError)
+            if not 0 <= finite_number(share, f"The share of {name} in {self.file}", BundleError) <= 1.001:
+                raise BundleError(f"The share of {name} in {self.file} is {short_repr(share)}; allowed: 0 to 1.")
+        integer(self.opset, f"The opset of {self.file}", BundleError)
         if self.compute not in COMPUTES:
             raise BundleError(
-                f"The graph {self.file} computes in {shown(self.compute)}; allowed: {', '.join(COMPUTES[1:])}."
+                f"The graph {self.file} computes in {short_repr(self.compute)}; allowed: {', '.join(COMPUTES[1:])}."
             )
 
 
@@ -62,31 +62,31 @@ class Manifest:
     """The content of ``manifest.json``.
 
     Args:
-        name: Name of the policy.
-        version: Version of the policy, as its author counts.
-        spec: What the policy consumes and produces.
-        graphs: Graph name -> graph; empty in a source bundle.
-        program: How the graphs are run, in order.
-        files: Path inside the bundle -> SHA-256 and size, of every file but the reports.
+        name: name of the policy.
+        version: version of the policy, as its author counts.
+        spec: what the policy consumes and produces.
+        graphs: graph name -> graph; empty in a source bundle.
+        program: how the graphs are run, in order.
+        files: path inside the bundle -> SHA-256 and size, of every file but the reports.
         parent: ``sha256:...`` of the bundle that this one was made from.
-        made_by: Version of vlatool, stage, options, versions of the packages that change the result.
-        build: The build record: for each stage from the source to this bundle what ``made_by`` says, the seed, the hash
+        made_by: version of vlatool, stage, options, versions of the packages that change the result.
+        build: build record: for each stage from the source to this bundle what ``made_by`` says, the seed, the hash
             of its input, the SHA-256 of its graphs, of its input files and of its calibration samples.
-        source: Factory and hashes of the code and weights (a source bundle, and those exported from it).
-        environment: Factory and tasks of the closed-loop evaluation.
-        parts: Part of the policy -> globs of module names.
-        golden: File with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
-        golden_tolerance: Largest relative L2 difference from the golden action with which a machine loads the bundle,
+        source: factory and hashes of the code and weights (a source bundle, and those exported from it).
+        environment: factory and tasks of the closed-loop evaluation.
+        parts: part of the policy -> globs of module names.
+        golden: file with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
+        golden_tolerance: largest relative L2 difference from the golden action with which a machine loads the bundle,
             from what was measured when it was made; ``GOLDEN_TOLERANCE`` when 0.
-        golden_chunk_tolerance: The same for the action in physical units, each element from the offset of its
+        golden_chunk_tolerance: the same for the action in physical units, each element from the offset of its
             statistics and in units of their spread; ``golden_tolerance`` when 0.
-        findings: What a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
+        findings: what a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
             and ``gate`` refuse the bundle unless each is overruled by its name.
-        accuracy: Measured accuracy: name -> value, interval, samples.
-        description: One sentence.
+        accuracy: measured accuracy: name -> value, interval, samples.
+        description: one sentence.
         license: SPDX identifier of the policy's licence.
-        engine: Engine that the graphs were made for; ONNX Runtime on the CPU when empty.
-        schema: Version of this format.
+        engine: engine that the graphs were made for; ONNX Runtime on the CPU when empty.
+        schema: version of this format.
     """
 
     name: str
@@ -112,8 +112,8 @@ class Manifest:
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
-        check("files", len(self.files), "The manifest", BundleError)
-        check("graphs", len(self.graphs), "The manifest", BundleError)
+        check_limit("files", len(self.files), "The manifest", BundleError)
+        check_limit("graphs", len(self.graphs), "The manifest", BundleError)
         for path in (*self.files, *(graph.file for graph in self.graphs.values())):
             _inside(path)
         for graph in self.graphs.values():
@@ -124,9 +124,9 @@ class Manifest:
         for name, measured in self.accuracy.items():
             if not isinstance(measured, Mapping) or "value" not in measured:
                 raise BundleError(
-                    f"The manifest's accuracy '{name}' must have a number as 'value'; got {shown(measured)}."
+                    f"The manifest's accuracy '{name}' must have a number as 'value'; got {short_repr(measured)}."
                 )
-            finite(measured["value"], f"The manifest's accuracy '{name}'", BundleError)
+            finite_number(measured["value"], f"The manifest's accuracy '{name}'", BundleError)
         if self.program:
             check_program(self.program, self.graphs or {step.graph: None for step in self.program}, self.spec)
 
@@ -140,14 +140,14 @@ class Manifest:
         """
         values = mapping(data, "The manifest", BundleError)
         check_schema(values.get("schema"))
-        known(values, [item.name for item in fields(cls)], "The manifest", BundleError)
+        known_keys(values, [item.name for item in fields(cls)], "The manifest", BundleError)
         for item in fields(cls):
             if item.name in values:
                 _check_type(item.name, values[item.name], item)
         for key in ("name", "version", "spec"):
             if key not in values:
                 raise BundleError(f"The manifest has no '{key}'.", "export the policy again")
-        check("files", len(values.get("files", ())), "The manifest", BundleError)
+        check_limit("files", len(values.get("files", ())), "The manifest", BundleError)
         values["spec"] = PolicySpec.from_dict(values["spec"])
         values["graphs"] = {name: _graph(name, graph) for name, graph in values.get("graphs", {}).items()}
         values["program"] = program_from(values.get("program", []))
@@ -155,7 +155,7 @@ class Manifest:
         values["findings"] = _entries(values.get("findings", ()), "findings", ("name", "message"))
         values["files"] = {path: _record(path, record) for path, record in values.get("files", {}).items()}
         for part, globs in values.get("parts", {}).items():
-            for glob in listed(globs, f"The part '{part}' of the manifest", BundleError):
+            for glob in sequence(globs, f"The part '{part}' of the manifest", BundleError):
                 text(glob, f"A glob of the part '{part}'", BundleError)
         return cls(**values)
 
@@ -195,10 +195,10 @@ def check_schema(schema: Any) -> None:
         BundleError: when it is newer than this vlatool, or none.
     """
     if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
-        raise BundleError(f"The manifest has the schema {shown(schema)}; this vlatool reads 1 to {SCHEMA}.")
+        raise BundleError(f"The manifest has the schema {short_repr(schema)}; this vlatool reads 1 to {SCHEMA}.")
     if schema > SCHEMA:
         raise BundleError(
-            f"The bundle has the manifest schema {shown(schema)}; this vlatool reads up to {SCHEMA}.",
+            f"The bundle has the manifest schema {short_repr(schema)}; this vlatool reads up to {SCHEMA}.",
             "upgrade vlatool",
         )
 
@@ -209,39 +209,39 @@ def _check_type(name: str, value: Any, item: Any) -> None:
     if name in ("spec", "schema"):
         return
     if name in ("golden_tolerance", "golden_chunk_tolerance"):
-        if finite(value, where, BundleError) < 0:
-            raise BundleError(f"{where} is {shown(value)}; allowed: a number from 0.")
+        if finite_number(value, where, BundleError) < 0:
+            raise BundleError(f"{where} is {short_repr(value)}; allowed: a number from 0.")
         return
     if item.default == "" or (item.default is MISSING and item.default_factory is MISSING):
         text(value, where, BundleError, empty=item.default == "")
     elif item.default_factory is dict:
         mapping(value, where, BundleError)
     elif name != "program":
-        listed(value, where, BundleError)
+        sequence(value, where, BundleError)
 
 
 def _graph(name: str, data: Any) -> Graph:
     values = mapping(data, f"The graph '{name}'", BundleError)
-    known(values, [item.name for item in fields(Graph)], f"The graph '{name}'", BundleError)
+    known_keys(values, [item.name for item in fields(Graph)], f"The graph '{name}'", BundleError)
     if "file" not in values:
         raise BundleError(f"The graph '{name}' has no 'file'.", "export the policy again")
     return Graph(**values)
 
 
 def _record(path: str, data: Any) -> FileRecord:
-    values = mapping(data, f"The record of {shown(path)}", BundleError)
-    known(values, ("sha256", "bytes"), f"The record of {shown(path)}", BundleError)
+    values = mapping(data, f"The record of {short_repr(path)}", BundleError)
+    known_keys(values, ("sha256", "bytes"), f"The record of {short_repr(path)}", BundleError)
     digest = values.get("sha256")
     if not isinstance(digest, str) or not SHA256.fullmatch(digest):
-        raise BundleError(f"The record of {shown(path)} has the SHA-256 {shown(digest)}; it must be 64 hex digits.")
-    return FileRecord(digest, whole(values.get("bytes"), f"The size of {shown(path)}", BundleError))
+        raise BundleError(f"The record of {short_repr(path)} has the SHA-256 {short_repr(digest)}, not 64 hex digits.")
+    return FileRecord(digest, integer(values.get("bytes"), f"The size of {short_repr(path)}", BundleError))
 
 
 def _inside(path: Any) -> None:
     if not isinstance(path, str):
-        raise BundleError(f"The manifest names the file {shown(path)} in graphs or files; a file is text.")
-    if reason := outside(path):
-        raise BundleError(f"The manifest names the file {shown(path)}, which is not inside the bundle: {reason}.")
+        raise BundleError(f"The manifest names the file {short_repr(path)} in graphs or files; a file is text.")
+    if reason := path_problem(path):
+        raise BundleError(f"The manifest names the file {short_repr(path)}, which is not inside the bundle: {reason}.")
 
 
 def _entries(data: Any, where: str, keys: tuple[str, ...]) -> tuple[dict[str, Any], ...]:

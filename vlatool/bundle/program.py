@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from vlatool.bundle.spec import DTYPES, PolicySpec
-from vlatool.errors import SpecError, nearest
-from vlatool.files.limits import check
-from vlatool.files.typed import axes, finite, known, mapping, shown, text
+from vlatool.errors import SpecError, suggest
+from vlatool.files.limits import check_limit
+from vlatool.files.validate import element_count, finite_number, known_keys, mapping, short_repr, text
 
 DISTRIBUTIONS = ("normal", "uniform", "zeros")
 
@@ -35,50 +35,51 @@ def check_step(step: ProgramStep) -> None:
 
 def drawn_and_kept(step: ProgramStep) -> int:
     """Return the elements of the noise and of the kept values of an entry that was checked."""
-    return sum(axes(value["shape"], "a shape", SpecError) for value in (*step.noise.values(), *step.keep.values()))
+    values = (*step.noise.values(), *step.keep.values())
+    return sum(element_count(value["shape"], "a shape", SpecError) for value in values)
 
 
 def _check_repeat(step: ProgramStep) -> None:
     if isinstance(step.repeat, bool) or not isinstance(step.repeat, int) or step.repeat < 1:
-        raise SpecError(f"The program repeats '{step.graph}' {shown(step.repeat)} times; allowed: from 1.")
-    check("repeat", step.repeat, f"The step of '{step.graph}'", SpecError)
+        raise SpecError(f"The program repeats '{step.graph}' {short_repr(step.repeat)} times; allowed: from 1.")
+    check_limit("repeat", step.repeat, f"The step of '{step.graph}'", SpecError)
     for value, numbers in step.schedule.items():
         if not isinstance(numbers, list | tuple):
-            raise SpecError(f"The schedule of '{value}' must be a list of numbers; got {shown(numbers)}.")
+            raise SpecError(f"The schedule of '{value}' must be a list of numbers; got {short_repr(numbers)}.")
         if len(numbers) != step.repeat:
             got = f"{len(numbers)} numbers, but '{step.graph}' runs {step.repeat} times"
             raise SpecError(f"The schedule of '{value}' has {got}.")
         for entry in numbers:
-            finite(entry, f"A number in the schedule of '{value}'", SpecError)
+            finite_number(entry, f"A number in the schedule of '{value}'", SpecError)
             if isinstance(entry, int) and not -(2**63) <= entry < 2**63:
                 raise SpecError(f"The schedule of '{value}' has a number that no int64 holds.")
 
 
 def _check_noise(value: str, noise: Any) -> None:
     noise = mapping(noise, f"The noise '{value}'", SpecError)
-    known(noise, ("shape", "distribution"), f"The noise '{value}'", SpecError)
+    known_keys(noise, ("shape", "distribution"), f"The noise '{value}'", SpecError)
     if noise.get("distribution", "normal") not in DISTRIBUTIONS or not noise.get("shape"):
         raise SpecError(f"The noise '{value}' needs a shape and a distribution of {', '.join(DISTRIBUTIONS)}.")
-    elements = axes(noise["shape"], f"the shape of the noise '{value}'", SpecError)
-    check("elements", elements, f"The noise '{value}'", SpecError)
+    elements = element_count(noise["shape"], f"the shape of the noise '{value}'", SpecError)
+    check_limit("elements", elements, f"The noise '{value}'", SpecError)
 
 
 def _check_kept(value: str, kept: Any) -> None:
     shape = kept.get("shape") if isinstance(kept, Mapping) else kept
     if not isinstance(kept, Mapping) or not shape:
         raise SpecError(
-            f"The kept value '{value}' needs a shape of one axis or more; got {shown(shape)}.",
+            f"The kept value '{value}' needs a shape of one axis or more; got {short_repr(shape)}.",
             f"write it as {value}: {{shape: [1], dtype: float32}}; a single number is such a value, too, and "
             "forward() takes and returns it with that axis",
         )
-    known(kept, ("shape", "dtype"), f"The kept value '{value}'", SpecError)
+    known_keys(kept, ("shape", "dtype"), f"The kept value '{value}'", SpecError)
     if kept.get("dtype", "float32") not in DTYPES:
         raise SpecError(
-            f"The kept value '{value}' has the dtype {shown(kept['dtype'])}; allowed: {', '.join(DTYPES)}.",
+            f"The kept value '{value}' has the dtype {short_repr(kept['dtype'])}; allowed: {', '.join(DTYPES)}.",
             "keep it as one of them, bfloat16 as float32, and let forward() convert it when it takes and returns it",
         )
-    elements = axes(kept["shape"], f"the shape of the kept value '{value}'", SpecError)
-    check("elements", elements, f"The kept value '{value}'", SpecError)
+    elements = element_count(kept["shape"], f"the shape of the kept value '{value}'", SpecError)
+    check_limit("elements", elements, f"The kept value '{value}'", SpecError)
 
 
 @dataclass(frozen=True)
@@ -86,14 +87,14 @@ class ProgramStep:
     """One entry of a program: run a graph, once or several times.
 
     Args:
-        graph: Name of the graph.
-        feeds: Graph input name -> value name.
-        gives: Graph output name -> value name.
-        repeat: How often the graph runs.
-        carry: Given value -> the value that it replaces before the next repeat.
-        schedule: Value -> one number for each repeat, presented as an array of shape (1,).
-        noise: Value -> {shape, distribution}; drawn once before the first repeat, from the seedable generator.
-        keep: Value -> {shape, dtype}; zero after ``reset``, else what the last inference gave under that name.
+        graph: name of the graph.
+        feeds: graph input name -> value name.
+        gives: graph output name -> value name.
+        repeat: how often the graph runs.
+        carry: given value -> the value that it replaces before the next repeat.
+        schedule: value -> one number for each repeat, presented as an array of shape (1,).
+        noise: value -> {shape, distribution}; drawn once before the first repeat, from the seedable generator.
+        keep: value -> {shape, dtype}; zero after ``reset``, else what the last inference gave under that name.
     """
 
     graph: str
@@ -127,12 +128,12 @@ def program_from(data: Any) -> tuple[ProgramStep, ...]:
     words = [item.name for item in fields(ProgramStep)]
     if not isinstance(data, list | tuple):
         raise SpecError(f"The program must be a list of steps; got {type(data).__name__}.")
-    check("steps", len(data), "The program", SpecError)
+    check_limit("steps", len(data), "The program", SpecError)
     steps = []
     for number, entry in enumerate(data):
         if not isinstance(entry, Mapping) or not {"graph", "feeds", "gives"} <= set(entry):
-            raise SpecError(f"Step {number} of the program needs 'graph', 'feeds' and 'gives'; got {shown(entry)}.")
-        known(entry, words, f"Step {number} of the program", SpecError)
+            raise SpecError(f"Step {number} of the program lacks 'graph', 'feeds' or 'gives': {short_repr(entry)}.")
+        known_keys(entry, words, f"Step {number} of the program", SpecError)
         steps.append(ProgramStep(**entry))
     return tuple(steps)
 
@@ -152,18 +153,18 @@ def check_program(program: Iterable[ProgramStep], graphs: Iterable[str], spec: P
     """
     graph_names = list(graphs)
     program = tuple(program)
-    check("steps", len(program), "The program", SpecError)
-    check("runs", sum(step.repeat for step in program), "The program", SpecError)
-    check("state_elements", sum(map(drawn_and_kept, program)), "Noise and kept values of the program", SpecError)
+    check_limit("steps", len(program), "The program", SpecError)
+    check_limit("runs", sum(step.repeat for step in program), "The program", SpecError)
+    check_limit("state_elements", sum(map(drawn_and_kept, program)), "Noise and kept values of the program", SpecError)
     values = {tensor.name for tensor in spec.inputs}
     for number, step in enumerate(program):
         if step.graph not in graph_names:
-            raise SpecError(f"Step {number} runs the graph '{step.graph}'; {nearest(step.graph, graph_names)}.")
+            raise SpecError(f"Step {number} runs the graph '{step.graph}'; {suggest(step.graph, graph_names)}.")
         values |= step.sources()
         for name in step.feeds.values():
             if name not in values:
                 raise SpecError(
-                    f"Step {number} ({step.graph}) needs the value '{name}' before it exists; {nearest(name, values)}."
+                    f"Step {number} ({step.graph}) needs the value '{name}' before it exists; {suggest(name, values)}."
                 )
         for source in step.carry:
             if source not in step.gives.values():
@@ -171,4 +172,4 @@ def check_program(program: Iterable[ProgramStep], graphs: Iterable[str], spec: P
         values |= set(step.gives.values())
     for tensor in spec.outputs:
         if tensor.name not in values:
-            raise SpecError(f"No step of the program gives the output '{tensor.name}'; {nearest(tensor.name, values)}.")
+            raise SpecError(f"No step of the program gives the output '{tensor.name}'; {suggest(tensor.name, values)}.")

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from vlatool.errors import SpecError, nearest
-from vlatool.files.limits import check
-from vlatool.files.typed import known, mapping, outside, shown, text, whole
+from vlatool.errors import SpecError, suggest
+from vlatool.files.limits import check_limit
+from vlatool.files.validate import integer, known_keys, mapping, path_problem, short_repr, text
 
 DTYPES = (
     "float32", "float16", "int64", "int32", "uint8", "bool", "float64", "int8", "int16", "uint16", "uint32", "uint64",
@@ -18,11 +18,11 @@ KINDS = ("tensor", "text", "discrete")
 NORMALISATIONS = ("none", "mean_std", "min_max", "quantiles")
 STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99")}
 MODES = ("", "delta", "absolute", "velocity", "relative")
-MOST_INDICES = 2**18
+MAX_INDICES = 2**18
 """Labels that are made up for a discrete output that names none: more than any vocabulary of tokens has."""
 
 
-MOST_HZ = 100_000
+MAX_HZ = 100_000
 
 
 @dataclass(frozen=True)
@@ -30,21 +30,21 @@ class TensorSpec:
     """One named input or output of a policy.
 
     Args:
-        name: The key of the observation, or of the result.
-        shape: With the batch axis in front; a string names an axis whose length is free. Empty for one number without
+        name: the key of the observation, or of the result.
+        shape: axes, the batch first; a string names an axis whose length is free. Empty for one number without
             axes, which an action is not.
-        dtype: What the graph sees: float32, float16, float64, int8 to int64, uint8 to uint64 or bool; uint8 holds
+        dtype: what the graph sees: float32, float16, float64, int8 to int64, uint8 to uint64 or bool; uint8 holds
             pixels.
         kind: ``tensor``; ``text`` (the observation holds a string, the graph sees token ids); ``discrete`` (an output
             of logits over ``labels``; the action is the index of the largest).
-        unit: One unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
-        labels: A name for each element of the last axis; the indices, when a discrete output names none.
-        mode: How a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
-        normalisation: How the runtime maps physical values to what the graph sees (outputs: and back): ``none``,
+        unit: one unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
+        labels: a name for each element of the last axis; the indices, when a discrete output names none.
+        mode: how a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
+        normalisation: how the runtime maps physical values to what the graph sees (outputs: and back): ``none``,
             ``mean_std``, ``min_max`` or ``quantiles``.
         statistics: ``file#key`` of the statistics that the normalisation needs; file relative to the assets.
-        tokenizer: File of the tokenizer, relative to the assets (``kind: text``).
-        max_tokens: Number of ids that the tokenizer pads or cuts to (``kind: text``).
+        tokenizer: file of the tokenizer, relative to the assets (``kind: text``).
+        max_tokens: number of ids that the tokenizer pads or cuts to (``kind: text``).
         finite: False for an input of floats in which the policy itself handles NaN and infinity, such as a depth image
             without a return; everywhere else they are refused.
     """
@@ -72,9 +72,9 @@ class TensorSpec:
                 "name the statistics as FILE#KEY, for example statistics.json#proprio",
             )
         for file in self.assets():
-            if reason := outside(file):
+            if reason := path_problem(file):
                 raise SpecError(
-                    f"'{self.name}' names the file {shown(file)}: {reason}.",
+                    f"'{self.name}' names the file {short_repr(file)}: {reason}.",
                     "statistics and tokenizers belong in the policy's folder; name them relative to it",
                 )
 
@@ -83,28 +83,28 @@ class TensorSpec:
         for field in ("statistics", "tokenizer"):
             text(getattr(self, field), f"The {field} of '{self.name}'", SpecError)
         if not isinstance(self.labels, tuple) or not isinstance(self.unit, str | tuple):
-            got = f"labels {shown(self.labels)} and unit {shown(self.unit)}"
+            got = f"labels {short_repr(self.labels)} and unit {short_repr(self.unit)}"
             raise SpecError(f"'{self.name}' has {got}; labels must be a list.")
         for word in (*self.labels, *(self.unit if isinstance(self.unit, tuple) else (self.unit,))):
             text(word, f"A label or unit of '{self.name}'", SpecError)
-        whole(self.max_tokens, f"The max_tokens of '{self.name}'", SpecError)
-        check("tokens", self.max_tokens, f"'{self.name}'", SpecError)
+        integer(self.max_tokens, f"The max_tokens of '{self.name}'", SpecError)
+        check_limit("tokens", self.max_tokens, f"'{self.name}'", SpecError)
         allowed = {"dtype": DTYPES, "kind": KINDS, "normalisation": NORMALISATIONS, "mode": MODES}
         for field, values in allowed.items():
             got = getattr(self, field)
             if got not in values:
-                allowed_values = nearest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
-                raise SpecError(f"'{self.name}' has {field} {shown(got)}; {allowed_values}.")
+                allowed_values = suggest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
+                raise SpecError(f"'{self.name}' has {field} {short_repr(got)}; {allowed_values}.")
 
     def _check_shape(self) -> None:
         for axis in self.shape:
             if isinstance(axis, bool) or not isinstance(axis, int | str) or (isinstance(axis, int) and axis < 1):
                 raise SpecError(
-                    f"'{self.name}' has the shape {shown(self.shape)}; each axis is a whole number from 1 or a name."
+                    f"'{self.name}' has the shape {short_repr(self.shape)}; an axis is a whole number from 1 or a name."
                 )
             if isinstance(axis, str):
                 text(axis, f"An axis of '{self.name}'", SpecError, empty=False)
-        check("elements", self.elements, f"'{self.name}'", SpecError)
+        check_limit("elements", self.elements, f"'{self.name}'", SpecError)
         width = self.width
         for field in ("labels", "unit"):
             value = getattr(self, field)
@@ -124,7 +124,7 @@ class TensorSpec:
             )
 
         if not isinstance(self.finite, bool):
-            raise SpecError(f"'{self.name}' has finite {shown(self.finite)}; it must be true or false.")
+            raise SpecError(f"'{self.name}' has finite {short_repr(self.finite)}; it must be true or false.")
         if not self.finite and (self.kind != "tensor" or not self.dtype.startswith("float")):
             raise SpecError(
                 f"'{self.name}' says finite: false, but is {'text' if self.kind == 'text' else self.dtype}.",
@@ -164,7 +164,8 @@ class TensorSpec:
         Raises:
             SpecError: for an unknown key or an impossible value.
         """
-        values = _known_only(cls, data, f"tensor {shown(data.get('name', '?') if isinstance(data, Mapping) else data)}")
+        name = short_repr(data.get("name", "?") if isinstance(data, Mapping) else data)
+        values = _known_only(cls, data, f"tensor {name}")
         if values.get("kind") == "text":
             values.setdefault("dtype", "int64")
             values.setdefault("shape", [1, values.get("max_tokens", 1)])
@@ -172,7 +173,7 @@ class TensorSpec:
             if isinstance(values.get(key), list):
                 values[key] = tuple(values[key])
         if "name" not in values or not isinstance(values.get("shape"), tuple):
-            raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {shown(values.get('shape'))}.")
+            raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {short_repr(values.get('shape'))}.")
         if values.get("kind") == "discrete":
             values.setdefault("labels", _indices(values["shape"]))
         return cls(**values)
@@ -185,7 +186,7 @@ class TensorSpec:
 def _indices(shape: tuple[Any, ...]) -> tuple[str, ...]:
     """Labels of actions without names, such as 256 action tokens: the indices of the last axis, unless it is free."""
     width = shape[-1] if shape else 0
-    return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MOST_INDICES else ()
+    return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MAX_INDICES else ()
 
 
 @dataclass(frozen=True)
@@ -193,11 +194,11 @@ class PolicySpec:
     """What a policy consumes and produces.
 
     Args:
-        inputs: In the order in which the source takes them.
-        outputs: The first is the action.
-        control_hz: Rate of the control loop in Hz.
-        chunk: Actions in one inference.
-        execute: Actions that are executed before the next inference; 0 means the whole chunk.
+        inputs: inputs in the order in which the source takes them.
+        outputs: the first is the action.
+        control_hz: rate of the control loop in Hz.
+        chunk: actions in one inference.
+        execute: actions that are executed before the next inference; 0 means the whole chunk.
     """
 
     inputs: tuple[TensorSpec, ...]
@@ -209,7 +210,7 @@ class PolicySpec:
     def __post_init__(self) -> None:
         if not self.inputs or not self.outputs:
             raise SpecError("A policy needs at least one input and one output.")
-        check("tensors", len(self.inputs) + len(self.outputs), "The spec", SpecError)
+        check_limit("tensors", len(self.inputs) + len(self.outputs), "The spec", SpecError)
         names = [tensor.name for tensor in (*self.inputs, *self.outputs)]
         for name in names:
             if names.count(name) > 1:
@@ -224,12 +225,12 @@ class PolicySpec:
                 )
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
-        if isinstance(self.control_hz, bool) or not _between(self.control_hz, 0, MOST_HZ):
-            allowed = f"a rate in Hz above 0 and below {MOST_HZ:,}"
-            raise SpecError(f"control_hz is {shown(self.control_hz)}; allowed: {allowed}.")
-        whole(self.chunk, "chunk", SpecError, 1)
-        check("elements", self.chunk, "chunk", SpecError)
-        if whole(self.execute, "execute", SpecError) > self.chunk:
+        if isinstance(self.control_hz, bool) or not _is_between(self.control_hz, 0, MAX_HZ):
+            allowed = f"a rate in Hz above 0 and below {MAX_HZ:,}"
+            raise SpecError(f"control_hz is {short_repr(self.control_hz)}; allowed: {allowed}.")
+        integer(self.chunk, "chunk", SpecError, 1)
+        check_limit("elements", self.chunk, "chunk", SpecError)
+        if integer(self.execute, "execute", SpecError) > self.chunk:
             raise SpecError(f"chunk is {self.chunk!r} and execute {self.execute!r}; allowed: 1 <= execute <= chunk.")
 
     @property
@@ -258,7 +259,7 @@ class PolicySpec:
         for key in ("inputs", "outputs"):
             listed = values.get(key)
             if not isinstance(listed, list | tuple):
-                raise SpecError(f"The spec needs '{key}', a list of tensors; got {shown(listed)}.")
+                raise SpecError(f"The spec needs '{key}', a list of tensors; got {short_repr(listed)}.")
             values[key] = tuple(TensorSpec.from_dict(item) for item in listed)
         if "control_hz" not in values:
             raise SpecError("The spec needs 'control_hz', the rate of the control loop in Hz.")
@@ -272,13 +273,13 @@ class PolicySpec:
         return plain
 
 
-def _between(value: Any, low: float, high: float) -> bool:
+def _is_between(value: Any, low: float, high: float) -> bool:
     return isinstance(value, int | float) and low < value < high
 
 
 def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
     values = mapping(data, f"The {where}", SpecError)
-    known(values, [field.name for field in fields(cls)], f"The {where}", SpecError)
+    known_keys(values, [field.name for field in fields(cls)], f"The {where}", SpecError)
     return values
 
 

@@ -148,7 +148,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
     """Run a command line; return what the process ends with."""
     try:
-        with plain_warnings(), trust.nothing_named():
+        with plain_warnings(), trust.forget_named():
             refuse_two_distributions()
             code = app(words, standalone_mode=False) or 0
         if code == INTERRUPTED:  # typer catches Ctrl-C itself

@@ -73,7 +73,7 @@ def board_summary(bundle: Bundle, source: Bundle | None, profile: Profile, conte
     numbers: tuple[Measurement, ...] = ()
     error = None
     if bundle.manifest.graphs:
-        context.tell(f"predicting for {profile.name}", None)
+        context.progress(f"predicting for {profile.name}", None)
         with _noting(missing, f"nothing is predicted for {profile.name}"):
             numbers = _predicted(bundle, profile)
         with _noting(missing, "the actions were not compared with the source's"):
@@ -99,9 +99,10 @@ def _predicted(bundle: Bundle, profile: Profile) -> tuple[Measurement, ...]:
 
 
 def _error(bundle: Bundle, source: Bundle | None, context: Context) -> Measurement | None:
-    from vlatool.evaluate.recorded import Recorded, carries_recordings
+    from vlatool.data import carries_evaluation
+    from vlatool.evaluate.recorded import Recorded
 
-    if source is None or not source.manifest.graphs or not carries_recordings(bundle):
+    if source is None or not source.manifest.graphs or not carries_evaluation(bundle):
         return None
     row = Recorded(baseline=source.path, samples=SAMPLES).run(bundle, context).rows[-1]
     error = row.get("agreement_baseline") or row.get("relative_error")

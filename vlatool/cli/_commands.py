@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 from vlatool import registry
 from vlatool.cli._once import once
 from vlatool.cli._stages import DEFAULTS, StageGroup, built, failing
-from vlatool.errors import PluginError, UsageError, nearest
+from vlatool.errors import PluginError, UsageError, suggest
 from vlatool.stage.build import stage_kinds
 
 FIRST = "optimize"
@@ -32,7 +32,7 @@ class Commands(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the named command; for an unknown one, suggest the nearest."""
         if args and args[0] not in (known := self.list_commands(ctx)) and not ctx.resilient_parsing:
-            raise UsageError(f"Unknown command '{args[0]}'; {nearest(args[0], known)}.", "vlatool --help")
+            raise UsageError(f"Unknown command '{args[0]}'; {suggest(args[0], known)}.", "vlatool --help")
         return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
@@ -52,7 +52,7 @@ class Commands(TyperGroup):
         command = getattr(source, "app", None) or getattr(source, cmd_name.replace("-", "_"), None)
         if not isinstance(command, typer.Typer) and not callable(command):
             missing = f"neither a function of that name nor a Typer 'app' is in {source.__name__}"
-            words = f"The package {registry.owner(source.__name__)} adds the command '{cmd_name}', but {missing}."
+            words = f"The package {registry.plugin_of(source.__name__)} adds the command '{cmd_name}', but {missing}."
             return failing(cmd_name, PluginError(words, "report it to its authors"))
         return _built(command, cmd_name)
 

@@ -14,8 +14,8 @@ from vlatool import registry
 from vlatool.bundle.bundle import MANIFEST
 from vlatool.report import REPORT
 
-MOST = 200
-"""Of a folder."""
+MAX_NAMES = 2000
+"""Names of a folder that are looked at."""
 _CLICK: Any = TyperGroup.__mro__[1].__module__.rpartition(".")[0]
 CompletionItem: Any = importlib.import_module(f"{_CLICK}.shell_completion").CompletionItem
 """From the click inside typer, or the one that it imports, depending on its version."""
@@ -62,13 +62,13 @@ def reports(incomplete: str) -> list[str]:
 
 
 def sources(incomplete: str) -> list[str]:
-    """Return bundles, policies, ONNX files, and folders that may hold some."""
-    return _paths(incomplete, lambda path: _is_bundle(path) or _holds(path, "policy.yaml") or path.endswith(".onnx"))
+    """Return bundles, what a source is certain to read, and folders that may hold some."""
+    return _paths(incomplete, lambda path: _is_bundle(path) or registry.is_certain("sources", path))
 
 
 def policies(incomplete: str) -> list[str]:
-    """Return folders of policies, and folders that may hold some."""
-    return _paths(incomplete, lambda path: _holds(path, "policy.yaml"))
+    """Return folders that a source is certain to read, and folders that may hold some."""
+    return _paths(incomplete, lambda path: os.path.isdir(path) and registry.is_certain("sources", path))
 
 
 OF_FIELDS: dict[str, Callable[[str], list[str]]] = {
@@ -109,6 +109,6 @@ def _beginning(incomplete: str) -> Iterator[str]:
     """Return the paths that begin like an incomplete one; hidden files only where it begins with a dot."""
     folder, start = os.path.split(incomplete)
     with contextlib.suppress(OSError):
-        for name in sorted(os.listdir(folder or os.curdir))[: MOST * 10]:
+        for name in sorted(os.listdir(folder or os.curdir))[:MAX_NAMES]:
             if name.startswith(start) and (start or not name.startswith(".")):
                 yield os.path.join(folder, name)

@@ -19,14 +19,14 @@ import typer
 
 from vlatool.cli._document import document, put, report_document, written
 from vlatool.errors import GateFailed, Inconclusive, OutputError, UsageError
+from vlatool.files.directory_writer import write_directory
 from vlatool.files.outputs import REPORT, refuse_inputs, refuse_replacing
-from vlatool.files.printable import one_line, printable, without_password
-from vlatool.files.writing import writing
+from vlatool.files.printable import mask_passwords, one_line, printable
 from vlatool.machine.host import cache_directory
 from vlatool.report import REPORT as REPORT_FILE
 from vlatool.report import Report
-from vlatool.stage.base import Context, Tell
-from vlatool.workers import PROCESSES, asked_for, launcher
+from vlatool.stage.base import Context, OnProgress
+from vlatool.workers import PROCESSES, launcher, parse_workers
 
 PLACES = ("-o", "--output", "--cache", "--junit", "--video")
 """Options that name a place to write to: paths are not recorded."""
@@ -47,7 +47,7 @@ def command_line() -> str:
             shown.append(f"-o{_without_folders(word[2:])}" if word[2:] else word)
         else:
             shown.append(word)
-    return shlex.join(map(without_password, shown))
+    return shlex.join(map(mask_passwords, shown))
 
 
 def _without_folders(path: str) -> str:
@@ -69,7 +69,7 @@ def crew(workers: str | None) -> tuple[int, str]:
     """
     if workers is None:
         return default_workers(), PROCESSES
-    name, count = asked_for(workers)
+    name, count = parse_workers(workers)
     launcher(name, count).check()
     return count or default_workers() if name == PROCESSES else count, name
 
@@ -102,7 +102,7 @@ def progress(workers: int = 1, launched_by: str = PROCESSES) -> Iterator[Context
         yield Context(tell, workers, **common)
 
 
-def _plain_lines() -> Tell:
+def _plain_lines() -> OnProgress:
     """Write what is new at once, and only numbers that changed every ``EVERY`` seconds."""
     last, told = "", 0.0
 
@@ -155,7 +155,7 @@ def refuse_existing(
     if out is None:
         return
     refuse_inputs(out, inputs)
-    refuse_replacing(out, force=force, further={"the cache": cache_directory()}, kind=kind)
+    refuse_replacing(out, force=force, protected={"the cache": cache_directory()}, kind=kind)
     if not os.path.lexists(out):
         _refuse_unwritable(out)
 
@@ -235,7 +235,7 @@ def show(
     else:
         put(terminal_text(report))
     if out is not None:
-        with writing(out, force=force) as draft:
+        with write_directory(out, force=force) as draft:
             write_reports(report, draft)
     written(unfinished)
     if out is not None and not as_json:

@@ -20,7 +20,7 @@ from typing import Any
 import typer
 
 from vlatool.cli._failure import INPUT, Failure
-from vlatool.files.work import forget_all
+from vlatool.files.resumable_work import remove_all_unused
 from vlatool.report import Report, without_nan
 
 FLAG = "--json"
@@ -173,7 +173,7 @@ def written(unfinished: Sequence[Path]) -> None:
 def forget_kept(*, printed: bool) -> None:
     """Remove what was kept of runs whose results were written and printed; what was not printed can be asked again."""
     if printed:
-        forget_all(_kept)
+        remove_all_unused(_kept)
     _kept.clear()
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from vlatool.user_code import children
 
-GRAPHS = ("numpy.random", "onnx", "onnxruntime", "vlatool.stage._inside", "vlatool.quantize.static_int8")
-MODULES = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", "vlatool.stage._inside")
+GRAPHS = ("numpy.random", "onnx", "onnxruntime", "vlatool.stage._child", "vlatool.quantize.static_int8")
+MODULES = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", "vlatool.stage._child")
 TRAINED = "qat"
 
 

@@ -83,8 +83,8 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
     if isinstance(error, SystemExit):
         code = error.code if isinstance(error.code, int) else 1
         return Failure("Terminated", f"ended by signal {code - 128}." if code > 128 else "ended.", "", code)
-    if blamed := registry.blamed(error):
-        return Failure("PluginError", *registry.complaint(blamed, type(error).__name__, message_of(error)), INPUT)
+    if blamed := registry.package_at_fault(error):
+        return Failure("PluginError", *registry.plugin_failure(blamed, type(error).__name__, message_of(error)), INPUT)
     fix = "this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback"
     return Failure("InternalError", f"{type(error).__name__}: {message_of(error)}", fix, OUR_BUG)
 

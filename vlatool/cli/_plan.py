@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from vlatool.files.printable import without_password
+from vlatool.files.printable import mask_passwords
 
 if TYPE_CHECKING:
     from vlatool.optimize.plan import Plan
@@ -20,7 +20,7 @@ def plan_document(plan: Plan) -> dict[str, Any]:
         "export": _stages(plan.export),
         "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
         "search": plan.recipe.search,
-        "pruning": {**pruning.model_dump(mode="json"), "study": without_password(pruning.study)},
+        "pruning": {**pruning.model_dump(mode="json"), "study": mask_passwords(pruning.study)},
         "benchmark": {"iterations": effort.iterations, "threads": effort.threads},
         "evaluate": {"recorded": True, "episodes": loop.episodes if loop else 0},
         "limits": plan.recipe.limits.model_dump(mode="json", exclude_none=True),

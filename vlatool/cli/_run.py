@@ -27,12 +27,13 @@ from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
-from vlatool.stage.controls import PRUNED, controls
+from vlatool.stage.controls import PRUNED_KEY, controls
 from vlatool.stage.finish import read_difference
-from vlatool.stage.run import cache_directory, cached_transform, first_steps, measured, measured_with, run_transform
+from vlatool.stage.run import cache_directory, cached_transform, first_steps, measure_in_child, report_of, run_transform
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
+    from vlatool.sources import Source
 
 
 def _flag(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
@@ -92,7 +93,7 @@ def transform(
 ) -> None:
     """Make a bundle from a bundle, or from a policy that is exported first."""
     from vlatool.hardware.profile import load_profile
-    from vlatool.sources import is_bundle, source_stage, sourced
+    from vlatool.sources import open_source, source_bundle
 
     bundle: Bundle | None
     refuse_existing(out, force, source, file_or_none(profile), *named_files(stage), kind=BUNDLE)
@@ -105,32 +106,32 @@ def transform(
     stage = stage.on(board) if board else stage.on_this_host()
     then = following(stage, board)
     with progress() as context:
-        if is_bundle(source):
-            bundle = Bundle.open(source)
-        elif stage.kind() == "export" and source_stage(source).has_graphs:
-            # an ONNX file, whose source stage is all the export that there is
-            stage, bundle = _onnx_source(stage, source_stage(source)), None
+        found = open_source(source)
+        if isinstance(found, Bundle):
+            bundle = found
+        elif stage.kind() == "export" and found.has_graphs:
+            stage, bundle = _graph_source(stage, found), None
         elif stage.takes_modules:
-            bundle = sourced(source, cache_directory(), context)
+            bundle = source_bundle(found, cache_directory(), context)
         else:
-            bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
+            bundle = stream_source(stage, found, context) or export_source(found, cache_directory(), context)
         context = replace(context, events=str(events.absolute()) if events else "")
         stage, bundle = first_steps(stage, bundle, cache_directory(), context)
         reports = None
         for other in then:
             bundle = cached_transform(stage, bundle, cache_directory(), context)
-            if told := stage.told(bundle):
-                context.said.extend((*told, f"loss curve: {out / REPORTS_FOLDER / 'report.html'}"))
+            if told := stage.summary(bundle):
+                context.messages.extend((*told, f"loss curve: {out / REPORTS_FOLDER / 'report.html'}"))
                 reports = bundle.path / REPORTS_FOLDER
             stage = other
         result = run_transform(stage, bundle, out, context, force=force, reports=reports)
         on_board = board_summary(result, bundle, board, context) if board else None
-    baseline = source if is_bundle(source) else ""
+    baseline = source if isinstance(found, Bundle) else ""
     precision = {name: graph.precision for name, graph in result.manifest.graphs.items()}
     if as_json:
         document({
             "bundle": str(out), "hash": result.hash, "bytes": result.size_bytes, "precision": precision,
-            "findings": result.manifest.findings, "pruned": result.manifest.made_by.get(PRUNED),
+            "findings": result.manifest.findings, "pruned": result.manifest.made_by.get(PRUNED_KEY),
             "board": on_board.values() if on_board else None,
             "difference": asdict(difference) if (difference := read_difference(result)) else None,
         })  # fmt: skip
@@ -139,7 +140,7 @@ def transform(
     graphs = f"graphs {result.graph_bytes / 1e6:.2f} MB, " if result.manifest.graphs else ""
     sizes = f"{graphs}in all {result.size_bytes / 1e6:.1f} MB"
     typer.echo(f"{out}: {one_line(result.manifest.name)} {one_line(result.manifest.version)}, {sizes}")
-    for line in (*map(printable, context.said), *stage.lines(result), *(controls(bundle) if bundle else ())):
+    for line in (*map(printable, context.messages), *stage.lines(result), *(controls(bundle) if bundle else ())):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
         if not shares:
@@ -168,13 +169,13 @@ def _moved(bundle: Bundle) -> Iterator[str]:
 
 def following(stage: Transform, board: Profile | None) -> list[Transform]:
     """Return the stages that the command line runs after one, with the options that the board needs."""
-    stages = [cast(Transform, build_stage(name, options)) for name, options in stage.then()]
+    stages = [cast(Transform, build_stage(name, options)) for name, options in stage.following_stages()]
     return [each.on(board) if board else each.on_this_host() for each in stages]
 
 
-def _onnx_source(export: Transform, source: Transform) -> Transform:
-    """Return the source stage of an ONNX file, with the opset and the shapes that the export was asked for."""
-    asked = export.model_fields_set & {"opset", "shape"}
+def _graph_source(export: Transform, source: Source) -> Transform:
+    """Return the source of a policy that is graphs, all the export that there is, with the options of that export."""
+    asked = export.model_fields_set & set(type(source).model_fields)
     return source.model_copy(update={name: getattr(export, name) for name in asked})
 
 
@@ -202,13 +203,13 @@ def named_files(stage: Stage) -> tuple[Path, ...]:
     return tuple(item for item in items if isinstance(item, Path))
 
 
-def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
+def stream_source(stage: Transform, source: Source, context: Context) -> Bundle | None:
     """Return the bundle of a policy whose weights the stage reads from their shards itself, None for any other."""
-    from vlatool.sources import sourced
+    from vlatool.sources import source_bundle
 
     if not stage.streams:
         return None
-    bundle = sourced(source, cache_directory(), context)
+    bundle = source_bundle(source, cache_directory(), context)
     try:
         stage.check(bundle, None)
     except BundleError:
@@ -216,20 +217,22 @@ def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
     return bundle
 
 
-def exported(source: str, cache: Path, context: Context) -> Bundle:
-    """Return a float32 bundle with graphs of what a person typed as SOURCE, exported with the default options."""
+def export_source(source: Bundle | Source, cache: Path, context: Context) -> Bundle:
+    """Return a bundle as it is, and a float32 bundle with graphs of a policy, exported with the default options."""
     from vlatool.export.onnx import ExportOnnx
-    from vlatool.sources import sourced
+    from vlatool.sources import source_bundle
 
-    bundle = sourced(source, cache, context)
-    return bundle if bundle.manifest.graphs else cached_transform(ExportOnnx(), bundle, cache, context)
+    bundle = source_bundle(source, cache, context)
+    return (
+        bundle if bundle is source or bundle.manifest.graphs else cached_transform(ExportOnnx(), bundle, cache, context)
+    )
 
 
-def opened(source: str, context: Context) -> Bundle:
+def open_with_graphs(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or that of a policy, exported with the default options."""
-    from vlatool.sources import is_bundle
+    from vlatool.sources import open_source
 
-    return Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
+    return export_source(open_source(source), cache_directory(), context)
 
 
 def measure(
@@ -258,12 +261,12 @@ def measure(
         board = load_profile(profile)
     with progress(*crew(workers)) as context:
         context = replace(context, video=str(video.absolute()) if video else "", force=force)
-        bundle = opened(source, context)
+        bundle = open_with_graphs(source, context)
         stage.check(bundle, board)
         if target is not None:
             from vlatool.remote.ssh import measure_on
 
-            context = replace(context, elsewhere=partial(measure_on, target, python=remote_python or ""))
+            context = replace(context, measure_remotely=partial(measure_on, target, python=remote_python or ""))
         report = _measured(stage if board is None else stage.on(board), bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
@@ -274,10 +277,10 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
     """Run a stage here; evaluate a bundle of OpenVINO in the board's instruction set, where this host has that."""
     engine = getattr(stage, "engine", "") or bundle.manifest.engine
     if board is None or stage.kind() != "evaluate" or engine != ENGINE:
-        return measured(stage, bundle, context)
+        return report_of(stage, bundle, context)
     computes = board_set(board)
     confine = {MAX_CPU_ISA: computes.to_set}
-    report = measured_with(confine, stage, bundle, context) if computes.to_set else stage.run(bundle, context)
+    report = measure_in_child(confine, stage, bundle, context) if computes.to_set else stage.run(bundle, context)
     summary, warnings = (*report.summary, *computes.about_errors()), (*report.warnings, *computes.warnings())
     return replace(report, summary=summary, warnings=warnings)
 

@@ -18,9 +18,9 @@ from vlatool import registry
 from vlatool.cli import _complete, _run, _torchrun
 from vlatool.cli._default import DefaultGroup
 from vlatool.cli._once import once
-from vlatool.errors import PluginError, UsageError, instead, nearest
+from vlatool.errors import PluginError, UsageError, fix_for, suggest
 from vlatool.stage.base import Measure, Stage, Transform
-from vlatool.stage.build import validated
+from vlatool.stage.build import stage_from
 
 DEFAULTS = {
     "export": "onnx",
@@ -56,8 +56,8 @@ class StageGroup(DefaultGroup):
         other = "" if self.names_command(ctx, args) or ctx.resilient_parsing else args[0]
         if difflib.get_close_matches(other, known, n=1) and not Path(other).exists():
             raise UsageError(
-                f"Unknown {registry.noun_of(self.name or '')} '{other}'; {nearest(other, known)}.",
-                instead(other, known),
+                f"Unknown {registry.noun_of(self.name or '')} '{other}'; {suggest(other, known)}.",
+                fix_for(other, known),
             )
         return super().parse_args(ctx, args)
 
@@ -92,7 +92,7 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
         chosen = {name: value for name, value in options.items() if _typed(context, name)}
         name = f"vlatool {stage.kind()} {registry_name(stage)}"
         launch = _torchrun.launch_for(name, trains=issubclass(stage, Transform) and stage.trains)
-        built = validated(stage, _torchrun.with_processes(chosen, launch), name).named()
+        built = stage_from(stage, _torchrun.with_processes(chosen, launch), name).trust_code()
         if measures:
             _run.measure(typing.cast(Measure, built), **arguments)
         elif launch is not None:

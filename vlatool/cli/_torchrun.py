@@ -27,9 +27,9 @@ def launch_for(command: str, *, trains: bool) -> Launch | None:
     """
     if "WORLD_SIZE" not in os.environ:
         return None
-    from vlatool.training.torchrun import launched
+    from vlatool.training.torchrun import current_launch
 
-    launch = launched()
+    launch = current_launch()
     if launch is not None and not trains:
         raise UsageError(
             f"torchrun started {launch.size} processes of {command}, which runs in one.",
@@ -57,10 +57,10 @@ def with_processes(chosen: Mapping[str, Any], launch: Launch | None) -> dict[str
 
 def train(stage: Transform, launch: Launch, source: str, **arguments: Any) -> None:
     """Run the command as torchrun's first process, or follow that one."""
-    from vlatool.training.torchrun import follow, leading
+    from vlatool.training.torchrun import follow, lead
 
     if launch.rank == 0:
-        with leading(launch):
+        with lead(launch):
             _run.transform(stage, source, **arguments)
         return
 

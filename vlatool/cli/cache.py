@@ -13,7 +13,7 @@ import typer
 
 from vlatool.cli._document import document
 from vlatool.cli._options import AsJson
-from vlatool.errors import DataError, UsageError, nearest
+from vlatool.errors import DataError, UsageError, suggest
 from vlatool.files.printable import printable
 
 if TYPE_CHECKING:
@@ -92,12 +92,12 @@ def prune(
 
 def _place(cache: Path | None) -> Path:
     from vlatool.machine.host import cache_directory
-    from vlatool.stage.cache import is_cache
+    from vlatool.stage.cache import looks_like_cache
 
     place = cache or cache_directory()
     if (cache is not None or place.exists()) and not place.is_dir():
         raise DataError(f"No such directory: {place}.", "name the directory of a cache")
-    if cache is not None and not is_cache(place):
+    if cache is not None and not looks_like_cache(place):
         raise DataError(f"{place} is not a cache: vlatool keeps nothing in it.", "name the directory of a cache")
     return place
 
@@ -118,7 +118,7 @@ def _amount(option: str, text: str, units: dict[str, int], example: str) -> floa
         )
     unit = next((name for name in units if name.lower() == match[2].lower()), None)
     if unit is None:
-        raise UsageError(f"{option} is '{text[:40]}'; {nearest(match[2], units)}.", f"write it as {option} {example}")
+        raise UsageError(f"{option} is '{text[:40]}'; {suggest(match[2], units)}.", f"write it as {option} {example}")
     value = float(match[1]) * units[unit]
     if not math.isfinite(value):
         raise UsageError(f"{option} is '{text[:40]}', which is too large.", f"give less, such as {option} {example}")

@@ -19,10 +19,10 @@ from vlatool.cli._console import command_line, crew, progress, refuse_existing, 
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document, put
 from vlatool.cli._options import AsJson, Force, Raw, ReportFolder, Workers
-from vlatool.cli._run import opened
+from vlatool.cli._run import open_with_graphs
 from vlatool.errors import BundleError, OutputError, UsageError
-from vlatool.files.edited import refuse_file, write_own
 from vlatool.files.outputs import output_errors, refuse_inputs
+from vlatool.files.user_files import refuse_file, write_own_file
 
 if TYPE_CHECKING:
     from vlatool.gate.config import Gate
@@ -82,7 +82,7 @@ def run(
     if junit is not None:
         _place(junit, candidate, *_read_by(gate, base), config)
     with progress(*crew(workers)) as context:
-        bundle = opened(candidate, context)
+        bundle = open_with_graphs(candidate, context)
         report = run_gate(bundle, Bundle.open(base), gate, context, seed)
     report = replace(report, command=command_line(), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     if os.environ.get("GITHUB_ACTIONS") == "true" and not as_json:
@@ -115,7 +115,7 @@ def init(
     with _folders(files):
         for path, text in files.items():
             with output_errors(path):
-                write_own(path, text, force=force)
+                write_own_file(path, text, force=force)
     if as_json:
         document({"written": [str(path) for path in files]})
         return
@@ -181,7 +181,7 @@ def _place(junit: Path, *inputs: str | Path | None) -> None:
 def _write_junit(report: Report, path: Path) -> None:
     from vlatool.render import render
 
-    write_own(path, render(report, "junit"), force=True, comment="<!-- {} -->")
+    write_own_file(path, render(report, "junit"), force=True, comment="<!-- {} -->")
 
 
 def _tell_github(report: Report) -> None:

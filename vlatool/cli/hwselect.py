@@ -162,7 +162,7 @@ def score(
     else:
         _finite(refit=refit)
         with progress() as context:
-            found = refit_points(points, held_out, seed, refit, context.tell)
+            found = refit_points(points, held_out, seed, refit, context.progress)
         tables = list(found.values())
     if as_json:
         document(found)

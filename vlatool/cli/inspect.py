@@ -16,14 +16,14 @@ from vlatool.cli._document import document
 from vlatool.cli._options import BundlePath
 from vlatool.errors import BundleError, GraphError
 from vlatool.files.printable import printable
-from vlatool.files.sealed import open_inside
+from vlatool.files.verified_read import open_inside
 from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded
 from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
 from vlatool.stage.controls import controls
 
-LONG = 120
+MAX_OPTION = 120
 """Characters of an option of a build record that are shown."""
 
 
@@ -131,7 +131,7 @@ def _tensor(tensor: TensorSpec) -> str:
 
 def _short(value: str) -> str:
     """Return a value, of a long one its beginning: what a stage chose may be a list of thousands of units."""
-    return value if len(value) <= LONG else f"{value[: LONG - 20]}… ({len(value)} characters)"
+    return value if len(value) <= MAX_OPTION else f"{value[: MAX_OPTION - 20]}… ({len(value)} characters)"
 
 
 def _lineage(manifest: Manifest) -> list[str]:

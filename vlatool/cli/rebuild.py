@@ -16,7 +16,7 @@ from vlatool.errors import GateFailed, UsageError
 from vlatool.files.outputs import BUNDLE
 
 if TYPE_CHECKING:
-    from vlatool.rebuild.rebuild import Rebuilt
+    from vlatool.rebuild.rebuild import RebuildResult
 
 RECORDED = "the versions are the recorded ones"
 CHANGED = "the bundle was changed after it was made"
@@ -76,15 +76,15 @@ def _shifts(versions: Versions) -> str:
     return ", ".join(f"{name} {recorded} recorded, {now} installed" for name, (recorded, now) in versions.items())
 
 
-def _text(rebuilt: Rebuilt, versions: Versions, output: Path | None) -> str:
+def _text(rebuilt: RebuildResult, versions: Versions, output: Path | None) -> str:
     lines = [
         f"source    {rebuilt.source}",
         f"stages    {' -> '.join(name for name, _ in rebuilt.stages)}",
         f"versions  {'not as recorded' if versions else 'as recorded'}",
     ]
     measured = [f"{', '.join(rebuilt.left_out)} in manifest.json: measured, so not the same twice"]
-    beside = [f"{', '.join(rebuilt.beside)}: in no hash"]
-    if left_out := [*(measured if rebuilt.left_out else []), *(beside if rebuilt.beside else [])]:
+    beside = [f"{', '.join(rebuilt.files_beside)}: in no hash"]
+    if left_out := [*(measured if rebuilt.left_out else []), *(beside if rebuilt.files_beside else [])]:
         lines.append(f"left out  {'; '.join(left_out)}")
     width = max(len(item.file) for item in rebuilt.files)
     lines += ["", f"{'file':<{width}}  {'bytes':>12}  identical"]
@@ -102,7 +102,7 @@ def _text(rebuilt: Rebuilt, versions: Versions, output: Path | None) -> str:
     return "\n".join([*lines, *([f"bundle: {output}"] if output else [])]) + "\n"
 
 
-def _as_json(rebuilt: Rebuilt, versions: Versions, output: Path | None) -> dict[str, Any]:
+def _as_json(rebuilt: RebuildResult, versions: Versions, output: Path | None) -> dict[str, Any]:
     return {
         "bundle": str(rebuilt.bundle.path),
         "source": rebuilt.source,
@@ -119,7 +119,7 @@ def _as_json(rebuilt: Rebuilt, versions: Versions, output: Path | None) -> dict[
     }
 
 
-def _fail(rebuilt: Rebuilt, versions: Versions) -> None:
+def _fail(rebuilt: RebuildResult, versions: Versions) -> None:
     """Raise for the first file that differs.
 
     Raises:

@@ -12,8 +12,8 @@ from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document
 from vlatool.cli._options import AsJson, Force
-from vlatool.errors import MissingExtra, UsageError, VlatoolError, instead, nearest
-from vlatool.files.writing import writing
+from vlatool.errors import MissingExtra, UsageError, VlatoolError, fix_for, suggest
+from vlatool.files.directory_writer import write_directory
 
 app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -50,9 +50,9 @@ def make(
 
     known = _complete.samples("")
     if name.replace("_", "-") not in known:
-        raise UsageError(f"Unknown sample '{name}'; {nearest(name, known)}.", instead(name, known))
+        raise UsageError(f"Unknown sample '{name}'; {suggest(name, known)}.", fix_for(name, known))
     refuse_existing(output, force, kind="")
-    with writing(output, force=force) as draft:
+    with write_directory(output, force=force) as draft:
         write_sample(name.replace("-", "_"), draft, seed)
     try:
         with progress() as context:

@@ -7,10 +7,8 @@ from typing import Annotated
 
 import typer
 
-from vlatool.bundle.bundle import Bundle
 from vlatool.cli._console import progress, refuse_existing, show
 from vlatool.cli._options import AsJson, Force, ReportFolder
-from vlatool.sources import is_bundle
 
 
 def verify(
@@ -32,7 +30,7 @@ def verify(
     units. Exits 1 when the actions differ.
     """
     from vlatool.machine.host import cache_directory
-    from vlatool.sources import sourced
+    from vlatool.sources import open_source, source_bundle
     from vlatool.verify import Options, check
     from vlatool.verify import verify as verify_policy
 
@@ -40,6 +38,6 @@ def verify(
     options = Options(against, data, samples, tolerance, seed)
     check(options)
     with progress() as context:
-        bundle = Bundle.open(source) if is_bundle(source) else sourced(source, cache_directory(), context)
+        bundle = source_bundle(open_source(source), cache_directory(), context)
         report = verify_policy(bundle, options, context)
     show(report, as_json=as_json, out=output, force=force)

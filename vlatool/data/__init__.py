@@ -1,4 +1,4 @@
-"""Readers of calibration and evaluation data, one file per format."""
+"""Recordings: readers, one file each format; what is selected of them, and observations that are drawn."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from vlatool.data._drawn import save_drawn as save_drawn
 from vlatool.data._halves import halves as halves
 from vlatool.data._not_finite import takes_not_finite as takes_not_finite
 from vlatool.data._not_finite import with_not_finite as with_not_finite
-from vlatool.data._observations import CALIBRATION as CALIBRATION
-from vlatool.data._observations import EVALUATION as EVALUATION
 from vlatool.data._observations import Observations as Observations
-from vlatool.data._observations import calibration_recording as calibration_recording
-from vlatool.data._observations import evaluation_recording as evaluation_recording
 from vlatool.data._observations import observations_for as observations_for
 from vlatool.data._observations import random_observations as random_observations
 from vlatool.data._observations import recorded_observations as recorded_observations
 from vlatool.data._observations import synthetic_observations as synthetic_observations
 from vlatool.data._played import BEGINS as BEGINS
-from vlatool.data._played import MOST as MOST
+from vlatool.data._played import MAX_PLAYED as MAX_PLAYED
 from vlatool.data._played import PLAYED as PLAYED
 from vlatool.data._played import Encoded as Encoded
 from vlatool.data._played import kept_rows as kept_rows
 from vlatool.data._played import played_observations as played_observations
-from vlatool.data._recording import RECORD_ALL as RECORD_ALL
+from vlatool.data._reader import Reader as Reader
+from vlatool.data._reader import read_recording as read_recording
 from vlatool.data._recording import Moment as Moment
 from vlatool.data._recording import Recording as Recording
-from vlatool.data._recording import checked as checked
-from vlatool.data._recording import read_recording as read_recording
+from vlatool.data._recording import build_recording as build_recording
+from vlatool.data._selections import PURPOSES as PURPOSES
+from vlatool.data._selections import calibration_recording as calibration_recording
+from vlatool.data._selections import carries_evaluation as carries_evaluation
+from vlatool.data._selections import carry_recording as carry_recording
+from vlatool.data._selections import evaluation_recording as evaluation_recording
+from vlatool.data._selections import is_of_recording as is_of_recording
+from vlatool.data._selections import recordings_of as recordings_of

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._recording import Recording
-from vlatool.errors import nearest
+from vlatool.errors import suggest
 from vlatool.runtime.statistics import load_normaliser
 
 Array = NDArray[Any]
-FEW = 8
+MIN_SAMPLES = 8
 """Samples below which the extremes of activations are hardly seen."""
-FAR = 50.0
-"""Training deviations (or ranges) beyond which a value is no measurement of the same quantity."""
-NAMED = 6
+MAX_DEVIATIONS = 50.0
+"""Training deviations (or ranges) beyond which a value is not a measurement of the same quantity."""
+MAX_CHANNELS = 6
 """Channels that a message lists."""
 
 
@@ -61,7 +61,7 @@ def calibration_checks(
 def _of_count(recording: Recording, count: int, requested: int) -> Iterator[str]:
     if count < requested:
         yield f"{requested} calibration samples were asked for; {recording.path} holds {count}"
-    if count < FEW:
+    if count < MIN_SAMPLES:
         yield f"ranges from {count} calibration samples are unreliable; use 64 or more, from every task"
 
 
@@ -70,7 +70,7 @@ def _of_names(recording: Recording, spec: PolicySpec) -> Iterator[str]:
     for name in recording.ignored:
         yield (
             f"{recording.path} has the array '{name}', which is not an input of the policy and is ignored; "
-            + nearest(name, known)
+            + suggest(name, known)
         )
 
 
@@ -106,9 +106,9 @@ def _of_channels(where: str, tensor: TensorSpec, values: Array) -> Iterator[str]
     if constant:
         named = ", ".join(
             f"{channel}{f' ({tensor.labels[channel]})' if tensor.labels else ''} = {float(rows[0, channel]):g}"
-            for channel in constant[:NAMED]
+            for channel in constant[:MAX_CHANNELS]
         )
-        more = f" and {len(constant) - NAMED} more" if len(constant) > NAMED else ""
+        more = f" and {len(constant) - MAX_CHANNELS} more" if len(constant) > MAX_CHANNELS else ""
         yield (
             f"{where} never changes over the {len(values)} calibration samples in channel {named}{more}; "
             "what depends on it is not calibrated"
@@ -124,13 +124,14 @@ def _of_distance(where: str, tensor: TensorSpec, values: Array, numbers: Sequenc
         len(values), -1, values.shape[-1]
     )
     distances[~np.isfinite(distances)] = 0
-    if not (distances > FAR).any():
+    if not (distances > MAX_DEVIATIONS).any():
         return
-    far = np.flatnonzero((distances > FAR).any(axis=(1, 2)))
+    far = np.flatnonzero((distances > MAX_DEVIATIONS).any(axis=(1, 2)))
     worst, _, channel = np.unravel_index(int(distances.argmax()), distances.shape)
     unit = "standard deviations from the training mean" if tensor.normalisation == "mean_std" else (
         "half ranges from the middle of the training range")  # fmt: skip
     yield (
         f"{where} is {float(distances.max()):.3g} {unit} in channel {int(channel)} of sample {numbers[int(worst)]} "
-        f"(above {FAR:g} in {len(far)} of {len(values)} calibration samples); look at units, statistics and names"
+        f"(above {MAX_DEVIATIONS:g} in {len(far)} of {len(values)} calibration samples); look at units, "
+        "statistics and names"
     )

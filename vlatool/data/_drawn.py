@@ -73,7 +73,7 @@ class Drawer:
         drawn = partial(self._drawn, structured=Structures(random))
         makers: dict[str, Callable[[np.random.Generator], dict[str, Any]]]
         makers = {RECORDED: self._recorded, OTHER: self._other, DRAWN: drawn}
-        return [Drawn(kinds[place], makers[kinds[place]](random)) for place in random.permutation(count)]
+        return [Drawn(kinds[index], makers[kinds[index]](random)) for index in random.permutation(count)]
 
     def _recorded(self, random: np.random.Generator) -> dict[str, Any]:
         recording = self._recordings[int(random.integers(len(self._recordings)))]
@@ -117,7 +117,7 @@ def sentence(words: Sequence[str], random: np.random.Generator, lengths: Sequenc
     """Return words of a vocabulary, as many as one of the lengths says; nothing of an empty vocabulary."""
     if not words:
         return ""
-    return " ".join(words[place] for place in random.integers(len(words), size=int(random.choice(lengths))))
+    return " ".join(words[index] for index in random.integers(len(words), size=int(random.choice(lengths))))
 
 
 def words_of(path: Path) -> list[str]:
@@ -177,7 +177,7 @@ def _gradient(shape: tuple[int, ...], random: np.random.Generator) -> Array:
     values = np.zeros(shape)
     for axis, length in enumerate(shape):
         ramp = np.linspace(-1, 1, length) if length > 1 else np.zeros(1)
-        values = values + random.normal() * ramp.reshape([-1 if place == axis else 1 for place in range(len(shape))])
+        values = values + random.normal() * ramp.reshape([-1 if index == axis else 1 for index in range(len(shape))])
     return values
 
 
@@ -233,8 +233,8 @@ def _physical(values: Array, normaliser: Normaliser | None, like: Any) -> Array:
 def save_drawn(path: Path, drawn: Sequence[Drawn]) -> None:
     """Write observations to an ``.npz`` file."""
     arrays: dict[str, Any] = {
-        f"{place}.{name}": np.asarray(value)
-        for place, item in enumerate(drawn)
+        f"{index}.{name}": np.asarray(value)
+        for index, item in enumerate(drawn)
         for name, value in item.observation.items()
     }
     np.savez(path, kind=np.array([item.kind for item in drawn]), **arrays)
@@ -245,8 +245,8 @@ def read_drawn(path: Path) -> list[Drawn]:
     with np.load(path, allow_pickle=False) as stored:
         observations = [Drawn(str(kind), {}) for kind in stored["kind"]]
         for key in stored.files:
-            place, _, name = key.partition(".")
+            index, _, name = key.partition(".")
             if name:
                 value = stored[key]
-                observations[int(place)].observation[name] = str(value) if value.dtype.kind == "U" else value
+                observations[int(index)].observation[name] = str(value) if value.dtype.kind == "U" else value
     return observations

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vlatool.data._recording import Recording
 
-LEAST = 8
+MIN_HALF = 8
 """Observations of a half; a recording of fewer than twice as many is not split."""
 BLOCKS = 8
 """Stretches that take turns where episodes are not recorded: all phases in both halves, neighbours mostly in one."""
@@ -16,14 +16,14 @@ BLOCKS = 8
 def halves(recording: Recording) -> tuple[Recording, Recording]:
     """Return what to calibrate with and what to hold out: whole episodes where they are recorded, else stretches.
 
-    A recording of fewer than ``2 * LEAST`` observations is both halves. The same recording is always split the same.
+    A recording of fewer than ``2 * MIN_HALF`` observations is both halves. The same recording is always split the same.
     """
-    if len(recording) < 2 * LEAST:
+    if len(recording) < 2 * MIN_HALF:
         return recording, recording
     held_out = _whole_episodes(recording.episodes)
     if held_out is None:
         held_out = np.arange(len(recording)) * BLOCKS // len(recording) % 2 == 1
-    return recording.only(~held_out), recording.only(held_out)
+    return recording.subset(~held_out), recording.subset(held_out)
 
 
 def _whole_episodes(episodes: NDArray[np.int64] | None) -> NDArray[np.bool_] | None:
@@ -36,8 +36,8 @@ def _whole_episodes(episodes: NDArray[np.int64] | None) -> NDArray[np.bool_] | N
     names, firsts, counts = np.unique(episodes, return_index=True, return_counts=True)
     sides: tuple[list[int], list[int]] = ([], [])
     sizes = [0, 0]
-    for place in np.argsort(firsts):
+    for index in np.argsort(firsts):
         side = 0 if sizes[0] <= sizes[1] else 1
-        sides[side].append(int(names[place]))
-        sizes[side] += int(counts[place])
-    return np.isin(episodes, sides[1]) if min(sizes) >= LEAST else None
+        sides[side].append(int(names[index]))
+        sizes[side] += int(counts[index])
+    return np.isin(episodes, sides[1]) if min(sizes) >= MIN_HALF else None

@@ -41,12 +41,12 @@ def with_not_finite(
     ]
 
 
-def _spread(tensor: TensorSpec, value: Any, place: list[int]) -> Any:
-    kinds = KINDS[place[0] % len(KINDS)]
+def _spread(tensor: TensorSpec, value: Any, position: list[int]) -> Any:
+    kinds = KINDS[position[0] % len(KINDS)]
     if not kinds:
         return value
     array: NDArray[Any] = np.array(value, tensor.dtype)
     count = min(max(len(kinds), array.size // SHARE), max(1, array.size // 2))
-    chosen = np.random.default_rng(place).permutation(array.size)[:count]
-    array.reshape(-1)[chosen] = [kinds[(place[0] // len(KINDS) + at) % len(kinds)] for at in range(count)]
+    chosen = np.random.default_rng(position).permutation(array.size)[:count]
+    array.reshape(-1)[chosen] = [kinds[(position[0] // len(KINDS) + at) % len(kinds)] for at in range(count)]
     return array

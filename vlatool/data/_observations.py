@@ -11,64 +11,13 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._drawn import sentence, words_of
-from vlatool.data._halves import LEAST, halves
 from vlatool.data._not_finite import with_not_finite
-from vlatool.data._recording import Moment, Recording, read_recording
+from vlatool.data._recording import Moment, Recording
+from vlatool.data._selections import calibration_recording
 from vlatool.errors import DataError
 
-CALIBRATION = "data/calibration.npz"
-EVALUATION = "data/evaluation.npz"
-LONGEST = 8
+MAX_WORDS = 8
 """Words of a synthetic instruction at most."""
-
-
-def calibration_recording(source: Bundle, path: Path | None = None) -> Recording | None:
-    """Return the calibration recording of a bundle, or the one at ``path``; None when there is neither.
-
-    Of a bundle that brings no evaluation recording it is the half that is not held out (see ``halves``).
-
-    Raises:
-        DataError: when it is missing, corrupt, or does not fit the spec.
-    """
-    own = source.path / CALIBRATION if CALIBRATION in source.manifest.files else None
-    chosen = path or own
-    if chosen is None:
-        return None
-    recording = read_recording(chosen, source.manifest.spec)
-    return recording if path or EVALUATION in source.manifest.files else halves(recording)[0]
-
-
-def evaluation_recording(source: Bundle, path: Path | None = None) -> tuple[Recording, str]:
-    """Return the recording to evaluate a bundle on, and a reservation about it, empty when there is none.
-
-    Args:
-        source: With an evaluation recording, or a calibration recording of which a half is held out.
-        path: A recording to read in the place of the bundle's own.
-
-    Raises:
-        DataError: when there is none, or it is missing, corrupt, or does not fit the spec.
-    """
-    files, spec = source.manifest.files, source.manifest.spec
-    if path is not None or EVALUATION in files:
-        return read_recording(path or source.path / EVALUATION, spec), ""
-    if CALIBRATION not in files:
-        raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
-    whole = read_recording(source.path / CALIBRATION, spec)
-    _, held_out = halves(whole)
-    return held_out, _reservation(held_out, whole)
-
-
-def _reservation(held_out: Recording, whole: Recording) -> str:
-    if held_out is not whole:
-        return (
-            f"there is no evaluation recording: the errors are taken on {len(held_out)} of the {len(whole)} "
-            "observations for calibration, held out of it; to use others: evaluation: FILE.npz in policy.yaml"
-        )
-    return (
-        f"there is no evaluation recording, and {len(whole)} calibration observations are too few to hold out a half: "
-        f"what calibrates is what evaluates, which flatters it; record {2 * LEAST} or more, or name others: "
-        "evaluation: FILE.npz in policy.yaml"
-    )
 
 
 class Observations(Sequence[dict[str, Any]]):
@@ -98,9 +47,9 @@ class Observations(Sequence[dict[str, Any]]):
             return Observations(self._recording, self._numbers[at])
         return self._recording.observation(self._numbers[at])
 
-    def along(self) -> Iterator[Moment]:
+    def with_history(self) -> Iterator[Moment]:
         """Yield them, each after those before it in its episode."""
-        return self._recording.along(self._numbers)
+        return self._recording.with_history(self._numbers)
 
 
 def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> Sequence[dict[str, Any]]:
@@ -153,7 +102,7 @@ def _words(source: Bundle, tensor: TensorSpec) -> list[str]:
 
 def _synthetic(tensor: TensorSpec, random: np.random.Generator, words: Mapping[str, Sequence[str]]) -> Any:
     if tensor.kind == "text":
-        return sentence(words.get(tensor.name, ()), random, range(1, min(LONGEST, tensor.max_tokens) + 1))
+        return sentence(words.get(tensor.name, ()), random, range(1, min(MAX_WORDS, tensor.max_tokens) + 1))
     shape = tuple(axis if isinstance(axis, int) else 1 for axis in tensor.shape[1:])
     if tensor.dtype == "uint8":
         return random.integers(0, 256, shape, np.uint8)

@@ -18,11 +18,11 @@ Array = NDArray[Any]
 PLAYED = "data/played.npz"
 BEGINS = "(begins)"
 """Array that says of each row whether an episode begins with it, where the policy keeps values."""
-MOST = 128
+MAX_PLAYED = 128
 """Observations that are kept: twice those that calibrate by default."""
-LEAST = 16
+MIN_PLAYED = 16
 BYTES = 64 << 20
-"""Of observations beyond ``LEAST``, before they are compressed: large images are kept fewer."""
+"""Of observations beyond ``MIN_PLAYED``, before they are compressed: large images are kept fewer."""
 
 
 class Encoded(EncodedObservation):
@@ -32,12 +32,12 @@ class Encoded(EncodedObservation):
     """Whether an episode begins with it, or nothing before it is known."""
 
 
-AGAIN = "train again: quantize qat writes it"
+REMEDY = "train again: quantize qat writes it"
 
 
 def kept_rows(most: int, row_bytes: int) -> int:
     """Return how many observations of a size are kept."""
-    return min(most, max(LEAST, BYTES // max(1, row_bytes)))
+    return min(most, max(MIN_PLAYED, BYTES // max(1, row_bytes)))
 
 
 def played_observations(source: Bundle) -> list[Encoded]:
@@ -49,7 +49,7 @@ def played_observations(source: Bundle) -> list[Encoded]:
     if PLAYED not in source.manifest.files:
         return []
     path = source.file(PLAYED)
-    arrays = open_npz(path, fix=AGAIN)
+    arrays = open_npz(path, fix=REMEDY)
     for tensor in source.manifest.spec.inputs:
         _check(path, tensor, arrays.get(tensor.name))
     names = [tensor.name for tensor in source.manifest.spec.inputs]
@@ -73,4 +73,4 @@ def _check(path: Path, tensor: TensorSpec, array: Array | None) -> None:
 
 
 def _broken(path: Path, why: str) -> DataError:
-    return DataError(f"{path} does not fit the policy: {why}.", AGAIN)
+    return DataError(f"{path} does not fit the policy: {why}.", REMEDY)

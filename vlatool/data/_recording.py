@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool import registry
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.errors import DataError, nearest
+from vlatool.errors import DataError, suggest
 from vlatool.files.rows import Rows, blocks
 
 Array = NDArray[Any]
@@ -53,20 +52,22 @@ class Recording:
         actions: (N, T, A) in physical units, or (N, T) indices for discrete actions; T is the policy's chunk, or fewer
             of its leading steps; None when not recorded.
         episodes: (N,) int64 episode of each sample; None when not recorded.
+        times: (N,) float64 time stamp of each sample in seconds; None where the format has none.
         ignored: Names of arrays that the spec does not know.
         chunk: Actions in one inference of the policy.
-        whole: What it was chosen from; None when it is all that was recorded.
-        places: (N,) number of each observation in ``whole``.
+        whole: Recording that it is a selection of; None when it is all that was recorded.
+        indices: (N,) index of each observation in ``whole``.
     """
 
     path: Path
     inputs: Mapping[str, Values]
     actions: Array | None
     episodes: Array | None
+    times: Array | None = None
     ignored: tuple[str, ...] = ()
     chunk: int = 1
     whole: Recording | None = None
-    places: Array | None = None
+    indices: Array | None = None
 
     def __len__(self) -> int:
         return len(next(iter(self.inputs.values())))
@@ -82,11 +83,11 @@ class Recording:
             for name, values in self.inputs.items()
         }
 
-    def only(self, chosen: NDArray[np.bool_]) -> Recording:
-        """Return the observations that are chosen, in their order.
+    def subset(self, chosen: NDArray[np.bool_]) -> Recording:
+        """Return some observations, in their order.
 
         Args:
-            chosen: (N,) of each observation.
+            chosen: (N,) whether each observation is one of them.
         """
         inputs = {
             name: values.only(chosen) if isinstance(values, Rows) else values[chosen]
@@ -94,33 +95,34 @@ class Recording:
         }
         actions = None if self.actions is None else self.actions[chosen]
         episodes = None if self.episodes is None else self.episodes[chosen]
-        places = np.flatnonzero(chosen) if self.places is None else self.places[chosen]
-        whole = self.whole or self
-        return replace(self, inputs=inputs, actions=actions, episodes=episodes, whole=whole, places=places)
+        times = None if self.times is None else self.times[chosen]
+        indices = np.flatnonzero(chosen) if self.indices is None else self.indices[chosen]
+        series = replace(self, inputs=inputs, actions=actions, episodes=episodes, times=times)
+        return replace(series, whole=self.whole or self, indices=indices)
 
     def begins(self) -> NDArray[np.bool_]:
         """Say of each observation whether an episode begins with it, or none follows the one before: (N,)."""
         numbers = np.zeros(len(self), np.int64) if self.episodes is None else self.episodes
-        places = np.arange(len(self)) if self.places is None else self.places
-        return np.concatenate([[True], (numbers[1:] != numbers[:-1]) | (np.diff(places) != 1)])
+        indices = np.arange(len(self)) if self.indices is None else self.indices
+        return np.concatenate([[True], (numbers[1:] != numbers[:-1]) | (np.diff(indices) != 1)])
 
-    def along(self, numbers: Sequence[int]) -> Iterator[Moment]:
+    def with_history(self, numbers: Sequence[int]) -> Iterator[Moment]:
         """Yield observations, each after those of its episode that were recorded before it, held out or not.
 
         Args:
-            numbers: Of those that count, ascending.
+            numbers: Indices of those that count, ascending.
         """
         whole = self.whole or self
-        own = {int(number if self.places is None else self.places[number]): int(number) for number in numbers}
+        own = {int(number if self.indices is None else self.indices[number]): int(number) for number in numbers}
         begins = whole.begins()
         firsts = np.flatnonzero(begins)
-        last = {int(np.searchsorted(firsts, place, side="right")): place for place in own}
+        last = {int(np.searchsorted(firsts, index, side="right")): index for index in own}
         for episode, end in last.items():
-            for place in range(int(firsts[episode - 1]), end + 1):
-                yield Moment(whole.observation(place), own.get(place, place), bool(begins[place]), place in own)
+            for index in range(int(firsts[episode - 1]), end + 1):
+                yield Moment(whole.observation(index), own.get(index, index), bool(begins[index]), index in own)
 
     @property
-    def unjudged(self) -> tuple[str, ...]:
+    def unjudged_steps(self) -> tuple[str, ...]:
         """A sentence when fewer steps than the policy's chunk are recorded, so that the others are not judged."""
         if self.actions is None or (steps := self.actions.shape[1]) == self.chunk:
             return ()
@@ -137,39 +139,31 @@ class Recording:
         return sorted({int(index) for index in np.linspace(0, len(self) - 1, count)})
 
 
-def read_recording(path: Path, spec: PolicySpec) -> Recording:
-    """Read recorded observations with the reader that the file's suffix names, and check them against the spec.
+def build_recording(
+    path: Path, arrays: Mapping[str, Values], spec: PolicySpec, names: Mapping[str, str], times: Array | None = None
+) -> Recording:
+    """Build a recording from arrays, each checked against the spec.
 
-    Raises:
-        DataError: when the file is missing, of an unknown format, corrupt, or does not fit the spec.
-    """
-    if not path.exists():
-        raise DataError(f"Data file {path} not found.", "check the path, and record the file if there is none")
-    known = registry.names("data")
-    suffix = path.suffix.removeprefix(".")
-    if suffix not in known:
-        raise DataError(
-            f"{path} is of an unknown format; {nearest(suffix, known)}.",
-            "store it as .npz: np.savez(FILE, NAME=values)",
-        )
-    reader: Any = registry.load("data", suffix)
-    return checked(path, reader.read(path), spec)
-
-
-def checked(path: Path, arrays: Mapping[str, Values], spec: PolicySpec) -> Recording:
-    """Build a recording from arrays and check every one against the spec.
+    Args:
+        path: Where they were read from.
+        arrays: Name -> array with a leading sample axis; actions as ``action`` or under their name, and ``episode``.
+        spec: What the policy takes and gives.
+        names: Name in the spec -> name among the arrays, where they differ.
+        times: (N,) float64 time stamps in seconds; None where the format has none.
 
     Raises:
         DataError: naming the input and the sample.
     """
+    wanted = {recorded: name for name, recorded in names.items()}
+    arrays = {wanted.get(name, name): values for name, values in arrays.items()}
     inputs = {}
     for tensor in spec.inputs:
         if tensor.name not in arrays:
-            raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.", RECORD_ALL)
+            raise DataError(f"{path} has no '{tensor.name}'; {suggest(tensor.name, arrays)}.", RECORD_ALL)
         inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name], spec)
     actions, episodes = _in_memory(arrays, spec.action.name, "action"), _in_memory(arrays, "episode")
     lengths = {name: len(values) for name, values in inputs.items()}
-    for name, recorded in (("action", actions), ("episode", episodes)):
+    for name, recorded in (("action", actions), ("episode", episodes), ("times", times)):
         if recorded is not None:
             lengths[name] = _length(path, name, recorded)
     if len(set(lengths.values())) != 1:
@@ -184,11 +178,11 @@ def checked(path: Path, arrays: Mapping[str, Values], spec: PolicySpec) -> Recor
     known = {*inputs, *EXPERT, *(tensor.name for tensor in spec.outputs)}
     ignored = tuple(name for name in arrays if name not in known)
     action = None if actions is None else _checked_action(path, spec, actions)
-    return Recording(path, inputs, action, episodes, ignored, spec.chunk)
+    return Recording(path, inputs, action, episodes, times, ignored, spec.chunk)
 
 
 def _in_memory(arrays: Mapping[str, Values], *names: str) -> Array | None:
-    """Return the first of the arrays that there is, all of it: actions and episodes are held against each other."""
+    """Return the first array that there is, in memory: actions and episodes are compared as a whole."""
     array = next((arrays[name] for name in names if name in arrays), None)
     return array.read(0, len(array)) if isinstance(array, Rows) else array
 
@@ -295,7 +289,7 @@ def _indices(where: str, values: Array, labels: int) -> Array:
     if values.dtype.kind not in "iu":
         raise DataError(
             f"{where} must be indices from 0 to {labels - 1}; got {values.dtype}.",
-            "store the place of each action in the spec's labels, as int64",
+            "store the index of each action in the spec's labels, as int64",
         )
     wrong = (values < 0) | (values >= labels)
     if wrong.any():
@@ -303,7 +297,7 @@ def _indices(where: str, values: Array, labels: int) -> Array:
         raise DataError(
             f"{where} must be indices from 0 to {labels - 1}; got {int(values[sample, step])} in sample {sample}"
             f" (and in {int(wrong.any(axis=1).sum())} of {len(values)} samples such a value).",
-            "store the place of each action in the spec's labels",
+            "store the index of each action in the spec's labels",
         )
     return values
 

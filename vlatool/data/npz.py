@@ -2,31 +2,45 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
-from numpy.typing import NDArray
-
+from vlatool.bundle.spec import PolicySpec
+from vlatool.data._reader import Reader
+from vlatool.data._recording import Recording, build_recording
 from vlatool.files.npz import open_rows
-from vlatool.files.rows import Rows
 from vlatool.machine.host import memory
+from vlatool.registry import Claim
 
 LIMIT = "recording_bytes"
 
 
-class NpzReader:
+class NpzReader(Reader):
     """Reads ``.npz``: input name -> (N, ...), ``action`` (or the output's name) and ``episode`` where recorded."""
 
-    @staticmethod
-    def read(path: Path) -> dict[str, NDArray[Any] | Rows]:
-        """Return the arrays of a file by name, large ones as rows that stay on the disk.
+    suffix: ClassVar[str] = ".npz"
+    needs: ClassVar[str] = "a .npz file"
+
+    @classmethod
+    def claims(cls, path: Path) -> Claim:
+        """Claim a .npz file, and perhaps what else is an archive."""
+        if path.name.endswith(cls.suffix):
+            return Claim.CERTAIN
+        return Claim.MAYBE if path.is_file() and zipfile.is_zipfile(path) else Claim.NONE
+
+    def open(self, path: Path, spec: PolicySpec, names: Mapping[str, str]) -> Recording:
+        """Open a recording, large arrays as rows that stay on the disk.
 
         Raises:
             DataError: when the file is corrupt, is a single array, holds Python objects, or would not fit into the
-                limit, or what is no array of rows into the memory; before anything is unpacked.
+                limit, or what is not an array of rows into the memory, before anything is unpacked; when it does not
+                fit the spec.
         """
         free = _free_mb()
-        return open_rows(path, LIMIT, free=None if free is None else free * 1e6)
+        arrays = open_rows(path, LIMIT, free=None if free is None else free * 1e6)
+        return build_recording(path, arrays, spec, names)
 
 
 def _free_mb() -> float | None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from vlatool.errors import RecipeError, instead, nearest
+from vlatool.errors import RecipeError, fix_for, suggest
 
 DEPTH = "prune.depth"
-MADE_BY = {"depth": DEPTH, "width": "prune.structured"}
+STAGES = {"depth": DEPTH, "width": "prune.structured"}
 """Share that stays -> the stage that takes the rest away; in this order, so that no width is ranked for nothing."""
 EXAMPLE = "depth=0.5,width=0.75"
 DECIMALS = 6
@@ -37,15 +37,15 @@ def student_steps(text: str) -> tuple[tuple[str, dict[str, Any]], ...]:
                 f"--student says how much stays, such as {EXAMPLE} (of the blocks, and of the work); got '{text}'.",
                 f"write it as {EXAMPLE}",
             )
-        if name not in MADE_BY:
-            raise RecipeError(f"--student knows no '{name}'; {nearest(name, MADE_BY)}.", instead(name, MADE_BY))
+        if name not in STAGES:
+            raise RecipeError(f"--student knows no '{name}'; {suggest(name, STAGES)}.", fix_for(name, STAGES))
         if name in shares:
             raise RecipeError(f"--student names {name} twice: '{text}'.", "name it once")
         shares[name] = _share(name, value)
-    goes = {name: round(1 - shares[name], DECIMALS) for name in MADE_BY if shares.get(name, 1.0) < 1}
+    goes = {name: round(1 - shares[name], DECIMALS) for name in STAGES if shares.get(name, 1.0) < 1}
     if text and not goes:
         raise RecipeError(f"--student {text} takes nothing away.", f"ask for less than 1, such as {EXAMPLE}")
-    return tuple((MADE_BY[name], {"ratio": ratio}) for name, ratio in goes.items())
+    return tuple((STAGES[name], {"ratio": ratio}) for name, ratio in goes.items())
 
 
 def _share(name: str, value: str) -> float:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import CALIBRATION
+from vlatool.data import recordings_of
 from vlatool.distill._student import DEPTH, student_steps
 from vlatool.errors import DataError, RecipeError
 from vlatool.stage.base import Context, Transform
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from vlatool.hardware.profile import Profile
-    from vlatool.training.lesson import Lesson
+    from vlatool.training.objective import Objective
     from vlatool.training.teacher import Teacher
 
 OF_LABELS = ("l1", "l2", "huber")
@@ -104,7 +104,7 @@ class PolicyDistillation(ImitationStage):
                 f"elsewhere; got --{asked[0].replace('_', '-')} {getattr(self, asked[0])}.",
                 "leave it out",
             )
-        if self.alpha < 1 and source is not None and CALIBRATION not in source.manifest.files:
+        if self.alpha < 1 and source is not None and recordings_of(source).calibration is None:
             raise DataError(
                 f"--alpha {self.alpha:g} needs an expert's actions, and {source.path} has no recording.", RECORD
             )
@@ -121,13 +121,13 @@ class PolicyDistillation(ImitationStage):
         """Return who says what is right."""
         return Supervision(self.alpha, self.label_share, self.control)
 
-    def prepared(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Lesson]:
-        """Return the teacher, and a lesson in which the expert has its share."""
-        teacher, lesson = super().prepared(modules, source)
+    def prepare_objective(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Objective]:
+        """Return the teacher, and an objective in which the expert has its share."""
+        teacher, objective = super().prepare_objective(modules, source)
         if self.alpha == 1:
-            return teacher, lesson
+            return teacher, objective
         distance = self._distance(self.loss if self.loss in OF_LABELS else "l1")
-        return teacher, replace(lesson, expert=expert_loss(modules, source, distance))
+        return teacher, replace(objective, expert=expert_loss(modules, source, distance))
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Train, unless that is only the last of several steps.

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import SourceError, nearest
+from vlatool.errors import SourceError, suggest
 from vlatool.module.edits import load_tensors, read_tensors
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Weights(ModuleStage):
             raise SourceError(f"No such file: {self.file}.", "check the path of the state_dict")
         super().check(source, profile)
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Load the weights.
 
         Raises:
@@ -49,22 +49,22 @@ class Weights(ModuleStage):
         stored = read_tensors(self.file)
         check_tensors(modules, stored, str(self.file))
         for graph, module in modules.items():
-            context.tell(f"loading the weights of {graph}", None)
+            context.progress(f"loading the weights of {graph}", None)
             load_tensors(graph, module, stored, str(self.file))
-        return Changed()
+        return ModuleChanges()
 
 
 def check_tensors(modules: Mapping[str, nn.Module], stored: Mapping[str, Any], where: str) -> None:
     """See that a file holds the weights of modules and nothing else.
 
     Args:
-        modules: Graph name -> module.
-        stored: Name -> tensor; a name may have that of the graph before it.
-        where: The file, for messages.
+        modules: graph name -> module.
+        stored: name -> tensor; a name may have that of the graph before it.
+        where: the file, for messages.
 
     Raises:
         SourceError: when a tensor is unknown, there under both names, or of other numbers than the module's: codes of
-            a quantized file or complex numbers are no weights, whatever their shape.
+            a quantized file or complex numbers are not weights, whatever their shape.
     """
     held = {graph: module.state_dict() for graph, module in modules.items()}
     known = {name: value for state in held.values() for name, value in state.items()}
@@ -78,7 +78,7 @@ def check_tensors(modules: Mapping[str, nn.Module], stored: Mapping[str, Any], w
     if unknown:
         raise SourceError(
             f"{where} holds {len(unknown)} tensors that the policy has not: '{unknown[0]}'; "
-            f"{nearest(unknown[0], known)}.",
+            f"{suggest(unknown[0], known)}.",
             "save the state_dict() of the policy's own modules, and nothing else",
         )
     for graph, state in held.items():

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vlatool import registry
-from vlatool.errors import GraphError, MissingExtra, PluginError, VlatoolError, install
+from vlatool.errors import GraphError, MissingExtra, PluginError, VlatoolError, pip_install
 from vlatool.files.printable import message_of
 from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, usable_engines
-from vlatool.stage.products import products_apart
+from vlatool.stage.products import int8_arithmetic
 from vlatool.telemetry.rapl import UDEV_RULE
 
 Status = Literal["ok", "warn", "missing"]
@@ -60,10 +60,10 @@ class Check:
     """One finding.
 
     Args:
-        name: What was looked at.
+        name: what was looked at.
         status: ``ok``, ``warn`` (works, but) or ``missing``.
-        finding: What was found, in words.
-        fix: What to do; empty when nothing is to be done.
+        finding: what was found, in words.
+        fix: what to do; empty when nothing is to be done.
     """
 
     name: str
@@ -79,7 +79,8 @@ def diagnose(root: Path = host.ROOT) -> list[Check]:
         >>> [check.name for check in diagnose()][0]
         'python'
     """
-    installed = host.versions({*chain(*EXTRAS.values(), *_substitutes().values())})
+    engines_of = (library.distributions() for library in usable_engines().values())
+    installed = host.versions({*chain(*EXTRAS.values(), *engines_of)})
     return [
         python_version(),
         *engines(installed, host.board(root), lambda library: library.execution_providers()),
@@ -87,7 +88,7 @@ def diagnose(root: Path = host.ROOT) -> list[Check]:
         *extras(installed),
         *plugins(),
         instruction_set(host.isa(root)),
-        *confined(host.onednn_max_cpu_isa()),
+        *onednn_limit(host.onednn_max_cpu_isa()),
         *telemetry(root),
         clocks(root),
         cores(root),
@@ -112,14 +113,16 @@ def engines(
 ) -> Iterator[Check]:
     """The inference libraries with their version and, where they say so, what they run on."""
     jetson = bool(board and "jetson" in board.lower())
-    for library in usable_engines().values():
-        title = f"engine {library.package}"
-        package = next((name for name in (library.package, *library.substitutes) if name in installed), None)
+    packages: set[str] = set()
+    for name, library in usable_engines().items():
+        title = f"engine {name if library.package in packages else library.package}"
+        packages.add(library.package)
+        package = next((name for name in library.distributions() if name in installed), None)
         if package is not None:
             yield _engine(title, f"{package} {installed[package]}", library, jetson, ask)
             continue
         advice = f" ({library.advice})" if library.advice else ""
-        fix = "" if jetson and advice else f"{install(library.extra)}{advice}"
+        fix = "" if jetson and advice else f"{library.installation()}{advice}"
         yield Check(title, "missing", "not installed", fix)
 
 
@@ -129,7 +132,7 @@ def _engine(
     try:
         providers = ask(library)
     except MissingExtra as error:
-        return Check(title, "warn", f"{words} is installed, but cannot be imported", error.fix)
+        return Check(title, "warn", f"{words} is installed, but cannot be used: {error.message}", error.fix)
     except Exception as error:  # the seam: a library, or another package's engine, may raise anything
         return Check(title, "warn", f"{words} fails: {type(error).__name__}: {message_of(error)}", "update it")
     if providers is None:
@@ -144,9 +147,11 @@ def _engine(
 
 def arithmetic() -> Iterator[Check]:
     """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
-    for name in usable_engines():
+    for name, library in usable_engines().items():
+        if not library.is_installed():
+            continue
         try:
-            products = products_apart(name)
+            products = int8_arithmetic(name)
         except GraphError as error:  # the engine ended its process, or hangs
             yield Check(f"int8 {name}", "warn", error.message, error.fix)
             continue
@@ -157,7 +162,7 @@ def arithmetic() -> Iterator[Check]:
             yield Check(f"int8 {name}", "ok", finding)
             continue
         fix = COMPARE_INT8
-        if name != DEFAULT_ENGINE:
+        if name != DEFAULT_ENGINE and library.layouts:
             fix = "vlatool quantize static-int8 SOURCE -o BUNDLE --layout ort: ONNX Runtime is set to be exact here; "
             fix += f"or --layout {name} --reduce-range"
         yield Check(f"int8 {name}", "warn", finding, fix)
@@ -168,7 +173,7 @@ def extras(installed: Mapping[str, str]) -> Iterator[Check]:
     for extra, packages in EXTRAS.items():
         absent = [name for name in packages if _present(name, installed) is None]
         if absent:
-            yield Check(f"extra {extra}", "missing", f"lacks {', '.join(absent)}", install(extra))
+            yield Check(f"extra {extra}", "missing", f"lacks {', '.join(absent)}", pip_install(extra))
         else:
             versions = ", ".join(f"{name} {installed[_present(name, installed) or name]}" for name in packages)
             yield Check(f"extra {extra}", "ok", versions)
@@ -194,7 +199,10 @@ def plugins() -> Iterator[Check]:
 
 def _substitutes() -> dict[str, tuple[str, ...]]:
     """Package of an engine -> the distributions of other names that bring it."""
-    return {library.package: library.substitutes for library in usable_engines().values()}
+    known: dict[str, tuple[str, ...]] = {}
+    for library in usable_engines().values():
+        known[library.package] = (*known.get(library.package, ()), *library.substitutes)
+    return known
 
 
 def instruction_set(features: Sequence[str] | None) -> Check:
@@ -214,7 +222,7 @@ def instruction_set(features: Sequence[str] | None) -> Check:
     return Check(name, "warn", finding, "measure before you ship int8")
 
 
-def confined(isa: str | None) -> Iterator[Check]:
+def onednn_limit(isa: str | None) -> Iterator[Check]:
     """Whether a variable keeps OpenVINO from instructions that the processor has."""
     if isa is not None:
         setting = f"{host.MAX_CPU_ISA}={isa}"
@@ -263,16 +271,16 @@ def _readable(path: Path) -> bool:
 
 def _ina3221(root: Path) -> Iterator[Check]:
     for monitor in _glob(root, "sys/class/hwmon", "hwmon*"):
-        place = monitor.relative_to(root).as_posix()
-        if host.read_text(root, f"{place}/name") == "ina3221":
-            labels = [host.read_text(root, f"{place}/in{channel}_label") for channel in (1, 2, 3)]
+        path = monitor.relative_to(root).as_posix()
+        if host.read_text(root, f"{path}/name") == "ina3221":
+            labels = [host.read_text(root, f"{path}/in{channel}_label") for channel in (1, 2, 3)]
             rails = [label for label in labels if label and label != "NC"]
             whole = "VDD_IN is the whole module" if "VDD_IN" in rails else "no rail is the whole module"
             yield Check("power INA3221", "ok", f"rails {', '.join(rails) or 'without label'}; {whole}")
 
 
 def _vcgencmd(root: Path) -> Iterator[Check]:
-    if not any((root / place / "vcgencmd").exists() for place in ("usr/bin", "opt/vc/bin")):
+    if not any((root / folder / "vcgencmd").exists() for folder in ("usr/bin", "opt/vc/bin")):
         return
     if (root / "dev/vcio").exists() and os.access(root / "dev/vcio", os.R_OK | os.W_OK):
         yield Check("power vcgencmd", "ok", "throttling and supply voltage can be read")

@@ -14,12 +14,12 @@ from vlatool.motion.track import Track
 Array = NDArray[Any]
 SERIES = {"position": 1, "joints": 1, "heading": 0, "gripper": 0, "collision": 0}
 """What the info of a step may tell -> number of its axes."""
-MOST = {"position": 3, "joints": 64}
+MAX_ELEMENTS = {"position": 3, "joints": 64}
 """Elements that they may have."""
 TIME, SHORTEST = "time", "shortest_path"
-SHOWN = 2000
+MAX_SERIES_STEPS = 2000
 """Steps of an episode that is shown."""
-UNEVEN = 0.01
+MAX_UNEVENNESS = 0.01
 """Share by which two steps of an environment's clock may differ."""
 
 
@@ -32,7 +32,7 @@ class Body:
 
     def __init__(self, spec: PolicySpec) -> None:
         self._hz = float(spec.control_hz)
-        self._alike, self._grip = alike(spec.action), spec.action.gripper
+        self._alike, self._grip = same_unit_elements(spec.action), spec.action.gripper
         self._told: dict[str, list[Array]] = {name: [] for name in SERIES}
         self._times: list[float] = []
         self._shortest: float | None = None
@@ -55,7 +55,7 @@ class Body:
         if self._shortest is None and info.get(SHORTEST) is not None:
             self._shortest = self._number(SHORTEST, info[SHORTEST], least=0.0)
 
-    def acted(self, action: Array, fresh: bool) -> None:
+    def add_action(self, action: Array, fresh: bool) -> None:
         """Keep the action of a step, (A,) or a 0-d index, and whether it was the first of a chunk."""
         self._actions.append(np.asarray(action))
         self._fresh.append(fresh)
@@ -93,8 +93,8 @@ class Body:
             return None
         if array.size == 1 and SERIES.get(name, 0) == 0:
             array = array.reshape(())
-        if array.ndim != SERIES.get(name, 0) or not 0 < array.size <= MOST.get(name, 1):
-            wanted = f"(1 to {MOST[name]},)" if name in MOST else "one number"
+        if array.ndim != SERIES.get(name, 0) or not 0 < array.size <= MAX_ELEMENTS.get(name, 1):
+            wanted = f"(1 to {MAX_ELEMENTS[name]},)" if name in MAX_ELEMENTS else "one number"
             self.refused[name] = f"it has the shape {list(array.shape)}; allowed: {wanted}"
             return None
         if not np.isfinite(array).all() or np.abs(array).max() > 1e9:
@@ -127,7 +127,7 @@ class Body:
         steps = np.diff(self._times)
         if len(self._times) != self._looks and len(self._times) != self._looks - 1:
             self.refused[TIME] = f"it is told at {len(self._times)} of {self._looks} moments"
-        elif steps.min() <= 0 or steps.max() - steps.min() > UNEVEN * steps.mean():
+        elif steps.min() <= 0 or steps.max() - steps.min() > MAX_UNEVENNESS * steps.mean():
             self.refused[TIME] = f"its steps go from {steps.min():g} to {steps.max():g} s; all must be alike, above 0"
         else:
             return float(1 / steps.mean())
@@ -149,10 +149,10 @@ def series_of(track: Track, action: TensorSpec) -> dict[str, tuple[float, ...]]:
     else:
         names = action.labels or tuple(map(str, range(track.actions.shape[1])))
         series |= {f"action.{name}": values for name, values in zip(names, track.actions.T, strict=False)}
-    return {name: tuple(np.asarray(values, np.float64)[:SHOWN].tolist()) for name, values in series.items()}
+    return {name: tuple(np.asarray(values, np.float64)[:MAX_SERIES_STEPS].tolist()) for name, values in series.items()}
 
 
-def alike(action: TensorSpec) -> tuple[int, ...]:
+def same_unit_elements(action: TensorSpec) -> tuple[int, ...]:
     """Return the elements of a continuous action that share its most frequent unit, the gripper apart."""
     if action.kind == "discrete":
         return ()

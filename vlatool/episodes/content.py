@@ -19,10 +19,11 @@ from vlatool.episodes import play
 from vlatool.episodes.play import EpisodesJob
 from vlatool.files.messages import to_json
 from vlatool.machine.host import cpu_model, isa
-from vlatool.machine.instruction_sets import computed_in
+from vlatool.machine.instruction_sets import openvino_set
 from vlatool.machine.version import VERSION
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.module.imports import imported_files
+from vlatool.runtime.engine import identities
 from vlatool.user_code.walk import files_below
 
 MOST_FILES = 20_000
@@ -37,13 +38,15 @@ def circumstances(bundle: Bundle, engine: str, job: EpisodesJob) -> dict[str, An
         engine: That was named; empty for the bundle's own.
         job: Any of the jobs: its environment counts.
     """
+    built = identities().get(engine or bundle.manifest.engine)
     return {
         "bundle": bundle.hash,
         "engine": engine,
         "environment": environment_hash(job),
         "vlatool": VERSION,
         "steps": play.STEP_LIMIT,
-        "instruction set": computed_in(),
+        "instruction set": openvino_set(),
+        **({"engine built against": built} if built else {}),
         "processor": [cpu_model(), isa()],
         "python": platform.python_version(),
         "packages": _installed(),

@@ -6,14 +6,12 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.spec import TensorSpec
-from vlatool.runtime.interface import Policy
+from vlatool.runtime.interface import Array, Policy
 
-Array = NDArray[Any]
 CONTROLS = ("random", "constant")
-ASKED = 32
+ANSWERED_OBSERVATIONS = 32
 """Observations that a policy is asked for the actions that its controls play."""
 
 

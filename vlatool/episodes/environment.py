@@ -11,9 +11,9 @@ import numpy as np
 
 from vlatool.accuracy.success import truth_of
 from vlatool.bundle.spec import PolicySpec
-from vlatool.errors import DataError, instead, nearest
-from vlatool.files.limits import VARIABLE, limit
-from vlatool.machine.awaited import awaited
+from vlatool.errors import DataError, fix_for, suggest
+from vlatool.files.limits import LIMITS_VARIABLE, limit
+from vlatool.machine.watched_calls import watched_call
 
 SECONDS = "environment_seconds"
 GUIDE = "docs/guides/environment.md has a wrapper of ten lines"
@@ -49,14 +49,14 @@ def limited(
     allowed = timeout_s or limit(SECONDS)
     of = f"of task '{task}'" if seed is None else f"of task '{task}' {when} seed {seed}"
     longer = f"{2 * allowed:g}"
-    everywhere = "" if timeout_s else f"{VARIABLE}={SECONDS}={longer}, or "
+    everywhere = "" if timeout_s else f"{LIMITS_VARIABLE}={SECONDS}={longer}, or "
     asked = f"--environment-timeout {longer} (evaluate closed-loop, optimize)"
     raised = f"{everywhere}timeout: {longer} under environment in policy.yaml, or {asked}"
     own = f"make(task={task!r})" + (f".reset(seed={seed})" if call in ("reset()", "step()") else "")
     fix = f"where it needs longer, raise the limit: {raised}; else call {own} of the environment yourself and see where"
     whose = f"{call} of the environment of task '{task}'"
     at = "" if seed is None else f"{when} seed {seed}"
-    return awaited(f"{call} {of}", whose, at, f"{fix} it hangs", allowed)
+    return watched_call(f"{call} {of}", whose, at, f"{fix} it hangs", allowed)
 
 
 class World:
@@ -156,8 +156,8 @@ class World:
         known = self.disturbances()
         if kind not in known:
             raise DataError(
-                f"{self._name.capitalize()} offers no disturbance '{kind}'; {nearest(kind, known)}.",
-                instead(kind, known),
+                f"{self._name.capitalize()} offers no disturbance '{kind}'; {suggest(kind, known)}.",
+                fix_for(kind, known),
             )
         self._seed = seed
         with self._limited("disturb()"):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from vlatool.episodes.disturbed import OWN
+from vlatool.episodes.disturbances import BUILT_IN_DISTURBANCES
 from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.module.factory import RAISED, exits_caught
+from vlatool.module.factory import CORRECT_CODE, map_user_exceptions
 
 
 def under_way(task: str, seed: int) -> str:
@@ -32,7 +32,7 @@ def named(task: str, seed: int | None = None, under: tuple[str, float] | None = 
     """
     at = "" if seed is None else f" at seed {seed}{_under(under)}"
     try:
-        with exits_caught(f"the environment of task '{task}'{at and f',{at},'}"):
+        with map_user_exceptions(f"the environment of task '{task}'{at and f',{at},'}"):
             yield
     except VlatoolError as error:
         locate(error, task, seed, under=under)
@@ -65,7 +65,7 @@ def locate(
     if words:
         start = " ".join(words)
         error.message = f"{start[:1].upper()}{start[1:]}: {message}"
-    if error.fix in ("", RAISED) and isinstance(error, DataError | SourceError):
+    if error.fix in ("", CORRECT_CODE) and isinstance(error, DataError | SourceError):
         error.fix = _remedy(task, seed, under)
 
 
@@ -75,6 +75,6 @@ def _under(under: tuple[str, float] | None) -> str:
 
 def _remedy(task: str, seed: int | None, under: tuple[str, float] | None = None) -> str:
     call = f"make(task={task!r})" + ("" if seed is None else f".reset(seed={seed})")
-    if under and under[0] not in OWN and seed is not None:
+    if under and under[0] not in BUILT_IN_DISTURBANCES and seed is not None:
         call = f"e = make(task={task!r}), then e.disturb({under[0]!r}, {under[1]:g}, {seed}) and e.reset(seed={seed})"
     return f"call {call} of the environment yourself, and correct what fails; VLATOOL_DEBUG=1 shows where it was raised"

@@ -35,7 +35,7 @@ def check_filmable(bundles: Sequence[Bundle], job: EpisodesJob, context: Context
     blind = next((bundle for bundle in bundles if not images_of(bundle.manifest.spec)), None)
     if blind is not None:
         request = to_json(Request(str(blind.path.absolute()), "", STEP_LIMIT, job))
-        call(f"{__name__}:probe", request, context.tell, job.environment.rpartition(":")[0])
+        call(f"{__name__}:probe", request, context.progress, job.environment.rpartition(":")[0])
 
 
 def probe(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> None:

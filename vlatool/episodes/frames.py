@@ -9,14 +9,11 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import BEGINS
-from vlatool.runtime.interface import Action, Controller, Policy
+from vlatool.runtime.interface import Action, Array, Controller, Policy
 from vlatool.runtime.observation import ObservationEncoder
-
-Array = NDArray[Any]
 
 
 def file_of(folder: Path, name: str) -> Path:

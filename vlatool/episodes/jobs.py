@@ -12,12 +12,12 @@ from typing import Any
 
 from vlatool.accuracy.paired import Outcome
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
-from vlatool.data import CALIBRATION
+from vlatool.data import recordings_of
 from vlatool.episodes import play
 from vlatool.episodes.content import circumstances, key_of
-from vlatool.episodes.disturbed import OWN
+from vlatool.episodes.disturbances import BUILT_IN_DISTURBANCES
 from vlatool.episodes.faults import locate, under_way
-from vlatool.episodes.play import ENDED, PRELOAD, RECORDINGS, EpisodesJob, Played, Request
+from vlatool.episodes.play import OUTCOME_PREFIX, PRELOAD, RECORDINGS, EpisodesJob, Played, Request
 from vlatool.episodes.progress import Tally
 from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.messages import from_json, to_json
@@ -60,7 +60,7 @@ def run_jobs(
             part = kept.found[number] if number in kept.found else kept.whole(number, next(played))
             outcomes += part
             tally.add(part)
-            context.tell(tally.sentence(), tally.share)
+            context.progress(tally.sentence(), tally.share)
         next(played, None)  # what is open is closed
     kept.say()
     return outcomes
@@ -82,10 +82,10 @@ def _played(
     ours = {under_way(job.task, seed) for job in jobs for seed in job.seeds}
 
     def tell(what: str, share: float | None) -> None:
-        if what.startswith(ENDED):
-            kept.one(what.removeprefix(ENDED))
+        if what.startswith(OUTCOME_PREFIX):
+            kept.one(what.removeprefix(OUTCOME_PREFIX))
         else:
-            begun.add(what) if what in ours else context.tell(what, share)
+            begun.add(what) if what in ours else context.progress(what, share)
 
     work = _work("play", bundle, jobs, engine, PRELOAD, "close", away=name != PROCESSES)
     answers = launcher(name, count).answers(work, tell, done, context.notes.append)
@@ -125,8 +125,8 @@ def check_opens(bundles: Sequence[Bundle], job: EpisodesJob, engine: str, contex
     """
     for bundle in bundles:
         name = context.launcher if bundle.manifest.graphs else PROCESSES
-        work = _work("opened", bundle, [job], engine, PRELOAD, away=name != PROCESSES)
-        list(launcher(name, 1).answers(work, context.tell, lambda _number, _answer: None, context.notes.append))
+        work = _work("open_bundle", bundle, [job], engine, PRELOAD, away=name != PROCESSES)
+        list(launcher(name, 1).answers(work, context.progress, lambda _number, _answer: None, context.notes.append))
 
 
 def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
@@ -138,12 +138,12 @@ def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple
     """
     work = _work("disturbances", bundle, [job], "", away=context.launcher != PROCESSES)
     who = launcher(context.launcher, context.workers)
-    (own,) = who.answers(work, context.tell, lambda _number, _answer: None, context.notes.append)
+    (own,) = who.answers(work, context.progress, lambda _number, _answer: None, context.notes.append)
     if not isinstance(own, list) or not all(isinstance(kind, str) for kind in own):
         raise DataError(
             "The process that asked the environment for its disturbances did not answer with names.", OWN_FILES
         )
-    return (*OWN, *(kind for kind in own if kind not in OWN))
+    return (*BUILT_IN_DISTURBANCES, *(kind for kind in own if kind not in BUILT_IN_DISTURBANCES))
 
 
 def _work(
@@ -168,8 +168,10 @@ def _work(
 
 def _needed(bundle: Bundle, jobs: Sequence[EpisodesJob]) -> list[str]:
     """Return the files of a bundle that its episodes read: of the recordings what controls and noise are drawn from."""
-    asked = (CALIBRATION,) if any(job.control or job.noise for job in jobs) else ()
-    return sorted(name for name in bundle.manifest.files if not name.startswith(RECORDINGS) or name in asked)
+    drawn_from = recordings_of(bundle).calibration if any(job.control or job.noise for job in jobs) else None
+    recorded = {name for name in bundle.manifest.files if name.startswith(RECORDINGS)}
+    asked = {name for name in recorded if drawn_from and (bundle.path / name).is_relative_to(drawn_from)}
+    return sorted({*bundle.manifest.files} - recorded | asked)
 
 
 def _placed(job: EpisodesJob) -> tuple[EpisodesJob, tuple[Folder, ...]]:
@@ -214,7 +216,7 @@ def _impossible(outcome: Outcome, job: EpisodesJob) -> str:
     """Return why no episode ends like that; nothing when one may."""
     if not 1 <= outcome.steps <= play.STEP_LIMIT:
         return f"{outcome.steps:.3g} steps (allowed: 1 to {play.STEP_LIMIT:,})"
-    if len(outcome.instruction) > play.LONGEST:
+    if len(outcome.instruction) > play.MAX_INSTRUCTION_LENGTH:
         return f"an instruction of {len(outcome.instruction):,} characters"
     if not all(map(math.isfinite, outcome.motion.values())):
         return "a motion that is infinite or NaN"
@@ -229,7 +231,7 @@ class _Kept:
         self._jobs = jobs
         self._single: dict[tuple[str, int], Outcome] = {}
         self._context = context
-        self._store = None if context.kept is None or jobs[0].record else context.kept
+        self._store = None if context.store is None or jobs[0].record else context.store
         if self._store is None:
             return
         around = circumstances(bundle, engine, jobs[0])
@@ -244,7 +246,7 @@ class _Kept:
         self._store.taken += taken
         self._store.asked += sum(len(job.seeds) for job in jobs)
         if taken:
-            context.tell(f"{taken} episodes are of an interrupted run", None)
+            context.progress(f"{taken} episodes are of an interrupted run", None)
 
     def _found(self, key: str, job: EpisodesJob) -> Outcomes:
         """Return what is kept of a job; nothing where there is none, or it is not what that job gives."""
@@ -299,4 +301,4 @@ class _Kept:
     def say(self) -> None:
         """Say it where outcomes cannot be kept."""
         if self._store is not None and self._store.problem:
-            self._context.tell(self._store.problem, None)
+            self._context.progress(self._store.problem, None)

@@ -23,8 +23,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import observations_for
 from vlatool.episodes.body import Body, series_of
-from vlatool.episodes.controls import ASKED, Array, Blind, answers_of
-from vlatool.episodes.disturbed import OWN, DisturbedController
+from vlatool.episodes.controls import ANSWERED_OBSERVATIONS, Blind, answers_of
+from vlatool.episodes.disturbances import BUILT_IN_DISTURBANCES, DisturbedController
 from vlatool.episodes.environment import GUIDE, World, limited
 from vlatool.episodes.faults import named, under_way
 from vlatool.episodes.film import world_of
@@ -34,16 +34,16 @@ from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
 from vlatool.module.factory import call_factory
 from vlatool.motion.measure import measure_episode
-from vlatool.runtime.control import controller
-from vlatool.runtime.interface import Controller
+from vlatool.runtime.control import build_controller
+from vlatool.runtime.interface import Array, Controller
 from vlatool.runtime.policy import FIRST_RUN_S, BundlePolicy
 
-ENDED = "ended: "
+OUTCOME_PREFIX = "ended: "
 """How the progress begins that says how an episode ended: what comes after it in its job may never end."""
 SLICE = 10
 """Episodes of one task that a worker plays at a time."""
 STEP_LIMIT = 100_000
-LONGEST = 200
+MAX_INSTRUCTION_LENGTH = 200
 """Characters of an instruction that are kept."""
 EVALUATION_SEEDS = 5_000_000
 """First seed of the episodes that policies are judged by; those that they are trained on have smaller ones."""
@@ -68,7 +68,7 @@ class EpisodesJob:
             of each action's standard deviation; for discrete actions, how often a random one is taken.
         record: Folder for what the policy was given at each inference, ``NAME.npy`` for each input; nothing is kept
             when empty.
-        disturb: Disturbance of the environment, or of what the policy sees (``episodes/disturbed.py``).
+        disturb: Disturbance of the environment, or of what the policy sees (``episodes/disturbances.py``).
         strength: Of the disturbance; 1 is what an ordinary day brings.
         latency_ms: How late actions come; 0 for at once.
         controller: Names of the controller and of wrappers; vlatool's own when empty (``vlatool.runtime.control``).
@@ -133,8 +133,8 @@ class Worker:
     """What a child process keeps between jobs: the policy and the environment of the current task."""
 
     def __init__(self, path: str, engine: str) -> None:
-        self._bundle = Bundle.described(path)
-        policy = _opened(self._bundle, engine)
+        self._bundle = Bundle.open_lazily(path)
+        policy = _open_policy(self._bundle, engine)
         self.policy = FrameRecorder(policy, policy.encode)
         self._answers: Array | None = None
         self._key: tuple[str, ...] = ()
@@ -158,34 +158,34 @@ class Worker:
         """Play the episodes of a job; tell of each that it begins."""
         spec = self.policy.spec
         os.chdir(self._home)  # an environment before may have changed it, and the next one's file is named from here
-        acting = self.controller(job)
+        controller = self.controller(job)
         world = world_of(self.environment(job), job.task, spec, job.film, job.timeout_s)
         self._job = job
         with self.policy.recording(Path(job.record)) if job.record else contextlib.nullcontext():
             outcomes = []
             for seed in job.seeds:
                 tell(under_way(job.task, seed), None)
-                outcomes.append(_episode(world, acting, spec, job, seed, limit))
+                outcomes.append(_episode(world, controller, spec, job, seed, limit))
                 if len(job.seeds) > 1 and not job.show:
-                    tell(f"{ENDED}{json.dumps(to_json(outcomes[-1]))}", None)
+                    tell(f"{OUTCOME_PREFIX}{json.dumps(to_json(outcomes[-1]))}", None)
             return outcomes
 
     def controller(self, job: EpisodesJob) -> Controller:
-        """Return who acts in the episodes of a job: the policy, its actions with noise, or actions that do not look."""
+        """Return the controller of a job: of the policy, with noise where there is any, or one that does not look."""
         spec = self.policy.spec
-        acting: Controller
+        acting = build_controller(self.policy, job.controller, int(job.latency_ms * spec.control_hz / 1e3))
         if job.control:
             acting = Blind(job.control, spec.action, self._policy_answers())
-        else:
-            acting = controller(self.policy, job.controller, int(job.latency_ms * spec.control_hz / 1e3))
         if job.noise:
             acting = Noisy(acting, spec.action, job.noise, self._policy_answers())
-        return DisturbedController(acting, spec, job.disturb, job.strength) if job.disturb in OWN else acting
+        if job.disturb in BUILT_IN_DISTURBANCES:
+            acting = DisturbedController(acting, spec, job.disturb, job.strength)
+        return acting
 
     def _policy_answers(self) -> Array:
         """Return what the policy answers to recorded observations; asked once, and before frames are recorded."""
         if self._answers is None:
-            self._answers = answers_of(self.policy, observations_for(self._bundle, ASKED))
+            self._answers = answers_of(self.policy, observations_for(self._bundle, ANSWERED_OBSERVATIONS))
         return self._answers
 
     def close(self) -> None:
@@ -195,7 +195,7 @@ class Worker:
             _close(environment, self._job)
 
 
-def _opened(bundle: Bundle, engine: str) -> BundlePolicy:
+def _open_policy(bundle: Bundle, engine: str) -> BundlePolicy:
     """Verify and open a bundle, without its recordings; one that is not exported yet runs in torch.
 
     An inference that takes longer than any that a robot could use is stopped.
@@ -225,20 +225,20 @@ def play(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
     return answer
 
 
-def opened(request: Mapping[str, Any], _tell: Tell) -> None:
+def open_bundle(request: Mapping[str, Any], _tell: Tell) -> None:
     """Open the bundle of a ``Request`` in this process, as its episodes would.
 
     Raises:
         BundleError, GraphError: when it cannot be.
     """
     asked = from_json(Request, request)
-    _opened(Bundle.described(asked.bundle), asked.engine)
+    _open_policy(Bundle.open_lazily(asked.bundle), asked.engine)
 
 
 def disturbances(request: Mapping[str, Any], _tell: Tell) -> list[str]:
     """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
     asked = from_json(Request, request)
-    spec = Bundle.described(asked.bundle).manifest.spec
+    spec = Bundle.open_lazily(asked.bundle).manifest.spec
     with limited("make()", asked.job.task, None, asked.job.timeout_s):
         environment = call_factory(asked.job.environment, Path(asked.job.folder), {"task": asked.job.task})
     try:
@@ -263,21 +263,23 @@ def close(_request: Mapping[str, Any], _tell: Tell) -> None:
     _worker = None
 
 
-def _episode(world: World, acting: Controller, spec: PolicySpec, job: EpisodesJob, seed: int, limit: int) -> Outcome:
+def _episode(
+    world: World, controller: Controller, spec: PolicySpec, job: EpisodesJob, seed: int, limit: int
+) -> Outcome:
     task = job.task
     with named(task, seed, (job.disturb, job.strength) if job.disturb else None):
-        if job.disturb and job.disturb not in OWN:
+        if job.disturb and job.disturb not in BUILT_IN_DISTURBANCES:
             world.disturb(job.disturb, job.strength, seed)
         observation, info = world.reset(seed)
-        acting.reset(seed)
+        controller.reset(seed)
         success, body = Success(), Body(spec)
         body.look(info)
         instruction, start = instruction_of(observation, spec), start_of(observation, spec)
         for step in range(1, limit):
-            action = _action(acting, observation, f"task '{task}' at seed {seed}, step {step},")
+            action = _action(controller, observation, f"task '{task}' at seed {seed}, step {step},")
             observation, over, info = world.step(action.item() if action.ndim == 0 else action)
             success.look(info)
-            body.acted(action, acting.fresh)
+            body.add_action(action, controller.fresh)
             body.look(info)
             if over:
                 track = body.track()
@@ -293,7 +295,7 @@ def instruction_of(observation: Mapping[str, Any], spec: PolicySpec) -> str:
     texts = [tensor.name for tensor in spec.inputs if tensor.kind == "text"]
     value = observation[texts[0]] if len(texts) == 1 and texts[0] in observation else ""
     value = value[0] if isinstance(value, list | tuple | np.ndarray) and len(value) == 1 else value
-    return one_line(value, LONGEST) if isinstance(value, str) else ""
+    return one_line(value, MAX_INSTRUCTION_LENGTH) if isinstance(value, str) else ""
 
 
 def start_of(observation: Mapping[str, Any], spec: PolicySpec) -> str:
@@ -306,10 +308,10 @@ def start_of(observation: Mapping[str, Any], spec: PolicySpec) -> str:
     return digest.hexdigest()[:16]
 
 
-def _action(acting: Controller, observation: Mapping[str, Any], where: str) -> Array:
+def _action(controller: Controller, observation: Mapping[str, Any], where: str) -> Array:
     """Return the action; an observation that the policy does not take is the environment's."""
     try:
-        return acting.act(observation)
+        return controller.act(observation)
     except DataError as error:
         raise DataError(
             f"The environment, in {where} gives what the policy does not take: {error.message}",

@@ -45,12 +45,12 @@ def loop_latency(bundle: Bundle, board: str, engine: str, context: Context) -> M
 
 def _calls(bundle: Bundle, engine: str, context: Context) -> Sequence[float]:
     """Measure the latencies of calls in ms; a run that was interrupted goes on with those that it had measured."""
-    key, kept = f"latency of {bundle.hash} in {engine or 'its engine'}", context.kept
+    key, kept = f"latency of {bundle.hash} in {engine or 'its engine'}", context.store
     known = kept.get(key) if kept else None
     if isinstance(known, list) and known and all(isinstance(call, float) and call > 0 for call in known):
         return known
     job = LatencyJob((str(bundle.path.absolute()),), engine, 1, CALLS, SECONDS, check=False)
-    calls = agent.measure(job, context.tell).policies[0].samples
+    calls = agent.measure(job, context.progress).policies[0].samples
     if kept:
         kept.put(key, list(calls))
     return calls

@@ -43,7 +43,7 @@ class Player:
     def __call__(self, jobs: list[EpisodesJob]) -> list[Outcome]:
         """Play further episodes; one that is only to be shown was counted before."""
         if jobs[0].show:
-            here = replace(self._context, launcher=PROCESSES, workers=1, kept=None)  # pictures stay on this machine
+            here = replace(self._context, launcher=PROCESSES, workers=1, store=None)  # pictures stay on this machine
             context = here if jobs[0].film else self._context
             return run_jobs(self._bundle, with_latency(jobs, self._latency), self._engine, context)
         tally = Tally(self._most, self._baseline.outcomes if self._baseline else ())

@@ -49,7 +49,7 @@ def played_until(
         decision = comparison.judge(lost, won, after, independent_starts(starts))
         if has_too_few_starts(starts) and decision.verdict in ("pass", "fail"):
             decision = replace(decision, verdict=GO_ON if after < comparison.most else "inconclusive")
-        context.tell(f"{after} pairs: {told(decision)}", after / comparison.most)
+        context.progress(f"{after} pairs: {told(decision)}", after / comparison.most)
         if decision.over:
             break
     if decision is None:

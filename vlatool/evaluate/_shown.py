@@ -125,7 +125,7 @@ def _filmed(
     again: EpisodesJob, before: Sequence[Outcome], plays: Sequence[Play], bundles: Sequence[Bundle], context: Context
 ) -> tuple[list[Outcome], str]:
     """Play the episode, film it and write the video; return its outcomes, and what is to be seen."""
-    context.tell("filming an episode", None)
+    context.progress("filming an episode", None)
     with scratch_directory() as scratch:
         folders = [scratch / str(place) for place in range(len(plays))]
         found = [play([replace(again, film=str(folder))])[0] for play, folder in zip(plays, folders, strict=True)]

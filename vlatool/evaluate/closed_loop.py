@@ -21,7 +21,7 @@ from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
-from vlatool.errors import DataError, SourceError, UsageError, instead, nearest
+from vlatool.errors import DataError, SourceError, UsageError, fix_for, suggest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._loop_latency import loop_latency, with_latency
 from vlatool.evaluate._names import BASELINE, names_of
@@ -30,10 +30,10 @@ from vlatool.evaluate._seen import FIX, seen_in_training
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._shown import check_video_of, played_again
 from vlatool.evaluate._told import told
-from vlatool.files.work import Store
+from vlatool.files.resumable_work import Store
 from vlatool.machine.host import cache_directory, fingerprint
-from vlatool.module.description import read_description
 from vlatool.module.factory import factory_file, split_factory
+from vlatool.module.source import describe
 from vlatool.report import Report, Row
 from vlatool.runtime.control import layers
 from vlatool.stage.base import Context, Measure
@@ -134,7 +134,7 @@ class ClosedLoop(Measure):
 
     def inputs(self) -> tuple[Path, ...]:
         """The baseline's manifest, and the environment's file with its neighbours, which it may import."""
-        described = read_description(self.policy) if self.policy else None
+        described = describe(self.policy) if self.policy else None
         where = self.environment or str((described.environment if described else {}).get("make", ""))
         folder = described.folder if described else Path()
         file = folder / where.rpartition(":")[0]
@@ -167,7 +167,7 @@ class ClosedLoop(Measure):
             raise UsageError(f"Nothing can be decided: {seen[0]}.", FIX)
 
     def _bundles(self, source: Bundle) -> list[Bundle]:
-        return [*([Bundle.described(self.baseline)] if self.baseline else []), source]
+        return [*([Bundle.open_lazily(self.baseline)] if self.baseline else []), source]
 
     def on(self, profile: Profile) -> ClosedLoop:
         """Return the evaluation with the latency that is predicted for a board, where latency counts."""
@@ -183,7 +183,7 @@ class ClosedLoop(Measure):
         place = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
         context.unfinished.append(place)
         with Store.open(place) as kept:
-            report = self._measured(source, replace(context, kept=kept))
+            report = self._measured(source, replace(context, store=kept))
         taken = f"{kept.taken} of the {kept.asked} episodes are of an interrupted run of the same command."
         notes = [*([taken] if kept.taken else []), *([kept.problem] if kept.problem else [])]
         context.notes.extend(notes)
@@ -254,8 +254,8 @@ class ClosedLoop(Measure):
         known = disturbances_of(source, job, context)
         if unknown := [kind for kind in self.disturb if kind not in (*known, ALL)]:
             raise UsageError(
-                f"There is no disturbance '{unknown[0]}'; {nearest(unknown[0], (*known, ALL))}.",
-                instead(unknown[0], (*known, ALL)),
+                f"There is no disturbance '{unknown[0]}'; {suggest(unknown[0], (*known, ALL))}.",
+                fix_for(unknown[0], (*known, ALL)),
             )
         return known if ALL in self.disturb else tuple(dict.fromkeys(self.disturb))
 
@@ -321,7 +321,7 @@ class ClosedLoop(Measure):
             )
         if self.policy or self.environment:
             if file or self.policy:  # a package that is named makes no code of the current directory run
-                trust.name(file.parent if file else Path(job.folder))
+                trust.allow(file.parent if file else Path(job.folder))
             return
         if file is None:
             raise SourceError(
@@ -337,7 +337,7 @@ class ClosedLoop(Measure):
             DataError: when both name one, and what would be played differs: a variant cannot choose its own.
         """
         own = source.manifest.environment if source else {}
-        base = Bundle.described(self.baseline).manifest.environment if self.baseline else {}
+        base = Bundle.open_lazily(self.baseline).manifest.environment if self.baseline else {}
         asked = {"make": self.environment, "tasks": self.tasks}
         other = [key for key, value in asked.items() if own and base and not value and own.get(key) != base.get(key)]
         if other:
@@ -349,7 +349,7 @@ class ClosedLoop(Measure):
         return base or own
 
     def _jobs(self, source: Bundle | None) -> list[EpisodesJob]:
-        described = read_description(self.policy) if self.policy else None
+        described = describe(self.policy) if self.policy else None
         named = described.environment if described else self._scene(source)
         known = tuple(named.get("tasks", ()))
         tasks = self.tasks or known
@@ -367,7 +367,7 @@ class ClosedLoop(Measure):
             )
         for task in self.tasks:
             if known and task not in known and not self.environment:
-                raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.", instead(task, known))
+                raise UsageError(f"There is no task '{task}'; {suggest(task, known)}.", fix_for(task, known))
         timeout = self.environment_timeout or timeout_of(named)
         job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control,
                           controller=self.controller, timeout_s=timeout)  # fmt: skip

@@ -18,7 +18,7 @@ from vlatool.accuracy.skill import skill, variation
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.bundle.program import keeps_values
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data import CALIBRATION, EVALUATION, Moment, Recording, evaluation_recording
+from vlatool.data import Moment, Recording, carries_evaluation, evaluation_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._names import names_of
@@ -27,7 +27,7 @@ from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context, Measure
-from vlatool.stage.tried import try_out
+from vlatool.stage.first_run import run_once_in_child
 from vlatool.stats.intervals import wilson
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Recorded(Measure):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is something to evaluate on."""
-        if source is not None and self.data is None and not carries_recordings(source):
+        if source is not None and self.data is None and not carries_evaluation(source):
             raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
 
     def run(self, source: Bundle, context: Context) -> Report:
@@ -94,7 +94,7 @@ class Recorded(Measure):
         verdict = "inconclusive" if trust.fails else "info"
         sentences = (*trust.sentences, text)
         reserved = (reservation,) if reservation else ()
-        warnings = (*reserved, *trust.warnings, *recording.unjudged, *found_wrong(source))
+        warnings = (*reserved, *trust.warnings, *recording.unjudged_steps, *found_wrong(source))
         return Report("evaluate", title, verdict, sentences, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _reference(
@@ -106,17 +106,12 @@ class Recorded(Measure):
         file = (recording.path, state.st_mtime_ns, state.st_size, len(recording))
         key = (baseline.hash, spec, file, tuple(indices), self.engine)
         if key not in REFERENCES:
-            context.tell("running the baseline", None)
+            context.progress("running the baseline", None)
             while len(REFERENCES) >= KEPT:
                 REFERENCES.pop(next(iter(REFERENCES)))
             REFERENCES[key] = run_recorded(baseline, recording, indices, self.engine, context)
             REFERENCES[key].setflags(write=False)
         return REFERENCES[key]
-
-
-def carries_recordings(bundle: Bundle) -> bool:
-    """Say whether a bundle brings observations to evaluate it on: recorded for it, or for calibration."""
-    return EVALUATION in bundle.manifest.files or CALIBRATION in bundle.manifest.files
 
 
 def _summary(row: Row) -> str:
@@ -154,14 +149,14 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
         GraphError: when this machine computes another golden action than recorded, an inference takes longer than
             ``FIRST_RUN_S``, or the engine crashes.
     """
-    try_out(bundle, engine)
+    run_once_in_child(bundle, engine)
     policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
     policy.warm_up(1)
     policy.limit_s = FIRST_RUN_S
     chunks: list[Array] = []
     for moment in moments_of(recording, indices, keeps=keeps_values(bundle.manifest.program)):
         if len(chunks) % 16 == 0:
-            context.tell("running recorded observations", len(chunks) / len(indices))
+            context.progress("running recorded observations", len(chunks) / len(indices))
         if moment.begins:
             policy.reset()
         answered = off_the_robot(f"sample {moment.number} of {recording.path}", MAKE_OTHERWISE)
@@ -174,7 +169,7 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
 def moments_of(recording: Recording, indices: Sequence[int], *, keeps: bool) -> Iterator[Moment]:
     """Yield the observations that a policy is given; one that keeps values is given all that come before them, too."""
     if keeps:
-        yield from recording.along(indices)
+        yield from recording.with_history(indices)
         return
     episode = None
     for index in indices:

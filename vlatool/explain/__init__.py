@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.bundle.unexported import no_graph
+from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.errors import VlatoolError
 from vlatool.explain import _tables as tables
 from vlatool.explain._bfloat16 import Phases, measure_phases, phase_sentences
@@ -29,7 +29,7 @@ from vlatool.explain._origin import (
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.workload import workload
 from vlatool.machine.host import before_run
-from vlatool.measurement.reach import reached_in
+from vlatool.measurement.reach import reach_by_dtype
 from vlatool.measurement.validity import busy, validity
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.report import Report, Row
@@ -162,7 +162,7 @@ def explanation(
 
 def _find(bundle: Bundle, options: Options, context: Context) -> _Findings:
     if not bundle.manifest.graphs:
-        raise no_graph(bundle, "explain")
+        raise no_graph_error(bundle, "explain")
     quantization = origin(bundle)
     baseline = find_baseline(bundle, quantization, options.baseline)
     observations = observations_of(bundle, baseline, options.data, options.samples)
@@ -199,12 +199,12 @@ def _layers(findings: _Findings, seconds: float, context: Context) -> None:
 def _times(findings: _Findings, options: Options, context: Context) -> None:
     """Profile the bundle and the float32 one, and examine the quantized graphs."""
     values = findings.observations.values
-    context.tell("profiling the operators", None)
+    context.progress("profiling the operators", None)
     findings.operators = profile(findings.bundle, values, options.runs, options.threads)
     engine = findings.bundle.manifest.engine or DEFAULT_ENGINE
-    findings.reach = reached_in(engine, _macs(findings.bundle), options.threads)
+    findings.reach = reach_by_dtype(engine, _macs(findings.bundle), options.threads)
     if findings.baseline is not None:
-        context.tell("profiling the operators of float32", None)
+        context.progress("profiling the operators of float32", None)
         compared = reference_engine(findings.bundle)
         findings.float_operators = profile(findings.baseline, values, options.runs, options.threads, compared)
     engine = findings.bundle.manifest.engine or DEFAULT_ENGINE

@@ -79,7 +79,7 @@ def _without_cut(
     bundle: Bundle, baseline: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context
 ) -> Phases:
     """Run float32, the bundle with its cut, and the whole float32 graph in bfloat16."""
-    context.tell(f"measuring the phases of {phase.graph} in bfloat16", None)
+    context.progress(f"measuring the phases of {phase.graph} in bfloat16", None)
     graphs = baseline.manifest.graphs
     try:
         plain = _actions(baseline, {}, observations, dict.fromkeys(graphs, ""))
@@ -93,7 +93,7 @@ def _without_cut(
 
 def _with_cut(bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context) -> Phases:
     """Run float32, the bundle itself, and the bundle with the cut."""
-    context.tell(f"measuring the effect of bfloat16 on the phases of {phase.graph}", None)
+    context.progress(f"measuring the effect of bfloat16 on the phases of {phase.graph}", None)
     manifest = bundle.manifest
     note = ""
     with scratch_directory() as scratch:

@@ -155,7 +155,7 @@ def measure(
     current = Candidate("as it is", None, bundle=bundle)
     base = Candidate("float32", None, bundle=baseline) if baseline is not None else None
     for number, candidate in enumerate(tried):
-        context.tell(f"making a candidate: {candidate.name}", None)
+        context.progress(f"making a candidate: {candidate.name}", None)
         if baseline is None or not isinstance(candidate.stage, Transform):
             continue
         try:
@@ -169,7 +169,7 @@ def measure(
     for candidate in candidates:
         if candidate.bundle is None:
             continue
-        context.tell(f"errors of the candidate: {candidate.name}", None)
+        context.progress(f"errors of the candidate: {candidate.name}", None)
         engine = reference_engine(bundle) if candidate is base else ""
         policy = Policy.open(candidate.bundle, engine=engine, threads=threads, seed=0)
         outputs = raw_actions(policy, observations)
@@ -180,6 +180,6 @@ def measure(
             candidate.name, candidate.bundle, policy, [dict(item) for item in observations]
         )
     run_interleaved(
-        [candidate.contestant for candidate in candidates if candidate.contestant], ITERATIONS, 5, context.tell
+        [candidate.contestant for candidate in candidates if candidate.contestant], ITERATIONS, 5, context.progress
     )
     return Comparison(current, base, [candidate for candidate in tried if candidate.bundle is not None])

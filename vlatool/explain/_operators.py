@@ -112,7 +112,7 @@ def raw_actions(policy: Policy, observations: Iterable[Mapping[str, Any]]) -> li
     """
     moments: Iterable[Moment]
     if policy.program.keeps and isinstance(observations, Observations):
-        moments = observations.along()
+        moments = observations.with_history()
     else:
         moments = (Moment(observation, number, begins=True) for number, observation in enumerate(observations))
     actions = []

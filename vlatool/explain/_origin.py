@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.data import recorded_observations, synthetic_observations
+from vlatool.data import recorded_observations, recordings_of, synthetic_observations
 from vlatool.errors import BundleError, VlatoolError
 from vlatool.graph.precision import FLOATS
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage.base import Stage
-from vlatool.stage.build import stage_class, validated
+from vlatool.stage.build import stage_class, stage_from
 from vlatool.stage.run import cache_directory
 
-EVALUATION = "data/evaluation.npz"
 INT8 = (StaticInt8, DynamicInt8)
 
 
@@ -79,7 +78,7 @@ def _stage(name: str, options: Mapping[str, Any]) -> tuple[Stage | None, tuple[s
     kept = {key: value for key, value in options.items() if key in kind.model_fields and key != "calibration"}
     notes = tuple(f"the option {key}: {value} was not adopted" for key, value in options.items() if key not in kept)
     try:
-        return validated(kind, kept, name), notes
+        return stage_from(kind, kept, name), notes
     except VlatoolError as error:
         return None, (*notes, error.message)
 
@@ -132,8 +131,8 @@ def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, 
         return Observations(recorded_observations(bundle, count, data), data.name)
     sources = [candidate for candidate in (bundle, baseline) if candidate is not None]
     for source in sources:
-        if EVALUATION in source.manifest.files:
-            values = recorded_observations(source, count, source.path / EVALUATION)
+        if (held_out := recordings_of(source).evaluation) is not None:
+            values = recorded_observations(source, count, held_out)
             return Observations(values, "recorded observations that calibration has not seen")
     for source in sources:
         if values := recorded_observations(source, count):

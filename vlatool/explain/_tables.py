@@ -14,7 +14,7 @@ from vlatool.explain._origin import command
 from vlatool.machine.host import isa
 from vlatool.machine.instruction_sets import saturates
 from vlatool.measurement.interleaved import latency_measurements, speedup
-from vlatool.measurement.reach import LIKELY, share_of_reach
+from vlatool.measurement.reach import LIKELY_SHARE, share_of_reach
 from vlatool.report import Measurement, Row
 from vlatool.sensitivity.layers import LayerError
 
@@ -194,7 +194,7 @@ def reach_sentence(operators: Sequence[Operator], macs: Mapping[str, int], reach
         f"At the speed of a large product here ({speeds}) its MACs would take {share * total:.3g} of the {total:.3g} ms"
     )
     text += f" ({share:.0%})."
-    if share > LIKELY:
+    if share > LIKELY_SHARE:
         text += " More than all of it: other work slowed the large product down, or the engine leaves work out."
     others: Counter[str] = Counter()
     for operator in operators:

@@ -58,7 +58,7 @@ def sentences(job: Mapping[str, Any], tell: Tell) -> list[str]:
 
 
 def _call(function: str, job: Mapping[str, Any], context: Context) -> Any:
-    return children.call(f"{__name__}:{function}", job, context.tell, "explain", PRELOAD, own=True)
+    return children.call(f"{__name__}:{function}", job, context.progress, "explain", PRELOAD, own=True)
 
 
 def _options_to_json(options: Options) -> dict[str, Any]:

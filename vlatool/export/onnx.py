@@ -14,14 +14,14 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, RecipeError, SourceError, require, require_present
-from vlatool.files.typed import shown
+from vlatool.files.validate import short_repr
 from vlatool.graph.float32_conversion import ROUNDING, describe_conversion, rewrite_as_float32
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.module.edits import is_changed
 from vlatool.module.folding import fold_weights
 from vlatool.module.memory import refuse_kept_values
 from vlatool.module.origin import factory_of
-from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
+from vlatool.module.sharded_weights import graph_weights, stored_modules, takes_shards, weights_on_demand
 from vlatool.module.to_onnx import (
     EXTERNAL_DATA_BYTES,
     IMPORTS,
@@ -38,8 +38,8 @@ from vlatool.runtime.observation import ObservationEncoder, not_finite_text
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context, Transform, source_of
-from vlatool.stage.counted import counted_shares
-from vlatool.stage.finish import carry_over, finish, named
+from vlatool.stage.finish import carry_over, finish, graph_names
+from vlatool.stage.precision_shares import count_shares
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -88,23 +88,23 @@ class ExportOnnx(Transform):
         bundle = source_of(source, self.name())
         check_chunk(bundle.manifest.spec)
         observations = observations_for(bundle, self.samples)
-        expected, graphs = self._exported(bundle, observations, out, context)
+        expected, graphs = self._run_and_export(bundle, observations, out, context)
         gone = {name: rewrite_as_float32(out / graph.file) for name, graph in graphs.items()}
         for name, graph in graphs.items():
-            graphs[name] = replace(graph, precision=counted_shares(out / graph.file, context))
+            graphs[name] = replace(graph, precision=count_shares(out / graph.file, context))
         carry_over(bundle, out)
-        context.tell("checking in ONNX Runtime", None)
+        context.progress("checking in ONNX Runtime", None)
         exported = finish(bundle, out, made_by=self.made_by(), graphs=graphs, observations=observations)
         rounding = max((ROUNDING.get(kind, 0) for types in gone.values() for kind in types), default=0)
         error = self._compare(exported, observations, expected, max(self.tolerance, rounding))
         for name, types in gone.items():
             if types:
-                context.said.append(
+                context.messages.append(
                     f"{name}: {describe_conversion(types)}; its action differs from torch's by up to {error:.2g}"
                 )
         return exported
 
-    def _exported(
+    def _run_and_export(
         self, bundle: Bundle, observations: list[dict[str, Any]], out: Path, context: Context
     ) -> tuple[list[Any], dict[str, Graph]]:
         """Return what torch gives for the observations, and the graphs; no module is in memory afterwards.
@@ -115,15 +115,15 @@ class ExportOnnx(Transform):
         stored = stored_modules(bundle) if is_changed(bundle) and takes_shards(bundle) else None
         modules = stored.modules if stored else load_modules(bundle)
         sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
-        context.tell("running the torch policy", None)
-        with weights_read(stored) if stored else contextlib.nullcontext():
+        context.progress("running the torch policy", None)
+        with weights_on_demand(stored) if stored else contextlib.nullcontext():
             expected = self._actions(bundle, sessions, observations)
             for session in sessions.values():
                 refuse_kept_values(session.module, session.step, session.last_feeds)
         graphs = {}
         for number, (name, session) in enumerate(sessions.items()):
-            context.tell(f"exporting {name}", number / len(sessions))
-            with graph_filled(stored, name) if stored else contextlib.nullcontext():
+            context.progress(f"exporting {name}", number / len(sessions))
+            with graph_weights(stored, name) if stored else contextlib.nullcontext():
                 graphs[name] = self._export(name, session, out, beside=stored is not None)
         return expected, graphs
 
@@ -145,7 +145,7 @@ class ExportOnnx(Transform):
                 with off_the_robot(answered, OF_NOT_FINITE if held else OF_THE_POLICY):
                     return program.run(encoded, finish=action)
             except SourceError as error:
-                texts = [f"{name} {shown(value)}" for name, value in observation.items() if isinstance(value, str)]
+                texts = [f"{name} {short_repr(value)}" for name, value in observation.items() if isinstance(value, str)]
                 asked = f" The policy was asked with {', '.join(texts)}." if texts else ""
                 raise SourceError(error.message + asked, error.fix) from error
 
@@ -177,7 +177,7 @@ class ExportOnnx(Transform):
         largest = 0.0
         policy = Policy.open(exported, threads=1, seed=0)
         for number, (observation, reference) in enumerate(zip(observations, expected, strict=True)):
-            doing = risky(engine_class(policy.engine), f"ran {named(exported.manifest)}")
+            doing = engine_call(engine_class(policy.engine), f"ran {graph_names(exported.manifest)}")
             with doing, off_the_robot(f"observation {number}", OF_THE_GRAPHS):
                 got = policy.infer(observation).outputs[exported.manifest.spec.action.name]
             error = relative_error(got, reference)

@@ -1,6 +1,6 @@
-"""How large what comes from outside may be: every limit by name, and how a person raises one.
+"""Limits on the size of untrusted input, by name, and how a user raises one.
 
-``VLATOOL_LIMITS=golden_bytes=1e9,files=50000`` in the environment raises (or lowers) limits for one process.
+``VLATOOL_LIMITS=golden_bytes=1e9,files=50000`` in the environment changes limits for one process.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import math
 import os
 from dataclasses import dataclass
 
-from vlatool.errors import UsageError, VlatoolError, instead, nearest
+from vlatool.errors import UsageError, VlatoolError, fix_for, suggest
 
-VARIABLE = "VLATOOL_LIMITS"
+LIMITS_VARIABLE = "VLATOOL_LIMITS"
 KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
 
 
@@ -20,9 +20,9 @@ class Limit:
     """One limit.
 
     Args:
-        default: The largest value that is allowed.
-        unit: What is counted: ``bytes``, ``files``, ``levels``, ...
-        what: What the limit is for, as a part of a sentence.
+        default: largest allowed value.
+        unit: unit of the value: ``bytes``, ``files``, ``levels``, ...
+        what: subject of the limit, as a part of a sentence.
     """
 
     default: int
@@ -35,8 +35,8 @@ LIMITS = {
     "files": Limit(10_000, "files", "files of a bundle"),
     "bundle_bytes": Limit(64 * GIB, "bytes", "all recorded files of a bundle together"),
     "graphs": Limit(256, "graphs", "graphs of a bundle"),
-    "json_depth": Limit(64, "levels", "lists and mappings inside each other in a JSON file"),
-    "graph_depth": Limit(100, "levels", "messages inside each other in a graph (a subgraph takes three)"),
+    "json_depth": Limit(64, "levels", "nested lists and mappings in a JSON file"),
+    "graph_depth": Limit(100, "levels", "nested messages in a graph (a subgraph takes three)"),
     "graph_fields": Limit(4_000_000, "fields", "parts of a graph that are gone through in search of weights beside it"),
     "golden_bytes": Limit(256 * MIB, "bytes", "the golden file, unpacked"),
     "golden_steps": Limit(64, "steps", "golden observations in a row"),
@@ -50,7 +50,7 @@ LIMITS = {
     "state_elements": Limit(1 << 27, "elements", "all noise and kept values of a program together"),
     "tokens": Limit(1 << 20, "tokens", "the ids of one text"),
     "yaml_bytes": Limit(256 * KIB, "bytes", "a YAML file: a recipe, gate, profile or policy.yaml"),
-    "yaml_depth": Limit(64, "levels", "lists and mappings inside each other in a YAML file"),
+    "yaml_depth": Limit(64, "levels", "nested lists and mappings in a YAML file"),
     "yaml_nodes": Limit(50_000, "nodes", "values of a YAML file, each alias counted as what it stands for"),
     "target_message_bytes": Limit(32 * MIB, "bytes", "one message of the target of a benchmark"),
     "target_bytes": Limit(256 * MIB, "bytes", "all that the target of a benchmark sends"),
@@ -78,52 +78,52 @@ def limit(name: str) -> int:
         >>> limit("files")
         10000
     """
-    text = os.environ.get(VARIABLE)
-    return _told(text).get(name, LIMITS[name].default) if text else LIMITS[name].default
+    text = os.environ.get(LIMITS_VARIABLE)
+    return _parse_overrides(text).get(name, LIMITS[name].default) if text else LIMITS[name].default
 
 
-def check(name: str, got: int, where: str, error: type[VlatoolError]) -> None:
-    """Refuse more than a limit allows.
+def check_limit(name: str, got: int, where: str, error: type[VlatoolError]) -> None:
+    """Refuse a value above a limit.
 
     Args:
-        name: Of the limit.
-        got: What was found, in the unit of the limit.
-        where: What is too large, as the start of a sentence.
-        error: Type of the error that is raised.
+        name: name of the limit.
+        got: value, in the unit of the limit.
+        where: what has that value, as the start of a sentence.
+        error: class of the error that is raised.
     """
     allowed = limit(name)
     if got > allowed:
         raise error(
             f"{where} has {_number(got)} {LIMITS[name].unit}; the limit '{name}' allows {allowed}.",
-            f"if it is right, raise the limit: {VARIABLE}={name}={_number(got)}",
+            f"if it is right, raise the limit: {LIMITS_VARIABLE}={name}={_number(got)}",
         )
 
 
 def _number(value: int) -> str:
-    """Numbers of thousands of digits are neither readable nor, for Python, printable."""
+    """Return a number as text; thousands of digits are neither readable nor, for Python, printable."""
     return str(value) if value.bit_length() <= 64 else f"more than 2^{value.bit_length() - 1}"
 
 
-def _told(text: str) -> dict[str, int]:
+def _parse_overrides(text: str) -> dict[str, int]:
     limits = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, _, value = part.partition("=")
         if name not in LIMITS:
             raise UsageError(
-                f"{VARIABLE} names the unknown limit '{name}'; {nearest(name, LIMITS)}.", instead(name, LIMITS)
+                f"{LIMITS_VARIABLE} names the unknown limit '{name}'; {suggest(name, LIMITS)}.", fix_for(name, LIMITS)
             )
-        limits[name] = _whole(name, value)
+        limits[name] = _parse_limit(name, value)
     return limits
 
 
-def _whole(name: str, value: str) -> int:
+def _parse_limit(name: str, value: str) -> int:
     try:
         number = float(value)
     except ValueError:
         number = math.nan
     if not 0 <= number < 2**63:
         raise UsageError(
-            f"{VARIABLE} sets {name} to '{value[:40]}'; it must be a number of {LIMITS[name].unit} from 0.",
-            f"write it as {VARIABLE}={name}={LIMITS[name].default}, or leave it out",
+            f"{LIMITS_VARIABLE} sets {name} to '{value[:40]}'; it must be a number of {LIMITS[name].unit} from 0.",
+            f"write it as {LIMITS_VARIABLE}={name}={LIMITS[name].default}, or leave it out",
         )
     return int(value) if value.isdigit() else int(number)

@@ -1,4 +1,4 @@
-"""Who uses an entry of the cache: a process locks what it took from there until it ends."""
+"""Locks on entries of the cache: a process holds a lock on each entry that it uses, until it ends."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-_HELD: dict[str, int] = {}
-"""Path -> descriptor of a directory that this process uses."""
+_LOCKS: dict[str, int] = {}
+"""Path -> descriptor of a directory that this process has locked."""
 
 
-def hold(directory: Path) -> bool:
-    """Lock an entry for this process, until it ends, and note that it was used now.
+def acquire(directory: Path) -> bool:
+    """Take a shared lock on an entry until this process ends, and set the time of its last use.
 
     Returns:
-        False when there is no such directory, or it is being removed.
+        False when the directory does not exist, or is being removed.
     """
     name = os.path.abspath(directory)
     try:
@@ -25,29 +25,29 @@ def hold(directory: Path) -> bool:
         return not isinstance(error, FileNotFoundError | NotADirectoryError)  # too many files are open: unlocked then
     try:
         fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        if not is_at(handle, name):
+        if not is_same_file(handle, name):
             os.close(handle)
             return False
     except OSError:
         os.close(handle)
         return False
     release(directory)
-    _HELD[name] = handle
+    _LOCKS[name] = handle
     with contextlib.suppress(OSError):
         os.utime(handle)
     return True
 
 
 def release(directory: Path) -> None:
-    """Give up the lock of an entry, if this process has one."""
-    handle = _HELD.pop(os.path.abspath(directory), None)
+    """Release the lock on an entry, if this process has one."""
+    handle = _LOCKS.pop(os.path.abspath(directory), None)
     if handle is not None:
         os.close(handle)
 
 
 @contextlib.contextmanager
-def alone(path: Path) -> Iterator[bool]:
-    """Lock a file or directory that is to be removed; gives False while somebody uses it, or when it is gone."""
+def exclusive_lock(path: Path) -> Iterator[bool]:
+    """Lock a file or directory that is to be removed; yields False while another process uses it, or if it is gone."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
@@ -55,7 +55,7 @@ def alone(path: Path) -> Iterator[bool]:
         return
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        got = is_at(handle, os.fspath(path))
+        got = is_same_file(handle, os.fspath(path))
     except OSError:
         got = False
     try:
@@ -64,8 +64,8 @@ def alone(path: Path) -> Iterator[bool]:
         os.close(handle)
 
 
-def is_at(handle: int, path: str) -> bool:
-    """Say whether an open directory is still the one of that name."""
+def is_same_file(handle: int, path: str) -> bool:
+    """Return whether an open file or directory is still the one at that path."""
     with contextlib.suppress(OSError):
         return os.path.samestat(os.fstat(handle), os.lstat(path))
     return False

@@ -1,4 +1,4 @@
-"""Frozen dataclasses as JSON values and back: what processes say to each other, each field held against its type."""
+"""Frozen dataclasses as JSON values and back, with each field checked against its type: messages between processes."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from functools import cache
 from types import NoneType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from vlatool.files.typed import shown
+from vlatool.files.validate import short_repr
 
 T = TypeVar("T")
 NAMES = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}
 
 
 def to_json(value: Any) -> Any:
-    """Return JSON values: a dataclass as a mapping of its fields, tuples as lists."""
+    """Return a value as JSON: a dataclass as a mapping of its fields, tuples as lists."""
     if is_dataclass(value):
         return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
@@ -26,18 +26,18 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(kind: type[T], value: Any, where: str = "message") -> T:
-    """Return what ``to_json`` made of an object of a type: a dataclass, or what its fields may be.
+    """Return the object of a type that ``to_json`` turned into JSON: a dataclass, or a value that a field may have.
 
     Fields are text, numbers, truth values, tuples, mappings by text, further dataclasses, any of these or None, and
-    ``Any``, which is not looked into.
+    ``Any``, which is not checked.
 
     Args:
-        kind: The type.
-        value: JSON values.
-        where: What they are called, for the reason.
+        kind: type of the object.
+        value: JSON value.
+        where: name of the value, for the reason.
 
     Raises:
-        ValueError: with a short reason, when the value is not of that type, or lacks a field or has an unknown one.
+        ValueError: with a short reason, when the value is not of that type, lacks a field, or has an unknown one.
     """
     try:
         return _read(kind, value, where)  # type: ignore[no-any-return]
@@ -61,14 +61,14 @@ def _read(kind: Any, value: Any, where: str) -> Any:
         return {name: _read(inside[1], item, f"{where}.{name}") for name, item in items}
     if type(value) is kind or (kind is float and type(value) is int):
         return kind(value)
-    raise ValueError(f"'{where}' is {shown(value)}, not {NAMES[kind]}")
+    raise ValueError(f"'{where}' is {short_repr(value)}, not {NAMES[kind]}")
 
 
 def _dataclass(kind: Any, value: Any, where: str) -> Any:
     types = _types(kind)
     for name in _mapping(value, where):
         if name not in types:
-            raise ValueError(f"'{where}' has the unknown field {shown(name)}")
+            raise ValueError(f"'{where}' has the unknown field {short_repr(name)}")
     for field in fields(kind):
         if field.name not in value and field.default is MISSING and field.default_factory is MISSING:
             raise ValueError(f"'{where}' lacks '{field.name}'")
@@ -82,13 +82,13 @@ def _types(kind: Any) -> dict[str, Any]:
 
 def _mapping(value: Any, where: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
-        raise ValueError(f"'{where}' is {shown(value)}, not a mapping")
+        raise ValueError(f"'{where}' is {short_repr(value)}, not a mapping")
     return value
 
 
 def _tuple(inside: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple):
-        raise ValueError(f"'{where}' is {shown(value)}, not a list")
+        raise ValueError(f"'{where}' is {short_repr(value)}, not a list")
     if inside == (float, ...) and _are_numbers(value):
         return tuple(map(float, value))
     if inside[-1] is not ... and len(value) != len(inside):
@@ -98,5 +98,5 @@ def _tuple(inside: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
 
 
 def _are_numbers(values: list[Any] | tuple[Any, ...]) -> bool:
-    """Say whether all are numbers: every call of a run is one, so that they are not looked at one by one."""
+    """Return whether all are numbers; long lists of timings are then not converted one by one."""
     return set(map(type, values)) <= {int, float}

@@ -1,4 +1,4 @@
-"""NumPy archives from outside: sizes are checked before anything is unpacked, and no Python object is ever built."""
+"""Untrusted NumPy archives: sizes are checked before anything is unpacked, and no Python object is ever unpickled."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import DataError, VlatoolError
-from vlatool.files.limits import MIB, check
-from vlatool.files.rows import OpenFile, Packed, Plain, Rows
+from vlatool.files.limits import MIB, check_limit
+from vlatool.files.rows import CompressedSource, OpenFile, PlainSource, Rows
 
 Array = NDArray[Any]
-DIRECTORY_BYTES = MIB
-"""Largest table of contents of an archive: twenty thousand names."""
-HEADER_BYTES = 1 << 16
+MAX_DIRECTORY_BYTES = MIB
+"""Largest central directory of an archive: about twenty thousand names."""
+MAX_HEADER_BYTES = 1 << 16
 HEADER = re.compile(
     r"\{\s*'descr':\s*'(?P<descr>[<>=|]?[a-zA-Z]\d{0,9})',\s*'fortran_order':\s*(?P<fortran>True|False),"
     r"\s*'shape':\s*\((?P<shape>(?:\d{1,18},?\s*){0,64})\),?\s*\}\s*"
 )
-BLOCK = MIB
-SAVE = "write it again with np.savez"
-IN_MEMORY = 16 * MIB
-FOREIGN = (
+BLOCK_BYTES = MIB
+SAVE_AGAIN = "write it again with np.savez"
+MAX_IN_MEMORY_BYTES = 16 * MIB
+LIBRARY_ERRORS = (
     OSError, ValueError, TypeError, KeyError, EOFError, NotImplementedError, RuntimeError, MemoryError,
     OverflowError, struct.error, zlib.error, zipfile.BadZipFile, zipfile.LargeZipFile,
 )  # fmt: skip
@@ -46,20 +46,20 @@ def open_npz(
     *,
     where: str = "",
     error: type[VlatoolError] = DataError,
-    fix: str = SAVE,
+    fix: str = SAVE_AGAIN,
 ) -> dict[str, Array]:
     """Return the arrays of an ``.npz`` file by name.
 
     Args:
-        source: A path, or the content of the file.
-        allowed: Name of the limit (``vlatool.files.limits``) on the bytes of all arrays together.
-        where: What the file is called in messages; its path when empty.
-        error: Type of the error that is raised.
-        fix: What is done about a file that cannot be read.
+        source: path, or content of the file.
+        allowed: name of the limit (``vlatool.files.limits``) on the total size of all arrays.
+        where: name of the file in messages; its path when empty.
+        error: class of the error that is raised.
+        fix: remedy for a file that cannot be read.
 
     Raises:
-        DataError: (or ``error``) when the file cannot be read, is no archive of arrays, holds Python objects, or would
-            unpack to more than the limit.
+        DataError: (or ``error``) when the file cannot be read, is not an archive of arrays, holds Python objects, or
+            would unpack to more than the limit.
 
     Example:
         >>> import io
@@ -69,7 +69,7 @@ def open_npz(
         [0, 1, 2]
     """
     where = where or ("the archive" if isinstance(source, bytes) else str(Path(source)))
-    with _foreign_errors(where, error, fix), _archive(source) as archive:
+    with _map_library_errors(where, error, fix), _archive(source) as archive:
         members = _members(archive, allowed, where, error, fix)
         return {name: _array(archive, member, name) for name, member in members.items()}
 
@@ -77,7 +77,7 @@ def open_npz(
 def open_rows(
     path: str | os.PathLike[str],
     allowed: str = "recording_bytes",
-    in_memory: int = IN_MEMORY,
+    in_memory: int = MAX_IN_MEMORY_BYTES,
     free: float | None = None,
 ) -> dict[str, Array | Rows]:
     """Return the arrays of an ``.npz`` file by name, large ones as ``Rows``, which stay on the disk.
@@ -85,20 +85,20 @@ def open_rows(
     The whole file is read once, in blocks: a damaged one is refused here and not later.
 
     Args:
-        path: The file.
-        allowed: Name of the limit on the bytes of all arrays together.
-        in_memory: Bytes of the largest array of numbers that is held in memory. Text, and arrays in Fortran's order, in
+        path: path of the file.
+        allowed: name of the limit on the total size of all arrays.
+        in_memory: size of the largest array of numbers that is held in memory. Text, and arrays in Fortran's order, in
             which a row is scattered, are held in memory whatever their size.
-        free: Bytes of memory that those may take together; None where it is not known.
+        free: bytes of memory that those may take in total; None when unknown.
 
     Raises:
         DataError: as ``open_npz`` does, and when the memory does not suffice.
     """
     where = str(Path(path))
-    with _foreign_errors(where), _archive(path) as archive:
+    with _map_library_errors(where), _archive(path) as archive:
         file = OpenFile.at(path, where)
         members = _members(archive, allowed, where)
-        stay = {name: _stays(archive, member, name, in_memory) for name, member in members.items()}
+        stay = {name: _stays_on_disk(archive, member, name, in_memory) for name, member in members.items()}
         _refuse_beyond(where, sum(member.file_size for name, member in members.items() if not stay[name]), free)
         return {
             name: _rows(archive, member, name, file) if stay[name] else _array(archive, member, name)
@@ -121,18 +121,18 @@ def _archive(source: bytes | str | os.PathLike[str]) -> Iterator[zipfile.ZipFile
 
 
 @contextlib.contextmanager
-def _foreign_errors(where: str, error: type[VlatoolError] = DataError, fix: str = SAVE) -> Iterator[None]:
-    """Map what zipfile, zlib and numpy raise into one sentence for the person."""
+def _map_library_errors(where: str, error: type[VlatoolError] = DataError, fix: str = SAVE_AGAIN) -> Iterator[None]:
+    """Turn what zipfile, zlib and numpy raise into an error of one sentence."""
     try:
         yield
     except VlatoolError:
         raise
-    except FOREIGN as foreign:
-        reason = f"{foreign.strerror}" if isinstance(foreign, OSError) and foreign.strerror else _told(foreign)
+    except LIBRARY_ERRORS as foreign:
+        reason = f"{foreign.strerror}" if isinstance(foreign, OSError) and foreign.strerror else _first_line(foreign)
         raise error(f"{where} cannot be read: {reason}.", fix) from foreign
 
 
-def _told(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
     return (str(error).strip().rstrip(".").splitlines() or [type(error).__name__])[0][:200] or type(error).__name__
 
 
@@ -164,14 +164,15 @@ def _with_small_directory(stream: IO[bytes]) -> IO[bytes]:
         raise ValueError("it is not a zip archive, or its end is missing")
     sizes = [struct.unpack_from("<I", tail, end + 12)[0]]
     if b"PK\6\7" in tail[:end]:
-        sizes = [struct.unpack_from("<Q", tail, at + 40)[0] for at in _all(tail, b"PK\6\6") if at + 48 <= len(tail)]
-    if max(sizes, default=0) > DIRECTORY_BYTES:
-        raise ValueError(f"its table of contents has {max(sizes)} bytes; allowed: {DIRECTORY_BYTES}")
+        starts = (at for at in _find_all(tail, b"PK\6\6") if at + 48 <= len(tail))
+        sizes = [struct.unpack_from("<Q", tail, at + 40)[0] for at in starts]
+    if max(sizes, default=0) > MAX_DIRECTORY_BYTES:
+        raise ValueError(f"its table of contents has {max(sizes)} bytes; allowed: {MAX_DIRECTORY_BYTES}")
     stream.seek(0)
     return stream
 
 
-def _all(text: bytes, part: bytes) -> Iterator[int]:
+def _find_all(text: bytes, part: bytes) -> Iterator[int]:
     at = text.find(part)
     while at >= 0:
         yield at
@@ -179,12 +180,12 @@ def _all(text: bytes, part: bytes) -> Iterator[int]:
 
 
 def _members(
-    archive: zipfile.ZipFile, allowed: str, where: str, error: type[VlatoolError] = DataError, fix: str = SAVE
+    archive: zipfile.ZipFile, allowed: str, where: str, error: type[VlatoolError] = DataError, fix: str = SAVE_AGAIN
 ) -> dict[str, zipfile.ZipInfo]:
     """Return array name -> entry, once the declared sizes are within the limits."""
     entries = archive.infolist()
-    check("arrays", len(entries), where, error)
-    check(allowed, sum(entry.file_size for entry in entries), f"{where}, unpacked,", error)
+    check_limit("arrays", len(entries), where, error)
+    check_limit(allowed, sum(entry.file_size for entry in entries), f"{where}, unpacked,", error)
     members: dict[str, zipfile.ZipInfo] = {}
     for entry in entries:
         name = entry.filename.removesuffix(".npy")
@@ -201,31 +202,31 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Array
         shape, fortran, dtype, _ = _checked_header(stream, entry, name)
         array = np.empty(math.prod(shape), dtype)
         _fill(stream, array, name)
-    return _sound(array, name).reshape(shape, order="F" if fortran else "C")
+    return _check_values(array, name).reshape(shape, order="F" if fortran else "C")
 
 
-def _stays(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str, in_memory: int) -> bool:
-    """Say whether an array stays on the disk: it is large, and its rows lie one after the other."""
+def _stays_on_disk(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str, in_memory: int) -> bool:
+    """Return whether an array stays on the disk: it is large, and its rows are contiguous."""
     with archive.open(entry) as stream:
         shape, fortran, dtype, _ = _checked_header(stream, entry, name)
     return bool(shape and shape[0]) and not fortran and dtype.kind not in "SU" and entry.file_size > in_memory
 
 
 def _rows(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str, file: OpenFile) -> Rows:
-    """Return the rows of an array once all of its bytes were read and found sound."""
+    """Return the rows of an array, after a pass over all of its bytes found them valid."""
     with archive.open(entry) as stream:
         shape, _, dtype, start = _checked_header(stream, entry, name)
-        while block := stream.read(BLOCK):  # the end compares the checksum
+        while block := stream.read(BLOCK_BYTES):  # the end compares the checksum
             if dtype.kind == "b":
-                _sound(np.frombuffer(block, np.bool_), name)
+                _check_values(np.frombuffer(block, np.bool_), name)
     where, size = f"'{name}' in {file.where}", entry.file_size - start
     if entry.compress_type == zipfile.ZIP_STORED:
-        return Rows(Plain(file, _data_start(file, entry) + start), shape, dtype, where)
-    return Rows(Packed(file, entry.filename, start, size), shape, dtype, where)
+        return Rows(PlainSource(file, _data_start(file, entry) + start), shape, dtype, where)
+    return Rows(CompressedSource(file, entry.filename, start, size), shape, dtype, where)
 
 
 def _data_start(file: OpenFile, entry: zipfile.ZipInfo) -> int:
-    """Return where an entry's data begin: after its local header, with a name and a field of sizes of their own."""
+    """Return the offset of an entry's data: after its local header, whose name and extra field have their own sizes."""
     header = bytearray(30)
     file.read_into(memoryview(header), entry.header_offset)
     name, extra = struct.unpack_from("<HH", header, 26)
@@ -254,8 +255,8 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     if start[:6] != b"\x93NUMPY" or not size:
         raise ValueError("an entry is not an array in the .npy format 1 or 2")
     length = int.from_bytes(stream.read(size), "little")
-    if length > HEADER_BYTES:
-        raise ValueError(f"the header of an array has {length} bytes; allowed: {HEADER_BYTES}")
+    if length > MAX_HEADER_BYTES:
+        raise ValueError(f"the header of an array has {length} bytes; allowed: {MAX_HEADER_BYTES}")
     match = HEADER.fullmatch(stream.read(length).decode("latin-1"))
     if match is None:
         raise ValueError("the header of an array is not one of plain numbers or text")
@@ -268,7 +269,7 @@ def _fill(stream: IO[bytes], array: Array, name: str) -> None:
     view = array.view(np.uint8).data if array.size else memoryview(b"")
     done = 0
     while done < len(view):
-        block = stream.read(min(BLOCK, len(view) - done))
+        block = stream.read(min(BLOCK_BYTES, len(view) - done))
         if not block:
             raise ValueError(f"'{name}' ends early")
         view[done : done + len(block)] = block
@@ -277,8 +278,8 @@ def _fill(stream: IO[bytes], array: Array, name: str) -> None:
         raise ValueError(f"'{name}' has more bytes than its shape")
 
 
-def _sound(array: Array, name: str) -> Array:
-    """Return the array in this machine's byte order; refuse bytes that are no value of their dtype."""
+def _check_values(array: Array, name: str) -> Array:
+    """Return the array in native byte order; refuse bytes that are not a valid value of their dtype."""
     native = array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
     if native.dtype.kind == "U" and native.size:
         codes = native.view(np.uint32)

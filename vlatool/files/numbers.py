@@ -1,4 +1,4 @@
-"""Numbers that people write in YAML: ``yes`` and ``true`` are none, although Python counts them as 1."""
+"""Numbers in YAML: ``yes`` and ``true`` are not numbers, although Python treats True as 1."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ class Numeric(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _truth_is_no_number(cls, value: Any, info: ValidationInfo) -> Any:
-        if _has_truth(value) and _numbers_alone(cls.model_fields[info.field_name or ""].annotation):
+    def _refuse_booleans(cls, value: Any, info: ValidationInfo) -> Any:
+        if _has_boolean(value) and _takes_only_numbers(cls.model_fields[info.field_name or ""].annotation):
             raise PydanticCustomError("truth", "Input should be a number, not a truth value")
         return value
 
 
-def _has_truth(value: Any) -> bool:
+def _has_boolean(value: Any) -> bool:
     parts = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else (value,)
     return any(isinstance(part, bool) for part in parts)
 
 
-def _numbers_alone(annotation: Any) -> bool:
-    """Say whether a field takes numbers and no truth values; a model inside of it looks after its own fields."""
+def _takes_only_numbers(annotation: Any) -> bool:
+    """Return whether a field takes numbers and no truth values; a nested model checks its own fields."""
     leaves = set(_leaves(annotation))
     return bool(leaves & {int, float}) and not leaves & {bool, Any}
 

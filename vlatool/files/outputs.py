@@ -1,4 +1,4 @@
-"""Where nothing may be written: over what somebody needs, or did not get from vlatool."""
+"""Checks on where output may be written: never over an input, or over something that vlatool did not write."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from vlatool.errors import OutputError
+from vlatool.files.ownership import LEDGER, refuse_foreign
 from vlatool.files.printable import file_of
-from vlatool.files.written import LEDGER, refuse_foreign
 
 RECIPE = "recipe.yaml"
-WRITTEN = (LEDGER, "manifest.json", "report.json")
-"""Names that tell of a directory which a program wrote: another file in it would make it another one."""
+MARKERS = (LEDGER, "manifest.json", "report.json")
+"""Names of files that mark a directory as written by a program, into which no other file is written."""
 BUNDLE, REPORT = "a bundle", "a report"
 KINDS = {BUNDLE: ("manifest.json", "manifest.sha256"), REPORT: ("report.json",)}
-"""What a directory that vlatool wrote is -> the files that all of its kind hold; the first that fits it is."""
+"""Kind of a directory that vlatool wrote -> files that each of that kind has; the first match counts."""
 SCRATCH = re.compile(r"vlatool-(?P<process>\d+)-\w{8}")
-"""What a folder for temporary files is called."""
-FULL = {
+"""Name of a folder for temporary files."""
+DISK_FULL = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
     errno.EFBIG: "a file would be larger than the limit on file sizes",
 }
-REFUSED = {
+WRITE_ERRORS = {
     errno.EROFS: ("the file system is read-only", "write elsewhere"),
     errno.EACCES: ("permission denied", "write elsewhere, or change the permissions of the directory"),
     errno.ENAMETOOLONG: ("the name is too long", "choose a shorter one"),
@@ -36,29 +36,29 @@ REFUSED = {
     errno.EBUSY: ("it is in use as a file system", "choose another output"),
     errno.ENOENT: ("nothing can be made there, or it was removed meanwhile", "choose another output"),
 }
-"""What the operating system says of a place -> why nothing is written there, and what to do about an output."""
-FREE, LARGER = "free some space, or write elsewhere", "raise the limit (ulimit -f)"
+"""Error of the operating system -> why nothing can be written there, and the fix."""
+FREE_SPACE, RAISE_LIMIT = "free some space, or write elsewhere", "raise the limit (ulimit -f)"
 OTHER_CACHE = "keep the cache elsewhere: VLATOOL_CACHE=DIR"
 OTHER_SCRATCH = "free some space, or name another directory: TMPDIR=DIR"
 EXISTS = "choose another output, or pass --force to replace it"
 
 
 def kind_of(directory: Path) -> str:
-    """Return what a directory that vlatool wrote is: ``BUNDLE``, ``REPORT``, or nothing for all others."""
+    """Return the kind of a directory that vlatool wrote: ``BUNDLE``, ``REPORT``, or empty for all others."""
     fits = (kind for kind, names in KINDS.items() if all((directory / name).is_file() for name in names))
     return next(fits, "")
 
 
 def refuse_replacing(
-    final: Path, *, force: bool, further: Mapping[str, Path] | None = None, kind: str | None = None
+    final: Path, *, force: bool, protected: Mapping[str, Path] | None = None, kind: str | None = None
 ) -> None:
-    """Refuse a place where something is that may not be replaced.
+    """Refuse a path at which something exists that must not be replaced.
 
     Args:
-        final: Where a directory is to be written.
-        force: Whether a directory that vlatool wrote may be replaced.
-        further: Directories that are never replaced, beside the current and the home directory, by what they are.
-        kind: What is to be written, as ``kind_of`` says it; None where that is not known yet.
+        final: path at which a directory is to be written.
+        force: whether a directory that vlatool wrote may be replaced.
+        protected: description -> path of further directories that are never replaced.
+        kind: kind of what is to be written, as ``kind_of`` returns it; None when not known yet.
 
     Raises:
         OutputError: naming what is in the way.
@@ -68,8 +68,8 @@ def refuse_replacing(
         return
     if final.is_symlink():
         raise OutputError(f"{final} is a link; nothing is replaced through it.", "choose another output")
-    for name, place in {**_dear(), **(further or {})}.items():
-        if Path(os.path.realpath(place)).is_relative_to(final.resolve()):
+    for name, path in {**_protected_directories(), **(protected or {})}.items():
+        if Path(os.path.realpath(path)).is_relative_to(final.resolve()):
             raise OutputError(f"{final} is {name}, or holds it.", "name a directory for the output alone")
     if not force:
         raise OutputError(f"{final} exists already.", EXISTS)
@@ -77,57 +77,57 @@ def refuse_replacing(
         raise OutputError(f"{final} is not a directory, so --force does not replace it.", "choose another output")
     if os.path.ismount(final):
         raise OutputError(f"{final} is a file system of its own.", "name a directory on it")
-    there = kind_of(final)
-    if kind is not None and there and there != kind:
+    existing = kind_of(final)
+    if kind is not None and existing and existing != kind:
         instead = f", not {kind}" if kind else " and nothing of that is to be written"
-        raise OutputError(f"{final}: it is {there}{instead}.", "give another -o, or remove it yourself")
+        raise OutputError(f"{final}: it is {existing}{instead}.", "give another -o, or remove it yourself")
     refuse_foreign(final)
 
 
-def _dear() -> dict[str, Path]:
-    """Return directories that are never replaced, and neither is what holds them."""
-    places = {}
+def _protected_directories() -> dict[str, Path]:
+    """Return directories that are never replaced, nor is any directory that contains them."""
+    directories = {}
     with contextlib.suppress(OSError):  # it may be gone
-        places["the current directory"] = Path.cwd()
+        directories["the current directory"] = Path.cwd()
     with contextlib.suppress(RuntimeError):
-        places["the home directory"] = Path.home()
-    return places
+        directories["the home directory"] = Path.home()
+    return directories
 
 
 def refuse_inputs(final: Path, inputs: Iterable[str | os.PathLike[str] | None]) -> None:
-    """Refuse an output that is an input of the command, holds one, or lies in one that vlatool wrote.
+    """Refuse an output that is an input of the command, contains one, or lies in one that vlatool wrote.
 
-    A place in the directory of a policy may be written to, and the recipe that an output holds may be its input: it was
-    read before, and is written again.
+    Output inside the directory of a policy is allowed, and so is a recipe in the output as input: it was read before,
+    and is written again.
 
     Args:
-        final: Where something is to be written.
-        inputs: What the command reads, as a person names it: files, directories, ``path.py:make``; None and names of
-            things that are no files are passed over.
+        final: path of the output.
+        inputs: what the command reads, as the user wrote it: files, directories, ``path.py:make``; None and names that
+            are not files are ignored.
 
     Raises:
         OutputError: naming the input.
     """
-    place = Path(os.path.realpath(final))
+    output = Path(os.path.realpath(final))
     for named in filter(None, map(str, (item for item in inputs if item is not None))):
         file = next((item for item in (named, named.rpartition(":")[0]) if item and os.path.exists(item)), None)
         if file is None:
             continue
         source = Path(os.path.realpath(file))
-        if source.is_relative_to(place) and source != place / RECIPE:
-            what = "is an input of this command" if source == place else f"holds {named}, an input of this command"
+        if source.is_relative_to(output) and source != output / RECIPE:
+            what = "is an input of this command" if source == output else f"holds {named}, an input of this command"
             raise OutputError(f"{final} {what}.", "name a directory for the output alone")
-        if source.is_dir() and place.is_relative_to(source) and any((source / name).exists() for name in WRITTEN):
+        if source.is_dir() and output.is_relative_to(source) and any((source / name).exists() for name in MARKERS):
             raise OutputError(f"{final} lies in {named}, an input of this command.", f"name a directory beside {named}")
 
 
 @contextlib.contextmanager
 def output_errors(final: Path, *, cache: bool = False) -> Iterator[None]:
-    """Map the operating system's refusals to write into one sentence for the person, which names the place.
+    """Turn the operating system's errors of writing into an error of one sentence that names the output.
 
     Args:
-        final: What is written.
-        cache: Whether it lies in vlatool's cache, so that another output would not help.
+        final: path of the output.
+        cache: whether it lies in vlatool's cache, so that another output would not help.
 
     Raises:
         OutputError: for a full disk, unless the error names a file elsewhere, and for what is wrong with this place.
@@ -136,30 +136,30 @@ def output_errors(final: Path, *, cache: bool = False) -> Iterator[None]:
         yield
     except OSError as error:
         number = error.errno or 0
-        reason, remedy = (FULL[number], FREE) if number in FULL else REFUSED.get(number, ("", ""))
-        named = Path(os.path.abspath(file_of(error) or "-"))
-        drafts = any(part.startswith(f".{final.name}.") for part in named.parts)
-        ours = drafts or named.is_relative_to(final) or final.is_relative_to(named)
-        lost = number == errno.ENOENT and not final.is_relative_to(named) and _draft_of(named, final).exists()
-        if not reason or lost or not (ours or (number in FULL and not file_of(error))):
+        reason, remedy = (DISK_FULL[number], FREE_SPACE) if number in DISK_FULL else WRITE_ERRORS.get(number, ("", ""))
+        mentioned = Path(os.path.abspath(file_of(error) or "-"))
+        drafts = any(part.startswith(f".{final.name}.") for part in mentioned.parts)
+        ours = drafts or mentioned.is_relative_to(final) or final.is_relative_to(mentioned)
+        lost = number == errno.ENOENT and not final.is_relative_to(mentioned) and _draft_of(mentioned, final).exists()
+        if not reason or lost or not (ours or (number in DISK_FULL and not file_of(error))):
             raise
         what = ""
         if in_scratch(final):
             what, remedy = "temporary files: ", OTHER_SCRATCH
         elif cache:
             free = "free some space there (vlatool cache prune), or "
-            what, remedy = "to the cache: ", f"{free if number in FULL else ''}{OTHER_CACHE}"
-        remedy = LARGER if number == errno.EFBIG else remedy
+            what, remedy = "to the cache: ", f"{free if number in DISK_FULL else ''}{OTHER_CACHE}"
+        remedy = RAISE_LIMIT if number == errno.EFBIG else remedy
         raise OutputError(f"Cannot write {what}{final}: {reason}.", remedy) from error
 
 
 def _draft_of(named: Path, final: Path) -> Path:
-    """Return the draft of an output in which a path lies; the path itself where it lies in none."""
-    drafts = (place for place in (named, *named.parents) if place.name.startswith(f".{final.name}."))
+    """Return the draft of an output that contains a path; the path itself where there is none."""
+    drafts = (path for path in (named, *named.parents) if path.name.startswith(f".{final.name}."))
     return next(drafts, named)
 
 
 def in_scratch(path: Path) -> bool:
-    """Say whether a path is one of the temporary files of ``vlatool.files.scratch``, or lies in their folder."""
+    """Return whether a path is a scratch directory of ``vlatool.files.scratch``, or lies in one."""
     home = Path(tempfile.gettempdir())
-    return any(place.parent == home and SCRATCH.fullmatch(place.name) for place in (path, *path.parents))
+    return any(part.parent == home and SCRATCH.fullmatch(part.name) for part in (path, *path.parents))

@@ -1,4 +1,4 @@
-"""Text from elsewhere, such as names in a manifest or what a target says, as it may stand on a terminal."""
+"""Untrusted text, such as names in a manifest or output of a target, made safe for a terminal."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import errno
 import re
 import unicodedata
 
-HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
+HIDDEN_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 """Unicode categories that move the cursor, change colours or the order of letters, or cannot be encoded."""
-KEPT = "\n\t\u200d\u00ad"
-TOLD = 2000
-"""Characters of what foreign code says that are shown."""
+ALLOWED_CHARACTERS = "\n\t\u200d\u00ad"
+MAX_CHARACTERS = 2000
+"""Characters of a foreign message that are shown."""
 
 
 def printable(text: str) -> str:
-    r"""Return a text in which control characters are written out.
+    r"""Return a text in which control characters are escaped.
 
     Example:
         >>> printable("a\x1b[2Jb")
@@ -22,7 +22,7 @@ def printable(text: str) -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join(_written(character) for character in text)
+    return "".join(_escape(character) for character in text)
 
 
 def one_line(text: str, longest: int = 400) -> str:
@@ -30,21 +30,21 @@ def one_line(text: str, longest: int = 400) -> str:
     return " ".join(printable(text[: 4 * longest]).split())[:longest]
 
 
-def shortened(text: str, longest: int = TOLD) -> str:
-    """Return the beginning of a text that is too long, and how long it is; other texts as they are.
+def truncate(text: str, longest: int = MAX_CHARACTERS) -> str:
+    """Return a text as it is, or the beginning of one that is too long, with its length.
 
     Example:
-        >>> shortened("x" * 5000, 3)
+        >>> truncate("x" * 5000, 3)
         'xxx... (5,000 characters)'
     """
     return text if len(text) <= longest else f"{text[:longest]}... ({len(text):,} characters)"
 
 
-def without_password(text: str) -> str:
-    """Return an address of a database, or an option with one, without its password; other texts as they are.
+def mask_passwords(text: str) -> str:
+    """Return the address of a database, or an option with one, with its passwords masked; other texts as they are.
 
     Example:
-        >>> without_password("--study=postgresql://me:secret@host/trials?sslpassword=other")
+        >>> mask_passwords("--study=postgresql://me:secret@host/trials?sslpassword=other")
         '--study=postgresql://me:***@host/trials?sslpassword=***'
     """
     for secret in sorted(secrets_in(text), key=len, reverse=True):
@@ -53,9 +53,9 @@ def without_password(text: str) -> str:
 
 
 def secrets_in(text: str) -> set[str]:
-    """Return what of an address is said to one reader alone: what is between the user and the last ``@``, and queries.
+    """Return the secrets in an address: what is between the user and the last ``@``, and the values of its query.
 
-    An address may be malformed: what cannot be a port counts as a password.
+    The address may be malformed: what cannot be a port counts as a password.
     """
     found = re.match(r"(?:-+[\w-]+=)?[A-Za-z][\w+.-]*:(?://?)?(?P<rest>.*)", text, re.DOTALL)
     if found is None or ("://" not in text and "@" not in text):
@@ -70,29 +70,29 @@ def secrets_in(text: str) -> set[str]:
 
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Errors of a place that takes no more."""
+"""Errors of a disk without space."""
 
 
 def file_of(error: OSError) -> str:
-    """Return the file that an error of the operating system is about; nothing where it names none.
+    """Return the file that an error of the operating system names, else nothing.
 
-    A copy names two, first what is read, and it is the other one for which there is no room.
+    A copy names two, the source first; where space is lacking, the second one matters.
     """
     named = error.filename2 if error.errno in NO_ROOM and error.filename2 is not None else error.filename
     return "" if named is None else str(named)
 
 
-def message_of(error: BaseException, longest: int = TOLD) -> str:
-    """Return the text of an exception of somebody else's class, shortened; the class may fail to have one."""
+def message_of(error: BaseException, longest: int = MAX_CHARACTERS) -> str:
+    """Return the text of an exception of a foreign class, truncated; its ``__str__`` may fail."""
     try:
-        return shortened(str(error), longest).encode("utf-8", "replace").decode()
+        return truncate(str(error), longest).encode("utf-8", "replace").decode()
     except KeyboardInterrupt:
         raise
     except BaseException as another:  # the seam: it is code of the user
-        return f"(its text cannot be told: {type(another).__name__})"
+        return f"(its text cannot be read: {type(another).__name__})"
 
 
-def _written(character: str) -> str:
-    if character in KEPT or unicodedata.category(character) not in HIDDEN:
+def _escape(character: str) -> str:
+    if character in ALLOWED_CHARACTERS or unicodedata.category(character) not in HIDDEN_CATEGORIES:
         return character
     return character.encode("unicode_escape", "surrogatepass").decode("ascii")

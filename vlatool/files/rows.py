@@ -1,4 +1,4 @@
-"""A large array of an ``.npz`` file that stays on the disk: rows are read as they are asked for."""
+"""Large arrays of an ``.npz`` file that stay on the disk: rows are read on request."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from vlatool.errors import DataError
 
 Array = NDArray[Any]
-BLOCK = 1 << 22
-"""Bytes that are looked at together."""
-REWINDS = 2
-"""How often a packed array is unpacked from its start before it is kept unpacked."""
+BLOCK_BYTES = 1 << 22
+"""Bytes that are read at a time."""
+MAX_REWINDS = 2
+"""Number of times a compressed array is decompressed from its start before it is stored decompressed."""
 
 
 class OpenFile:
-    """A file that stays open, whatever its name leads to later, as long as somebody reads from it."""
+    """A file that stays open as long as it is referenced, whatever happens to its path."""
 
     def __init__(self, handle: int, where: str) -> None:
         self.handle = handle
@@ -38,7 +38,7 @@ class OpenFile:
         return cls(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), where or str(Path(path)))
 
     def read_into(self, buffer: memoryview, at: int) -> int:
-        """Fill a buffer from a place in the file; return the bytes that there were."""
+        """Fill a buffer from an offset in the file; return the number of bytes read."""
         done = 0
         while done < len(buffer) and (count := os.preadv(self.handle, [buffer[done:]], at + done)):
             done += count
@@ -46,7 +46,7 @@ class OpenFile:
 
 
 class _Stream(io.RawIOBase):
-    """An open file with a position of its own, which no other reader and no child process moves."""
+    """An open file with its own position, which no other reader and no child process moves."""
 
     def __init__(self, file: OpenFile) -> None:
         self._file = file
@@ -73,18 +73,18 @@ class _Stream(io.RawIOBase):
 
 
 class Source(Protocol):
-    """Where the bytes of an array are."""
+    """Source of the bytes of an array."""
 
     def read_into(self, buffer: memoryview, at: int) -> int:
-        """Fill a buffer with the bytes from a place in the array; return how many there were."""
+        """Fill a buffer from an offset in the array; return the number of bytes read."""
 
 
-class Plain:
-    """An array that lies unpacked in a file.
+class PlainSource:
+    """An uncompressed array in a file.
 
     Args:
-        file: Where it lies.
-        start: Bytes before its first element.
+        file: the file.
+        start: offset of its first element.
     """
 
     def __init__(self, file: OpenFile, start: int) -> None:
@@ -92,18 +92,18 @@ class Plain:
         self._start = start
 
     def read_into(self, buffer: memoryview, at: int) -> int:
-        """Fill a buffer with the bytes from a place in the array; return how many there were."""
+        """Fill a buffer from an offset in the array; return the number of bytes read."""
         return self._file.read_into(buffer, self._start + at)
 
 
-class Packed:
-    """An array that is deflated: unpacked while it is read in order, into a file without a name when it is not.
+class CompressedSource:
+    """A deflated array: decompressed while it is read in order, and into an anonymous file when it is not.
 
     Args:
-        file: The archive.
-        entry: Name of the entry.
-        start: Bytes of the array's header.
-        size: Bytes of its elements.
+        file: the archive.
+        entry: name of the entry.
+        start: size of the array's header in bytes.
+        size: size of its elements in bytes.
     """
 
     def __init__(self, file: OpenFile, entry: str, start: int, size: int) -> None:
@@ -111,18 +111,18 @@ class Packed:
         self._stream: Any = None
         self._at = 0
         self._rewinds = 0
-        self._plain: Plain | None = None
+        self._plain: PlainSource | None = None
 
     def read_into(self, buffer: memoryview, at: int) -> int:
-        """Fill a buffer with the bytes from a place in the array; return how many there were."""
+        """Fill a buffer from an offset in the array; return the number of bytes read."""
         if self._stream is None or at < self._at:
             self._rewind()
         if self._plain is not None:
             return self._plain.read_into(buffer, at)
-        while self._at < at and (skipped := self._stream.read(min(BLOCK, at - self._at))):
+        while self._at < at and (skipped := self._stream.read(min(BLOCK_BYTES, at - self._at))):
             self._at += len(skipped)
         done = 0
-        while done < len(buffer) and (block := self._stream.read(min(BLOCK, len(buffer) - done))):
+        while done < len(buffer) and (block := self._stream.read(min(BLOCK_BYTES, len(buffer) - done))):
             buffer[done : done + len(block)] = block
             done += len(block)
         self._at += done
@@ -136,63 +136,63 @@ class Packed:
         self._stream.read(self._start)
         self._at = 0
         self._rewinds += 1
-        if self._rewinds > REWINDS:
-            self._plain = self._unpacked()
+        if self._rewinds > MAX_REWINDS:
+            self._plain = self._unpack()
 
-    def _unpacked(self) -> Plain:
+    def _unpack(self) -> PlainSource:
         handle, name = tempfile.mkstemp(prefix="vlatool-rows-")
         os.unlink(name)
         kept = OpenFile(handle, self._file.where)
         try:
-            while block := self._stream.read(BLOCK):
+            while block := self._stream.read(BLOCK_BYTES):
                 left = memoryview(block)
-                while left:  # a disk that is nearly full takes a part
+                while left:  # a disk that is nearly full accepts a part
                     left = left[os.write(handle, left) :]
         except OSError as error:
             raise DataError(
-                f"{self._file.where} is packed and is read out of order, for which {Path(name).parent} would need "
+                f"{self._file.where} is compressed and is read out of order, for which {Path(name).parent} would need "
                 f"{self._size / 1e6:,.0f} MB: {error.strerror}.",
                 "write it with np.savez instead of np.savez_compressed, or set TMPDIR to a place with more room",
             ) from error
-        return Plain(kept, 0)
+        return PlainSource(kept, 0)
 
 
-class Chosen:
-    """Some rows of an array, as if they were all that there are.
+class RowSubset:
+    """A subset of the rows of an array.
 
     Args:
-        source: Where the array is.
-        places: Number of each row in it, ascending.
-        row: Bytes of a row.
+        source: source of the array.
+        indices: index of each row, ascending.
+        row: size of a row in bytes.
     """
 
-    def __init__(self, source: Source, places: NDArray[np.intp], row: int) -> None:
-        self._source, self._places, self._row = source, places, row
+    def __init__(self, source: Source, indices: NDArray[np.intp], row: int) -> None:
+        self._source, self._indices, self._row = source, indices, row
 
     def read_into(self, buffer: memoryview, at: int) -> int:
-        """Fill a buffer with the bytes from the start of one of the rows; return how many there were."""
+        """Fill a buffer from the start of a row; return the number of bytes read."""
         done = 0
         first = at // self._row
-        for place in self._places[first : first + math.ceil(len(buffer) / self._row)]:
+        for index in self._indices[first : first + math.ceil(len(buffer) / self._row)]:
             part = buffer[done : done + self._row]
-            done += self._source.read_into(part, int(place) * self._row)
+            done += self._source.read_into(part, int(index) * self._row)
         return done
 
 
 class Rows:
-    """An array on the disk whose first axis counts samples; what is asked for is read, and nothing is kept.
+    """An array on the disk whose first axis counts samples; rows are read on request, and not cached.
 
     Args:
-        source: Where its bytes are, in C order.
-        shape: With the axis of samples first.
-        dtype: As stored; rows come in this machine's byte order.
-        where: What it is called in messages.
+        source: source of its bytes, in C order.
+        shape: shape, with the axis of samples first.
+        dtype: dtype as stored; rows are returned in native byte order.
+        where: name of the array in messages.
 
     Example:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "a.bin"
         >>> _ = path.write_bytes(np.arange(6, dtype=np.int16).tobytes())
-        >>> rows = Rows(Plain(OpenFile.at(path), 0), (3, 2), np.dtype(np.int16), "a")
+        >>> rows = Rows(PlainSource(OpenFile.at(path), 0), (3, 2), np.dtype(np.int16), "a")
         >>> len(rows), rows[1].tolist(), rows[[0, 2]].tolist()
         (3, [2, 3], [[0, 1], [4, 5]])
     """
@@ -218,11 +218,11 @@ class Rows:
         return self.shape[0]
 
     def __getitem__(self, at: int | Sequence[int]) -> Array:
-        """Return one row, or the rows at several places, as an array in memory.
+        """Return one row, or the rows at several indices, as an array in memory.
 
         Raises:
-            IndexError: where there is no row.
-            DataError: when the file became shorter since it was opened.
+            IndexError: when an index is out of range.
+            DataError: when the file has become shorter since it was opened.
         """
         if isinstance(at, Sequence):
             return np.stack([self[index] for index in at]) if at else np.empty((0, *self.shape[1:]), self.dtype)
@@ -243,29 +243,29 @@ class Rows:
         return array.astype(self.dtype, copy=False)
 
     def only(self, chosen: NDArray[np.bool_]) -> Rows:
-        """Return the rows that are chosen, which stay on the disk too.
+        """Return the rows of a mask, which stay on the disk, too.
 
         Args:
-            chosen: (N,) of each row.
+            chosen: (N,) mask of the rows.
         """
-        places = np.flatnonzero(chosen)
+        indices = np.flatnonzero(chosen)
         row = math.prod(self.shape[1:]) * self._stored.itemsize
-        return Rows(Chosen(self._source, places, row), (len(places), *self.shape[1:]), self._stored, self.where)
+        return Rows(RowSubset(self._source, indices, row), (len(indices), *self.shape[1:]), self._stored, self.where)
 
     def without_second_axis(self) -> Rows:
-        """Return the same rows where each has a further axis of one element in front."""
+        """Return the same rows without their second axis, which has one element."""
         return Rows(self._source, (self.shape[0], *self.shape[2:]), self._stored, self.where)
 
 
 def blocks(values: Array | Rows) -> Iterator[tuple[int, Array]]:
-    """Yield the number of a first row and rows from there on, a few megabytes at a time.
+    """Yield the index of a first row and the rows from there on, a few megabytes at a time.
 
     Example:
         >>> [(first, block.tolist()) for first, block in blocks(np.arange(3))]
         [(0, [0, 1, 2])]
     """
     row = math.prod(values.shape[1:]) * values.dtype.itemsize
-    step = max(1, BLOCK // max(1, row))
+    step = max(1, BLOCK_BYTES // max(1, row))
     for first in range(0, len(values), step):
         if isinstance(values, Rows):
             yield first, values.read(first, min(step, len(values) - first))

@@ -1,4 +1,4 @@
-"""Places that a person never sees: folders for temporary files, and other names for what errors say of them."""
+"""Temporary directories, and errors that do not expose their paths to the user."""
 
 from __future__ import annotations
 
@@ -11,83 +11,83 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vlatool.errors import OutputError, VlatoolError
-from vlatool.files.locks import alone
-from vlatool.files.outputs import FULL, OTHER_SCRATCH, SCRATCH, in_scratch
+from vlatool.files.locks import exclusive_lock
+from vlatool.files.outputs import DISK_FULL, OTHER_SCRATCH, SCRATCH, in_scratch
 from vlatool.files.printable import file_of
 
-ROOM = 1 << 20
-"""Bytes that are free on a disk that is not full."""
+MIN_FREE_BYTES = 1 << 20
+"""Free bytes below which a disk counts as full."""
 
 
 @contextlib.contextmanager
-def named_as(place: Path, name: str, itself: str = "") -> Iterator[None]:
-    """Let no error that leaves this block name a place, of this process, a child or a library that is quoted.
+def rename_in_errors(path: Path, name: str, itself: str = "") -> Iterator[None]:
+    """Replace a path in the errors that leave this block, of this process, of a child or of a library.
 
     Args:
-        place: A directory.
-        name: What it is called for a person: a path, or nothing where its files are named from it on.
-        itself: What the directory alone is called; ``name`` when empty.
+        path: directory.
+        name: what replaces its path: another path, or empty to name its files relative to it.
+        itself: what replaces the directory itself; ``name`` when empty.
     """
     try:
         yield
     except VlatoolError as error:
-        error.message, error.fix = (_renamed(text, place, name, itself) for text in (error.message, error.fix))
+        error.message, error.fix = (_replace_path(text, path, name, itself) for text in (error.message, error.fix))
         raise
     except OSError as error:
         for which in ("filename", "filename2"):
             if isinstance(file := getattr(error, which), str | os.PathLike):
-                setattr(error, which, _renamed(os.fspath(file), place, name, itself))
+                setattr(error, which, _replace_path(os.fspath(file), path, name, itself))
         raise
 
 
-def _renamed(text: str, place: Path, name: str, itself: str) -> str:
-    for written in dict.fromkeys((os.path.realpath(place), str(place))):
+def _replace_path(text: str, path: Path, name: str, itself: str) -> str:
+    for written in dict.fromkeys((os.path.realpath(path), str(path))):
         text = text.replace(f"{written}/", f"{name}/" if name else "").replace(written, itself or name)
     return text
 
 
 @contextlib.contextmanager
 def scratch_directory() -> Iterator[Path]:
-    """Yield an empty directory for temporary files, and remove it with all that is in it; errors name its files alone.
+    """Yield an empty directory for temporary files and remove it afterwards; errors name its files without their path.
 
-    Where the process is killed, the next one that has such a directory removes it.
+    If the process is killed, the next one that creates such a directory removes it.
 
     Raises:
-        OutputError: when the disk that it is on becomes full.
-        OSError: when it cannot be made.
+        OutputError: when its disk becomes full.
+        OSError: when it cannot be created.
     """
-    _sweep(Path(tempfile.gettempdir()))
-    place = Path(tempfile.mkdtemp(prefix=f"vlatool-{os.getpid()}-"))
-    lock = os.open(place, os.O_RDONLY | os.O_CLOEXEC)
+    _remove_stale(Path(tempfile.gettempdir()))
+    path = Path(tempfile.mkdtemp(prefix=f"vlatool-{os.getpid()}-"))
+    lock = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     fcntl.flock(lock, fcntl.LOCK_EX)
     try:
-        with named_as(place, "", "a temporary directory"), _full_disk(place):
-            yield place
+        with rename_in_errors(path, "", "a temporary directory"), _explain_full_disk(path):
+            yield path
     finally:
-        shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(path, ignore_errors=True)
         os.close(lock)
 
 
 @contextlib.contextmanager
-def _full_disk(place: Path) -> Iterator[None]:
-    """Blame the temporary folder where its disk is the full one: most such errors do not say which file it was."""
+def _explain_full_disk(path: Path) -> Iterator[None]:
+    """Name the temporary folder where its disk is the full one: most such errors do not name a file."""
     try:
         yield
     except OSError as error:
         file = file_of(error)
-        ours = in_scratch(Path(file)) if file else shutil.disk_usage(place).free < ROOM
-        if error.errno not in FULL or not ours:
+        ours = in_scratch(Path(file)) if file else shutil.disk_usage(path).free < MIN_FREE_BYTES
+        if error.errno not in DISK_FULL or not ours:
             raise
-        message = f"Cannot write temporary files to {place.parent}: {FULL[error.errno]}."
+        message = f"Cannot write temporary files to {path.parent}: {DISK_FULL[error.errno]}."
         raise OutputError(message, OTHER_SCRATCH) from error
 
 
-def _sweep(folder: Path) -> None:
-    """Remove what processes that were killed have left: the lock of a folder is free, and its process is gone."""
+def _remove_stale(folder: Path) -> None:
+    """Remove directories that killed processes left: the lock is free, and the process has ended."""
     for left in folder.glob("vlatool-*-*"):
         named = SCRATCH.fullmatch(left.name)
         if named is None or Path(f"/proc/{named['process']}").exists():
             continue
-        with contextlib.suppress(OSError), alone(left) as free:
+        with contextlib.suppress(OSError), exclusive_lock(left) as free:
             if free and left.lstat().st_uid == os.getuid():
                 shutil.rmtree(left, ignore_errors=True)

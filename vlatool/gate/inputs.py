@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import EVALUATION, Drawer, Drawn, Recording, calibration_recording, read_recording, save_drawn
+from vlatool.data import Drawer, Drawn, Recording, calibration_recording, read_recording, recordings_of, save_drawn
 from vlatool.files.scratch import scratch_directory
 
 TIMING, AGREEMENT, MEMORY = range(3)
@@ -43,7 +43,7 @@ class Inputs:
             DataError: when one cannot be read or does not fit the spec.
         """
         spec = self.baseline.manifest.spec
-        own = self.baseline.path / EVALUATION if EVALUATION in self.baseline.manifest.files else None
+        own = recordings_of(self.baseline).evaluation
         recordings = [read_recording(path, spec) for path in (self.data, own) if path is not None]
         calibration = calibration_recording(self.baseline)
         return (*recordings, *([calibration] if calibration is not None else []))

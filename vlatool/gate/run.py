@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 from vlatool.accuracy.credibility import FAILS
-from vlatool.bundle.bundle import Bundle, hash_file
+from vlatool.bundle.bundle import Bundle
 from vlatool.gate.claims import accuracy, answers, deadline, disturbed, growth, latency, motion, task_time, worst_task
 from vlatool.gate.config import Gate, LatencyClaim
 from vlatool.gate.episodes import Episodes
@@ -20,10 +20,10 @@ from vlatool.gate.timed import Timed
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
 from vlatool.measurement.pairs import PairJob
-from vlatool.measurement.validity import busy, throttled, validity
+from vlatool.measurement.validity import busy, throttling, validity
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, content_hash
 from vlatool.telemetry import Recorder, open_all
 
 KIND = "gate"
@@ -73,7 +73,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
             results.append(deadline.examine(timed, gate.deadline))
     if gate.answers:
         results.append(answers.examine(agreement, timed, gate.answers))
-    seen = (*throttled(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
+    seen = (*throttling(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
     seen = seen if gate.latency or gate.deadline else ()  # findings about times
     name = candidate.manifest.name
     row = _row("candidate", candidate, timed, results)
@@ -100,7 +100,7 @@ def _of_episodes(episodes: Episodes, gate: Gate) -> Iterator[ClaimResult]:
 def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:
     """Load both bundles as a robot does, golden action and all, and ask both where answers are claimed."""
     claim = gate.answers
-    timed.context.tell("both bundles, on observations that are not recorded", None)
+    timed.context.progress("both bundles, on observations that are not recorded", None)
     job = replace(timed.job, pairs=claim.observations if claim else 0, seconds=claim.seconds if claim else 0.0)
     if claim is None:
         return measure_agreement(job, timed.timeout)
@@ -114,12 +114,12 @@ def _measured_with(gate: Gate, inputs: Inputs, agreement: Agreement) -> list[dic
     table: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (how.threads, *how.also_threads)))}
     table |= dict(zip(("engine of the baseline", "engine of the candidate"), agreement.engines, strict=True))
     table |= {
-        f"recording {recording.path.name}": f"sha256:{hash_file(recording.path)}"
+        f"recording {recording.path.name}": f"sha256:{content_hash(recording.path)}"
         for recording in inputs.recordings
-        if recording.path.is_file()
+        if recording.path.exists()
     }
-    if gate.accuracy and (data := accuracy.data_of(inputs.baseline, gate.accuracy)) is not None and data.is_file():
-        table["evaluation data"] = f"sha256:{hash_file(data)}"
+    if gate.accuracy and (data := accuracy.data_of(inputs.baseline, gate.accuracy)) is not None and data.exists():
+        table["evaluation data"] = f"sha256:{content_hash(data)}"
     return [{"what": what, "value": value} for what, value in table.items()]
 
 

@@ -7,9 +7,9 @@ from typing import Any
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Manifest
+from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.spec import TensorSpec
-from vlatool.bundle.unexported import no_graph
-from vlatool.errors import BundleError, DataError, GraphError, instead, nearest, require
+from vlatool.errors import BundleError, DataError, GraphError, fix_for, require, suggest
 from vlatool.gate.claims import accuracy
 from vlatool.gate.config import Gate
 from vlatool.graph.files import read
@@ -35,11 +35,11 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
     """
     for bundle in (candidate, baseline):
         if not bundle.manifest.graphs:
-            raise no_graph(bundle, "run")
+            raise no_graph_error(bundle, "run")
         engine, known = bundle.manifest.engine, registry.names("engines")
         if engine and engine not in known:
             raise BundleError(
-                f"{bundle.path} is made for the engine '{engine}'; {nearest(engine, known)}.", instead(engine, known)
+                f"{bundle.path} is made for the engine '{engine}'; {suggest(engine, known)}.", fix_for(engine, known)
             )
     mine, theirs = candidate.manifest, baseline.manifest
     differs = _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from vlatool.gate.inputs import TIMING, Inputs
 from vlatool.measurement.pairs import PairJob, Pairs, measure_pairs
-from vlatool.measurement.turns import wanted
+from vlatool.measurement.turns import observation_count
 from vlatool.stage.base import Context
 
 
@@ -34,14 +34,14 @@ class Timed:
             GraphError: when a bundle cannot be run, or the process takes longer than the timeout.
         """
         if number == len(self.pairs):
-            self.context.tell(f"process {number + 1}: both bundles, call by call", None)
+            self.context.progress(f"process {number + 1}: both bundles, call by call", None)
             self.pairs.append(self._measure(replace(self.job, seed=self.job.seed + number), number))
         return self.pairs[number]
 
     def _measure(self, job: PairJob, number: int) -> Pairs:
         if self.inputs is None:
             return measure_pairs(job, self.timeout)
-        with self.inputs.file(wanted(job.pairs), TIMING, number) as path:
+        with self.inputs.file(observation_count(job.pairs), TIMING, number) as path:
             return measure_pairs(replace(job, observations=str(path)), self.timeout)
 
     def at_threads(self, threads: int) -> Timed:

@@ -11,7 +11,7 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import OutputError
-from vlatool.files.edited import whole_file
+from vlatool.files.user_files import atomic_file
 from vlatool.graph.workload import GraphWorkload, Workload
 from vlatool.machine.version import VERSION
 
@@ -98,7 +98,7 @@ def write_workload(file: Path, work: Workload, of: str = "") -> None:
         OSError: when the file cannot be written.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(file) as draft:
+    with atomic_file(file) as draft:
         data = {**to_values(work), "digest": of}
         draft.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
-from vlatool.errors import nearest
+from vlatool.errors import suggest
 
 UNITS = ("cpu", "gpu", "npu")
 WEIGHTS = ("w8", "w4")
@@ -28,7 +28,7 @@ def describe_problem(error: ErrorDetails, known: Iterable[str]) -> str:
     kind, got = error["type"], f"; got {error['input']!r}"
     where = ".".join(str(part) for part in error["loc"] if part != "[key]")
     if kind == "extra_forbidden":
-        hint, _, _ = nearest(str(error["loc"][-1]), known).rpartition(" known: ")
+        hint, _, _ = suggest(str(error["loc"][-1]), known).rpartition(" known: ")
         return f"{where}: is not a known key; {hint}".removesuffix("; ")
     if kind == "value_error":
         return f"{where}: {error['msg'].removeprefix('Value error, ')}"
@@ -41,7 +41,7 @@ def source_problems(value: Any, sources: Mapping[str, str], where: str = "") -> 
     if isinstance(value, BaseModel):
         source = getattr(value, "source", None)
         if source is not None and source not in sources:
-            yield f"{where}source: '{source}' is not in sources; {nearest(source, sources)}"
+            yield f"{where}source: '{source}' is not in sources; {suggest(source, sources)}"
         value = dict(value)
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, tuple) else ()
     for key, item in items:
@@ -51,12 +51,12 @@ def source_problems(value: Any, sources: Mapping[str, str], where: str = "") -> 
 def name_problems(profile: Any) -> Iterator[str]:
     """Yield a problem for each reference to a unit or mode that does not exist."""
     for unit_name in set(profile.units) - set(UNITS):
-        yield f"units.{unit_name}: is not a kind of unit; {nearest(unit_name, UNITS)}"
+        yield f"units.{unit_name}: is not a kind of unit; {suggest(unit_name, UNITS)}"
     if profile.default_mode not in profile.modes:
-        yield f"default_mode: '{profile.default_mode}' is not in modes; {nearest(profile.default_mode, profile.modes)}"
+        yield f"default_mode: '{profile.default_mode}' is not in modes; {suggest(profile.default_mode, profile.modes)}"
     for name, engine in profile.engines.items():
         if engine.unit not in profile.units:
-            yield f"engines.{name}.unit: '{engine.unit}' is not in units; {nearest(engine.unit, profile.units)}"
+            yield f"engines.{name}.unit: '{engine.unit}' is not in units; {suggest(engine.unit, profile.units)}"
             continue
         peaks = profile.units[engine.unit].peak_tops
         for dtype in engine.dtypes:
@@ -66,9 +66,9 @@ def name_problems(profile: Any) -> Iterator[str]:
                 yield f"engines.{name}.dtypes: {dtype} needs a peak_tops.float16 or float32 of {engine.unit}"
     for release in profile.software:
         for engine_name in {*release.engines} - {*profile.engines}:
-            yield f"software.{release.release}.engines: '{engine_name}' is not in engines; " + nearest(
+            yield f"software.{release.release}.engines: '{engine_name}' is not in engines; " + suggest(
                 engine_name, profile.engines
             )
     for name, mode in profile.modes.items():
         for unit in {*mode.cores, *mode.clock_mhz} - {*profile.units}:
-            yield f"modes.{name}: '{unit}' is not in units; {nearest(unit, profile.units)}"
+            yield f"modes.{name}: '{unit}' is not in units; {suggest(unit, profile.units)}"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from vlatool.errors import ProfileError, instead, nearest
+from vlatool.errors import ProfileError, fix_for, suggest
 from vlatool.files.yaml import read_yaml
 from vlatool.hardware.profile import NAME, SUFFIXES, Kind, Strict
 
@@ -53,7 +53,7 @@ def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
     path = Path(name) if own else _folder() / f"{name}.yaml"
     if not own and name not in platform_names():
         raise ProfileError(
-            f"Unknown platform '{name}'; {nearest(name, platform_names())}.", instead(name, platform_names())
+            f"Unknown platform '{name}'; {suggest(name, platform_names())}.", fix_for(name, platform_names())
         )
     try:
         return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))

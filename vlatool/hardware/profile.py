@@ -19,9 +19,9 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
 from vlatool import registry
-from vlatool.errors import OutputError, ProfileError, instead, nearest
-from vlatool.files.edited import unstamped, write_own
+from vlatool.errors import OutputError, ProfileError, fix_for, suggest
 from vlatool.files.numbers import Numeric
+from vlatool.files.user_files import remove_stamp, write_own_file
 from vlatool.files.yaml import read_mapping
 from vlatool.hardware._problems import describe_problem, name_problems, source_problems
 
@@ -38,7 +38,7 @@ DTYPES = ("float32", "tf32", "float16", "bfloat16", "float8", "int8", "int4", "f
 def _one_of(known: tuple[str, ...], what: str) -> AfterValidator:
     def check(name: str) -> str:
         if name not in known:
-            raise ValueError(f"is not {what}; {nearest(name, known)}")
+            raise ValueError(f"is not {what}; {suggest(name, known)}")
         return name
 
     return AfterValidator(check)
@@ -235,7 +235,7 @@ class Profile(Strict):
         chosen = self.default_mode if name is None else name
         if chosen not in self.modes:
             raise ProfileError(
-                f"{self.name} has no power mode '{chosen}'; {nearest(chosen, self.modes)}.", instead(chosen, self.modes)
+                f"{self.name} has no power mode '{chosen}'; {suggest(chosen, self.modes)}.", fix_for(chosen, self.modes)
             )
         return self.modes[chosen]
 
@@ -298,10 +298,10 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
             f"'{name}' is not a valid profile name; allowed: lower-case letters, digits and hyphens.",
             "name it like my-robot-2",
         )
-    text = re.sub(r"(?m)^name: .*$", f"name: {name}", unstamped(path.read_text(encoding="utf-8")), count=1)
+    text = re.sub(r"(?m)^name: .*$", f"name: {name}", remove_stamp(path.read_text(encoding="utf-8")), count=1)
     text = re.sub(r"(?m)^aliases:.*\n(?:[ \t]+.*\n|- .*\n|\]\n)*", "", text, count=1)
     try:
-        write_own(target, text, force=force)
+        write_own_file(target, text, force=force)
     except OSError as error:
         raise OutputError(
             f"{target} cannot be written: {error.strerror}.",

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import DataError, ProfileError
-from vlatool.files.edited import whole_file
+from vlatool.files.user_files import atomic_file
 from vlatool.graph.workload import PRECISIONS, TRAITS, WORKLOAD_TABLE, Workload, summarize_workload
 from vlatool.hardware.profile import Profile, load_profile, profile_names
 from vlatool.latency_model.board import Candidate, compute_unit_of
@@ -114,7 +114,7 @@ def store(measured: list[BoardMeasurement]) -> Path:
     known = [item for item in _read(file) if item not in measured] if file.is_file() else []
     file.parent.mkdir(parents=True, exist_ok=True)
     rows = [dict(vars(item)) for item in (*known, *measured)]
-    with whole_file(file) as draft:
+    with atomic_file(file) as draft:
         draft.write_text(json.dumps({"schema": SCHEMA_VERSION, "measured": rows}, indent=1) + "\n", encoding="utf-8")
     return file
 

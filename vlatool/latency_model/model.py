@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import DataError
-from vlatool.files.edited import whole_file
+from vlatool.files.user_files import atomic_file
 from vlatool.latency_model.features import PROXIES, Question, Shares, rows_of
 from vlatool.latency_model.gaussian_process import KEYS, Process, Rows, Scales
 
@@ -271,7 +271,7 @@ def write(model: LatencyModel, folder: Path) -> None:
             },
         }
     text = json.dumps({"about": dict(model.about), "parts": described}, indent=1)
-    with whole_file(folder / "latency.npz") as stored, whole_file(folder / "latency.json") as text_file:
+    with atomic_file(folder / "latency.npz") as stored, atomic_file(folder / "latency.json") as text_file:
         with stored.open("wb") as stream:  # by its name numpy would call it .npz
             np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
         text_file.write_text(text + "\n", encoding="utf-8")

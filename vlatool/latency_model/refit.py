@@ -17,7 +17,7 @@ from vlatool.latency_model.model import LatencyModel, Prediction
 from vlatool.latency_model.published_latencies import Point, merge_versions, read_points
 from vlatool.latency_model.score import DRAWS, FOLDS, describe_split, summarize
 from vlatool.machine.processes import single_threads
-from vlatool.user_code.children import spread
+from vlatool.user_code.children import map_jobs
 
 PredictedPoints = list[tuple[Point, Prediction]]
 
@@ -61,7 +61,7 @@ def refit_points(
     how = {"points": str(path.absolute()), "held_out": held_out, "seed": seed, "seconds": seconds}
     jobs = [{**how, "held": sorted(held)} for held in folds]
     processes = len(os.sched_getaffinity(0))
-    parts = spread(f"{__name__}:fold", jobs, processes, tell, "the fit", (__name__,))
+    parts = map_jobs(f"{__name__}:fold", jobs, processes, tell, "the fit", (__name__,))
     with single_threads(), contextlib.closing(parts):
         for done, part in enumerate(parts, 1):
             for kind, rows in part.items():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import DataError, UsageError, instead
+from vlatool.errors import DataError, UsageError, fix_for
 from vlatool.latency_model.features import rows_of
 from vlatool.latency_model.fit import Scores, split_by_part
 from vlatool.latency_model.folds import UNITS, Folds, Sample
@@ -49,7 +49,7 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
         predictions = load_model().predict([point.question for point in points if point.question])
         return summarize(points, predictions, whose)
     if held_out not in SPLITS:
-        raise UsageError(f"--held-out is '{held_out}'; allowed: {', '.join(SPLITS)}.", instead(held_out, SPLITS))
+        raise UsageError(f"--held-out is '{held_out}'; allowed: {', '.join(SPLITS)}.", fix_for(held_out, SPLITS))
     scored: list[Point] = []
     answers: list[Prediction] = []
     for draw in range(DRAWS if held_out == "calibrated" else 1):

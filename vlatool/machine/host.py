@@ -55,7 +55,7 @@ ARM_CORES = {
     ("0x4e", "0x004"): "Carmel",
 }
 """(Implementer, part) of ``/proc/cpuinfo`` -> core; from ``arch/arm64/include/asm/cputype.h`` of Linux."""
-UNLIMITED = 1 << 60
+NO_LIMIT_BYTES = 1 << 60
 """A memory limit of cgroup v1 from here on means that there is none."""
 
 
@@ -148,7 +148,7 @@ def onednn_max_cpu_isa(variables: Mapping[str, str] = os.environ) -> str | None:
     """The instruction set that ``ONEDNN_MAX_CPU_ISA`` confines oneDNN, and so OpenVINO, to; None when there is none.
 
     oneDNN obeys the older name where the newer one is not set, takes small letters for large ones, and ``ALL`` and
-    ``DEFAULT`` confine it to nothing. What is no name of an instruction set is told as ``?``: it may be anything, and
+    ``DEFAULT`` confine it to nothing. Anything else is reported as ``?``: it may be anything, and
     reports are shared.
     """
     value = (variables.get(MAX_CPU_ISA) or variables.get(OLDER_MAX_CPU_ISA, "")).upper()
@@ -163,6 +163,19 @@ def board(root: Path = ROOT) -> str | None:
         return model
     parts = [read_text(root, f"sys/class/dmi/id/{name}") for name in ("sys_vendor", "product_name")]
     return " ".join(part for part in parts if part) or None
+
+
+def gpus(root: Path = ROOT) -> tuple[str, ...]:
+    """Models of NVIDIA's graphics cards, as their driver names them."""
+    files = sorted(path.relative_to(root) for path in (root / "proc/driver/nvidia/gpus").glob("*/information"))
+    models = (re.search(r"^Model:\s*(.+)$", read_text(root, str(path)) or "", re.MULTILINE) for path in files)
+    return tuple(match[1] for match in models if match)
+
+
+def gpu_driver(root: Path = ROOT) -> str | None:
+    """Version of NVIDIA's driver in the kernel; None when it is not loaded."""
+    match = re.search(r"^NVRM version:.*?\s(\d+\.\d[\d.]*)\s", read_text(root, "proc/driver/nvidia/version") or "")
+    return f"NVIDIA driver {match[1]}" if match else None
 
 
 def online_cores(root: Path = ROOT) -> int | None:
@@ -187,12 +200,12 @@ def _count(ranges: str | None) -> int | None:
 def cpu_quota(root: Path = ROOT) -> float | None:
     """The smallest limit in cores that a control group of this process has; None when there is none."""
     limits = []
-    for place in _groups(root, "cpu"):
-        text = read_text(root, f"{place}/cpu.max")
+    for group in _groups(root, "cpu"):
+        text = read_text(root, f"{group}/cpu.max")
         if text and (limit := re.fullmatch(r"(\d+) (\d+)", text)):
             limits.append(int(limit[1]) / int(limit[2]))
-        quota = read_number(root, f"{place}/cpu.cfs_quota_us")
-        period = read_number(root, f"{place}/cpu.cfs_period_us")
+        quota = read_number(root, f"{group}/cpu.cfs_quota_us")
+        period = read_number(root, f"{group}/cpu.cfs_period_us")
         if quota is not None and quota > 0 and period:
             limits.append(quota / period)
     return round(min(limits), 3) if limits else None
@@ -203,10 +216,10 @@ def memory(root: Path = ROOT) -> dict[str, float | None]:
     text = read_text(root, "proc/meminfo") or ""
     known = {key: int(kib) * 1024 for key, kib in re.findall(r"^(\w+):\s+(\d+) kB", text, re.MULTILINE)}
     limits = []
-    for place in _groups(root, "memory"):
+    for group in _groups(root, "memory"):
         for name in ("memory.max", "memory.limit_in_bytes"):
-            limit = read_number(root, f"{place}/{name}")
-            if limit is not None and limit < UNLIMITED:
+            limit = read_number(root, f"{group}/{name}")
+            if limit is not None and limit < NO_LIMIT_BYTES:
                 limits.append(limit)
     return {
         "memory_mb": _mega(known.get("MemTotal")),
@@ -221,7 +234,7 @@ def _mega(count: int | None) -> float | None:
 
 def _groups(root: Path, controller: str) -> list[str]:
     """Directories of this process's control groups, v2 and v1, from its own up to the root."""
-    places: list[str] = []
+    groups: list[str] = []
     for line in (read_text(root, "proc/self/cgroup") or "").splitlines():
         number, controllers, path = [*line.split(":", 2), "", ""][:3]
         if number == "0" and not controllers:
@@ -232,8 +245,8 @@ def _groups(root: Path, controller: str) -> list[str]:
             continue
         parts = [part for part in path.split("/") if part not in ("", "..")]
         for base in dict.fromkeys(bases):
-            places += ["/".join([base, *parts[:depth]]) for depth in range(len(parts), -1, -1)]
-    return places
+            groups += ["/".join([base, *parts[:depth]]) for depth in range(len(parts), -1, -1)]
+    return groups
 
 
 def frequency(root: Path = ROOT) -> dict[str, Any]:
@@ -241,10 +254,10 @@ def frequency(root: Path = ROOT) -> dict[str, Any]:
     policies = [
         path.relative_to(root).as_posix() for path in sorted((root / "sys/devices/system/cpu/cpufreq").glob("policy*"))
     ]
-    governors = [governor for place in policies if (governor := read_text(root, f"{place}/scaling_governor"))]
+    governors = [governor for policy in policies if (governor := read_text(root, f"{policy}/scaling_governor"))]
     clocks: dict[str, list[float] | None] = {}
     for key, name in (("min", "scaling_min_freq"), ("max", "scaling_max_freq"), ("now", "scaling_cur_freq")):
-        values = [khz / 1000 for place in policies if (khz := read_number(root, f"{place}/{name}")) is not None]
+        values = [khz / 1000 for policy in policies if (khz := read_number(root, f"{policy}/{name}")) is not None]
         clocks[f"clock_{key}_mhz"] = values or None
     no_turbo = read_number(root, "sys/devices/system/cpu/intel_pstate/no_turbo")
     boost = read_number(root, "sys/devices/system/cpu/cpufreq/boost")

@@ -38,34 +38,34 @@ class BoardSet:
     """The set that OpenVINO computes in on a board, beside the one that it computes in here.
 
     Args:
-        board: Name of the profile.
-        wanted: The board's set; empty where there is nothing to compare (no profile, no x86, no OpenVINO on it).
-        lacks: The feature that this host's processor would need for it; empty when it has it.
-        host: The highest set of this host's processor; empty when it is no x86.
-        told: What OpenVINO obeys of ``ONEDNN_MAX_CPU_ISA`` in this process; empty when it confines nothing.
+        board: name of the profile.
+        wanted: the board's set; empty where there is nothing to compare (no profile, no x86, no OpenVINO on it).
+        lacks: the feature that this host's processor would need for it; empty when it has it.
+        host: the highest set of this host's processor; empty when it is not an x86.
+        isa_limit: what OpenVINO obeys of ``ONEDNN_MAX_CPU_ISA`` in this process; empty when it confines nothing.
     """
 
     board: str = ""
     wanted: str = ""
     lacks: str = ""
     host: str = ""
-    told: str = ""
+    isa_limit: str = ""
 
     @property
     def to_set(self) -> str:
-        """What the variable must say in a further process; empty where there is no need for one, or no use in it."""
-        needed = self.wanted and not self.lacks and not self.told and self.host != self.wanted
+        """What the variable must say in a further process; empty where it is not needed or not useful."""
+        needed = self.wanted and not self.lacks and not self.isa_limit and self.host != self.wanted
         return self.wanted if needed else ""
 
     @property
     def confined(self) -> bool:
         """Whether OpenVINO computes in the board's set in this process, and ONNX Runtime in the host's own."""
-        return bool(self.wanted) and not self.lacks and self.told == self.wanted != self.host
+        return bool(self.wanted) and not self.lacks and self.isa_limit == self.wanted != self.host
 
     @property
-    def alike(self) -> bool:
+    def same_set(self) -> bool:
         """Whether everything computes in the board's set: it is this host's."""
-        return bool(self.wanted) and self.host == self.wanted and self.told in ("", self.wanted)
+        return bool(self.wanted) and self.host == self.wanted and self.isa_limit in ("", self.wanted)
 
     @property
     def saturates(self) -> bool:
@@ -88,13 +88,13 @@ class BoardSet:
             return ""
         if self.to_set or self.confined:
             return f"OpenVINO confined to {self.wanted}, in a process of its own; ONNX Runtime as this host is"
-        if self.alike:
+        if self.same_set:
             return f"OpenVINO in {self.wanted}, as this host is"
-        return f"OpenVINO in {self.told or self.host or 'what this host has'}; {self.board} has {self.wanted}"
+        return f"OpenVINO in {self.isa_limit or self.host or 'what this host has'}; {self.board} has {self.wanted}"
 
     def sentences(self) -> tuple[str, ...]:
         """Say what the figures of OpenVINO are those of, where that is the board's set."""
-        if self.alike:
+        if self.same_set:
             return (f"This host has the instruction set of {self.board} ({self.wanted}) on another core: errors and "
                     "ratios are of that set, milliseconds are this host's.",)  # fmt: skip
         if not self.confined:
@@ -112,14 +112,14 @@ class BoardSet:
         if self.confined or self.to_set:
             sentence = f"OpenVINO was confined to {self.wanted}, the instruction set of {self.board}"
             return (f"{sentence}: its answers are of that set.",)
-        return (f"This host has the instruction set of {self.board} ({self.wanted}).",) if self.alike else ()
+        return (f"This host has the instruction set of {self.board} ({self.wanted}).",) if self.same_set else ()
 
     def warnings(self) -> tuple[str, ...]:
         """Say where this host's figures are not those of the board's set, what that means, and what to do."""
-        if not self.wanted or self.confined or self.alike:
+        if not self.wanted or self.confined or self.same_set:
             return ()
-        if self.told:
-            return (f"ONEDNN_MAX_CPU_ISA={self.told} is set, so that OpenVINO computes neither as {self.board} does "
+        if self.isa_limit:
+            return (f"ONEDNN_MAX_CPU_ISA={self.isa_limit} is set, so that OpenVINO computes neither as {self.board} "
                     f"({self.wanted}) nor as this host can: unset it.",)  # fmt: skip
         if self.to_set:
             return ()
@@ -148,7 +148,7 @@ class BoardSet:
 
 
 def rung(features: Collection[str]) -> str:
-    """Return the highest set that has these features (names of ``/proc/cpuinfo``); empty when it is no x86 with AVX2.
+    """Return the highest set that has these features (names of ``/proc/cpuinfo``); empty without x86 and AVX2.
 
     Example:
         >>> rung(["avx2", "fma", "avx_vnni"])
@@ -167,32 +167,32 @@ def saturates(features: Collection[str]) -> bool:
     return rung(features) in SATURATING
 
 
-def obeyed(told: str, host: Collection[str]) -> str:
-    """Return the set that oneDNN computes in when ``ONEDNN_MAX_CPU_ISA`` says ``told``, on a processor with features.
+def effective_set(isa_limit: str, host: Collection[str]) -> str:
+    """Return the set that oneDNN computes in under a value of ``ONEDNN_MAX_CPU_ISA``, on a processor with features.
 
     A set that the processor lacks is taken for the highest below it; a name that is none of ``RUNGS`` stands as it is.
 
     Example:
-        >>> obeyed("AVX512_CORE_AMX", ["avx2", "avx_vnni"]), obeyed("AVX2_VNNI", ["avx2", "avx512f", "avx512_vnni"])
-        ('AVX2_VNNI', 'AVX2')
+        >>> effective_set("AVX512_CORE_AMX", ["avx2", "avx_vnni"])
+        'AVX2_VNNI'
     """
     names = list(RUNGS)
-    below = names[names.index(told) :] if told in RUNGS else []
-    return next((name for name in below if RUNGS[name] in host), told)
+    below = names[names.index(isa_limit) :] if isa_limit in RUNGS else []
+    return next((name for name in below if RUNGS[name] in host), isa_limit)
 
 
-def compared(board: str, features: Collection[str], host: Collection[str], told: str = "") -> BoardSet:
+def compare_sets(board: str, features: Collection[str], host: Collection[str], isa_limit: str = "") -> BoardSet:
     """Return a board's set beside this host's.
 
     Args:
-        board: Name of the profile.
-        features: Features of the board's processor.
-        host: Features of this host's processor.
-        told: What ``ONEDNN_MAX_CPU_ISA`` says.
+        board: name of the profile.
+        features: features of the board's processor.
+        host: features of this host's processor.
+        isa_limit: what ``ONEDNN_MAX_CPU_ISA`` says.
     """
     wanted = rung(features)
-    needed, own, told = RUNGS.get(wanted, ""), rung(host), obeyed(told, host)
-    return BoardSet(board, wanted, "" if needed in host else needed, own, "" if told == own else told)
+    needed, own, isa_limit = RUNGS.get(wanted, ""), rung(host), effective_set(isa_limit, host)
+    return BoardSet(board, wanted, "" if needed in host else needed, own, "" if isa_limit == own else isa_limit)
 
 
 def board_set(profile: Profile | None) -> BoardSet:
@@ -205,7 +205,7 @@ def board_set(profile: Profile | None) -> BoardSet:
     if matches(profile.model_strings, fingerprint()):
         return BoardSet()
     features = profile.units[profile.engines[ENGINE].unit].isa
-    return compared(profile.name, features, isa() or (), onednn_max_cpu_isa() or "")
+    return compare_sets(profile.name, features, isa() or (), onednn_max_cpu_isa() or "")
 
 
 def about_onnx_runtime(profile: Profile | None) -> tuple[str, ...]:
@@ -221,7 +221,7 @@ def about_onnx_runtime(profile: Profile | None) -> tuple[str, ...]:
     return (f"{first} It was timed in this host's own set ({host}), which has it: its speed-ups do not carry over.",)
 
 
-def computed_in() -> str:
+def openvino_set() -> str:
     """Return what OpenVINO computes in, in this process: what it is confined to, or the processor's highest set."""
     host = isa() or ()
-    return obeyed(onednn_max_cpu_isa() or "", host) or rung(host)
+    return effective_set(onednn_max_cpu_isa() or "", host) or rung(host)

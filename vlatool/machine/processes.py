@@ -30,9 +30,9 @@ def python_command(module: str, arguments: Sequence[str] = (), path: Sequence[st
     Neither the current directory nor variables of Python choose what it imports, but ``import_path()`` alone.
 
     Args:
-        module: Its full name.
+        module: its full name.
         arguments: ``sys.argv[1:]`` of the module.
-        path: Where modules are imported from; ``import_path()`` when None.
+        path: where modules are imported from; ``import_path()`` when None.
     """
     joined = "\n".join(import_path() if path is None else path)
     return [sys.executable, "-I", "-c", START, joined, module, *arguments]

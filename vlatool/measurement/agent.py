@@ -22,10 +22,10 @@ from vlatool.files.messages import to_json
 from vlatool.machine.host import before_run
 from vlatool.measurement import child
 from vlatool.measurement.cold_start import cold_start
-from vlatool.measurement.interleaved import Tell
+from vlatool.measurement.interleaved import OnProgress
 from vlatool.measurement.jobs import LatencyJob, Limits, WorkerJob
-from vlatool.measurement.limited import chosen, command, grouped
-from vlatool.measurement.measured import Measured, PolicyRun
+from vlatool.measurement.process_limits import choose_processors, command, control_group
+from vlatool.measurement.results import Benchmark, PolicyRun
 from vlatool.telemetry import Absent, Reader, Recorder, open_all
 from vlatool.telemetry.process import ProcessReader
 from vlatool.user_code import trust
@@ -35,17 +35,17 @@ LOG_CHARACTERS = 4000
 WORKER = "vlatool.measurement.worker"
 
 
-def measure(job: LatencyJob, tell: Tell) -> Measured:
+def measure(job: LatencyJob, tell: OnProgress) -> Benchmark:
     """Measure on this machine.
 
     Raises:
         VlatoolError: what a bundle raises; GraphError when a process ends; GateFailed when it needs more memory than
             the limits leave.
     """
-    limits = chosen(job.limits)
+    limits = choose_processors(job.limits)
     if limits.memory_mb:
         tell("whether it fits into the memory", None)
-        with grouped(limits) as limited:
+        with control_group(limits) as limited:
             for path in job.bundles:
                 start = cold_start(Path(path), job.engine, job.threads, limited)
                 if start.peak_rss_mb > limited.memory_mb:  # pages of files that others have read count for no group
@@ -70,15 +70,15 @@ def _with_cold_starts(policy: PolicyRun, bundle: Path, job: LatencyJob, limits: 
     return replace(policy, cold=starts)
 
 
-def _run_worker(job: LatencyJob, limits: Limits, tell: Tell) -> Measured:
+def _run_worker(job: LatencyJob, limits: Limits, tell: OnProgress) -> Benchmark:
     about = ", ".join(job.bundles)
     with (
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log,
-        _started(command(limits, WORKER), log) as worker,
+        _start(command(limits, WORKER), log) as worker,
         contextlib.ExitStack() as recording,
     ):
         recorder: Recorder | None = None
-        _send(worker, json.dumps(to_json(WorkerJob(job, tuple(map(tuple, trust.named_so_far()))))))
+        _send(worker, json.dumps(to_json(WorkerJob(job, tuple(map(tuple, trust.named_folders()))))))
         for line in cast(IO[str], worker.stdout):
             match child.read_line(line):
                 case child.Progress(what, share):
@@ -90,12 +90,12 @@ def _run_worker(job: LatencyJob, limits: Limits, tell: Tell) -> Measured:
                     recording.close()
                     _send(worker)
                 case child.Result() as result:
-                    measured = child.result_of(result, Measured, about)
+                    measured = child.result_of(result, Benchmark, about)
                     telemetry = recorder.recorded if recorder else None
                     return replace(measured, telemetry=telemetry, log=_end_of(log))
                 case child.Raised() as raised:
                     raise child.error_of(raised, limits)
-        raise child.ended(about, worker.wait(), _end_of(log), limits, "while it was measured")
+        raise child.end_error(about, worker.wait(), _end_of(log), limits, "while it was measured")
 
 
 def _end_of(log: IO[str]) -> str:
@@ -113,7 +113,7 @@ def _send(worker: subprocess.Popen[str], line: str = "") -> None:
 
 
 @contextlib.contextmanager
-def _started(words: list[str], log: IO[str]) -> Iterator[subprocess.Popen[str]]:
+def _start(words: list[str], log: IO[str]) -> Iterator[subprocess.Popen[str]]:
     """Start a process, and see to it that it ends with the block."""
     pipe = subprocess.PIPE
     with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=log, text=True) as process:
@@ -124,7 +124,7 @@ def _started(words: list[str], log: IO[str]) -> Iterator[subprocess.Popen[str]]:
 
 
 def _readers(worker: int) -> list[Reader | Absent]:
-    """Return the readers of the board, and one of the worker in the place of that of this process."""
+    """Return the readers of the board, and one of the worker instead of that of this process."""
     readers = [reader for reader in open_all() if _name(reader) != ProcessReader.name]
     return [*readers, ProcessReader.open(number=worker)]
 
@@ -133,9 +133,9 @@ def _name(reader: Reader | Absent) -> str:
     return reader.reader if isinstance(reader, Absent) else reader.name
 
 
-def main() -> Measured:
+def main() -> Benchmark:
     """Run the job that standard input names."""
-    return measure(child.asked(LatencyJob), lambda what, share: child.say(child.Progress(what, share)))
+    return measure(child.read_job(LatencyJob), lambda what, share: child.say(child.Progress(what, share)))
 
 
 if __name__ == "__main__":

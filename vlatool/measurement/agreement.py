@@ -1,4 +1,4 @@
-"""What two bundles answer to observations that neither was made for: whether the one still follows the other.
+"""Agreement of two bundles on observations that neither was made for.
 
 ``python -m vlatool.measurement.agreement`` reads a ``PairJob`` and answers with an ``Agreement``. Both are loaded as a
 robot loads them: every file is hashed, and the golden action must be computed. Each observation is answered twice, once
@@ -24,11 +24,11 @@ from vlatool.measurement.pairs import PairJob
 Array = NDArray[Any]
 FEWEST = 24
 """Observations that are answered however long that takes."""
-STILL = 1e-6
+MAX_STILL_SPREAD = 1e-6
 """Spread of an element, as a share of its size, up to which it is said not to vary."""
 SEQUENCE = "consecutive"
 """Kind of the observations that policies which keep values answer in a row."""
-NEARLY_STILL = 0.1
+MIN_SPREAD_SHARE = 0.1
 """Share of an element's usual spread (over observations of all kinds, or of its statistics) that it counts by at least
 where it varies less: else the rounding of an element that happens to stand still would count as much as all motion."""
 CLOSE = 0.25
@@ -36,15 +36,15 @@ CLOSE = 0.25
 
 
 @dataclass(frozen=True)
-class Followed:
+class OutputAgreement:
     """How one output of the candidate follows the baseline's on observations of one kind.
 
     Args:
-        kind: Of the observations (``data.Drawn.kind``).
-        output: Its name.
-        correlation: Over observations and elements, each by the baseline's spread: 1 gives the same everywhere, 0 is
+        kind: kind of the observations (``data.Drawn.kind``).
+        output: its name.
+        correlation: over observations and elements, each by the baseline's spread: 1 gives the same everywhere, 0 is
             what a constant reaches, -1 is its opposite.
-        samples: Observations.
+        samples: observations.
     """
 
     kind: str
@@ -58,16 +58,16 @@ class Agreement:
     """What a process found.
 
     Args:
-        followed: One for each output and kind of observation.
-        looked: Observations that the candidate answered twice.
-        strays: How many of them it answered otherwise the second time.
-        unsteady: How many the baseline did.
-        skipped: Observations that the baseline cannot answer.
-        golden: Golden error of baseline and candidate; None without a golden action.
-        engines: Engines of baseline and candidate.
+        followed: one for each output and kind of observation.
+        looked: observations that the candidate answered twice.
+        strays: number of them that it answered differently the second time.
+        unsteady: number that the baseline did.
+        skipped: observations that the baseline cannot answer.
+        golden: golden error of baseline and candidate; None without a golden action.
+        engines: engines of baseline and candidate.
     """
 
-    followed: tuple[Followed, ...] = ()
+    followed: tuple[OutputAgreement, ...] = ()
     looked: int = 0
     strays: int = 0
     unsteady: int = 0
@@ -89,21 +89,21 @@ def measure_agreement(job: PairJob, timeout: float | None = None) -> Agreement:
 def run_agreement(job: PairJob) -> Agreement:
     """Measure in this process; ``job.seconds`` ends it early, once ``FEWEST`` observations are answered."""
     from vlatool.bundle.bundle import Bundle
-    from vlatool.measurement.turns import loaded, pool_of
+    from vlatool.measurement.turns import load_policy, pool_of
 
     baseline = Bundle.open(job.baseline)
-    policies = [loaded(path, job) for path in (job.baseline, job.candidate)]
+    policies = [load_policy(path, job) for path in (job.baseline, job.candidate)]
     pool = pool_of(job, baseline) if job.pairs else []
-    calls, skipped = _asked(policies, pool, job)
+    calls, skipped = _answers(policies, pool, job)
     if any(step.keep for step in baseline.manifest.program):
         for policy in policies:
             policy.reset()
-        calls += _asked(policies, [replace(drawn, kind=SEQUENCE) for drawn in pool], job, afresh=False)[0]
+        calls += _answers(policies, [replace(drawn, kind=SEQUENCE) for drawn in pool], job, afresh=False)[0]
     strays = [_strays(policy, calls, which, job.seed) for which, policy in enumerate(policies)]
     kinds = dict.fromkeys(call.kind for call in calls)
     usual = {tensor.name: _usual(policies[0], tensor, calls) for tensor in policies[0].spec.outputs} if calls else {}
     by_kind = ([call for call in calls if call.kind == kind] for kind in kinds)
-    followed = [one for alike in by_kind for one in _followed(policies, alike, usual)]
+    followed = [one for alike in by_kind for one in _agreements(policies, alike, usual)]
     return Agreement(tuple(followed), len(calls), strays[1], strays[0], skipped,
                      tuple(policy.golden_error for policy in policies),
                      tuple(policy.engine for policy in policies))  # fmt: skip
@@ -117,10 +117,12 @@ class _Asked:
     outputs: tuple[Mapping[str, Array], Mapping[str, Array]]
 
 
-def _asked(policies: Sequence[Any], pool: Sequence[Any], job: PairJob, afresh: bool = True) -> tuple[list[_Asked], int]:
+def _answers(
+    policies: Sequence[Any], pool: Sequence[Any], job: PairJob, afresh: bool = True
+) -> tuple[list[_Asked], int]:
     """Ask both for every observation, some bits of which are new, right after a reset (``afresh``) or in a row."""
     from vlatool.errors import GraphError
-    from vlatool.measurement.answers import varied
+    from vlatool.measurement.answers import vary_observation
     from vlatool.runtime.program import draw
 
     numbers = np.random.default_rng([job.seed, 3])
@@ -128,10 +130,10 @@ def _asked(policies: Sequence[Any], pool: Sequence[Any], job: PairJob, afresh: b
     calls: list[_Asked] = []
     skipped = 0
     end = time.monotonic() + job.seconds
-    for place, drawn in enumerate(pool):
-        if place >= FEWEST and time.monotonic() > end:
+    for index, drawn in enumerate(pool):
+        if index >= FEWEST and time.monotonic() > end:
             break
-        observation = varied(drawn.observation, spec, numbers)
+        observation = vary_observation(drawn.observation, spec, numbers)
         noise = {name: draw(wanted, numbers) for step in steps for name, wanted in step.noise.items()} or None
         try:
             theirs = _outputs(policies[0], observation, noise, afresh)
@@ -159,8 +161,8 @@ def _strays(policy: Any, calls: Sequence[_Asked], which: int, seed: int) -> int:
     if any(step.keep for step in policy.bundle.manifest.program):
         return 0
     answers = Answers([call.outputs[which] for call in calls])
-    for place in random.Random(seed).sample(range(len(calls)), len(calls)):
-        answers.look(place, policy.infer(calls[place].observation, noise=calls[place].noise).outputs)
+    for index in random.Random(seed).sample(range(len(calls)), len(calls)):
+        answers.look(index, policy.infer(calls[index].observation, noise=calls[index].noise).outputs)
     return answers.strays
 
 
@@ -174,7 +176,7 @@ def _usual(policy: Any, tensor: Any, calls: Sequence[_Asked]) -> Array:
     return np.asarray(spread if normaliser is None else np.maximum(spread, np.abs(normaliser.scale)))
 
 
-def _followed(policies: Sequence[Any], calls: Sequence[_Asked], usual: Mapping[str, Array]) -> list[Followed]:
+def _agreements(policies: Sequence[Any], calls: Sequence[_Asked], usual: Mapping[str, Array]) -> list[OutputAgreement]:
     kind, count = calls[0].kind, len(calls)
     followed = []
     for tensor in policies[0].spec.outputs:
@@ -183,7 +185,7 @@ def _followed(policies: Sequence[Any], calls: Sequence[_Asked], usual: Mapping[s
             for which, policy in enumerate(policies)
         )
         value = correlation(mine, theirs, usual[tensor.name], concordant=tensor.kind != "discrete")
-        followed.append(Followed(kind, tensor.name, value, count))
+        followed.append(OutputAgreement(kind, tensor.name, value, count))
     return followed
 
 
@@ -200,28 +202,28 @@ def _physical(policy: Any, name: str, values: Sequence[Array]) -> Array:
 
 
 def correlation(mine: Array, theirs: Array, usual: Array | None = None, concordant: bool = False) -> float:
-    """Return how (N, ...) answers follow others, see ``Followed``; elements that do not vary do not count.
+    """Return how (N, ...) answers follow others, see ``OutputAgreement``; elements that do not vary do not count.
 
     It is Pearson's, or the concordance correlation (Lin, Biometrics 45, 1989), for which a tenth of each answer, or one
     that lies elsewhere, is another answer: it is never larger, and equal where mean and spread are.
     Where none varies, 1 says that they are near each other and 0 that they are not.
 
     Args:
-        mine: Answers that should follow.
-        theirs: Those that they should follow.
+        mine: answers that should follow.
+        theirs: outputs that they should agree with.
         usual: (...), how much each element varies elsewhere: one that stands still here counts by its share of that.
-        concordant: Whether scale and place count, as they do unless answers are logits.
+        concordant: whether scale and place count, as they do unless answers are logits.
     """
     if mine.shape != theirs.shape:
         return 0.0
     count = len(theirs)
     mine, theirs = mine.reshape(count, -1), theirs.reshape(count, -1)
     spread = theirs.std(axis=0)
-    varied = spread > STILL * max(float(np.abs(theirs).max(initial=0.0)), 1e-12)
+    varied = spread > MAX_STILL_SPREAD * max(float(np.abs(theirs).max(initial=0.0)), 1e-12)
     if not varied.any():
         near = float(np.linalg.norm(mine - theirs)) <= CLOSE * (float(np.linalg.norm(theirs)) or 1.0)
         return float(near)
-    floor = np.zeros(spread.shape) if usual is None else NEARLY_STILL * usual.reshape(-1)
+    floor = np.zeros(spread.shape) if usual is None else MIN_SPREAD_SHARE * usual.reshape(-1)
     by = np.maximum(spread, floor)[varied]
     middle = theirs.mean(axis=0)
     one, two = ((values - (middle if concordant else values.mean(axis=0)))[:, varied] / by for values in (mine, theirs))

@@ -1,4 +1,4 @@
-"""What a policy answers while it is timed: a fast wrong answer, and a fast remembered one, are no inference.
+"""Checks of the answers of a timed policy: a fast wrong answer, or a fast cached one, does not count as an inference.
 
 The same observation, noise and kept values must give the same answer in the timed run as in an unhurried pass before it
 (MLPerf's TEST01: accuracy in performance mode). Observations that the policy has never seen must take as long as those
@@ -22,11 +22,11 @@ from vlatool.stats.signed_rank import lower_bound
 
 TOLERANCE = 1e-3
 """Relative L2 difference of an output; threads that add up in another order differ by 1e-6."""
-REMEMBERS = 1.10
+MAX_FRESH_RATIO = 1.10
 """Fresh observations that take longer than this times a repeated one mean a memory (the margin of TEST04)."""
 ALPHA = 0.001
 PAIRS = 40
-FEWEST = 10
+MIN_PAIRS = 10
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class AnswerCheck:
     """Timed answers, held against those of an unhurried pass.
 
     Args:
-        looked: How many were looked at.
-        strays: How many differ.
-        worst: The largest relative difference; None when one is not finite, or of another shape.
-        first: Which of the calls was the first to differ, from 0; -1 for none.
+        looked: number of answers that were compared.
+        strays: number of those that differ.
+        worst: largest relative difference; None when one is not finite, or of another shape.
+        first: which of the calls was the first to differ, from 0; -1 for none.
     """
 
     looked: int
@@ -50,7 +50,7 @@ class Answers:
     """Compares outputs with those of an unhurried pass.
 
     Args:
-        expected: For each observation, output name -> array.
+        expected: expected outputs of each observation: output name -> array.
     """
 
     def __init__(self, expected: Sequence[Mapping[str, NDArray[Any]]]) -> None:
@@ -64,9 +64,9 @@ class Answers:
         """How many observations have an expected answer."""
         return len(self._expected)
 
-    def look(self, place: int, outputs: Mapping[str, NDArray[Any]]) -> None:
+    def look(self, index: int, outputs: Mapping[str, NDArray[Any]]) -> None:
         """Compare the outputs for the observation of that place."""
-        for name, expected in self._expected[place].items():
+        for name, expected in self._expected[index].items():
             got = outputs[name]
             if not np.array_equal(got, expected):
                 self._differs(got, expected)
@@ -74,7 +74,7 @@ class Answers:
 
     def _differs(self, got: NDArray[Any], expected: NDArray[Any]) -> None:
         wrong = relative_error(got, expected) if got.shape == expected.shape else math.inf
-        if not wrong <= TOLERANCE:  # also when it is no number
+        if not wrong <= TOLERANCE:  # also when it is not a number
             self.strays += 1
             self.worst = max(self.worst, wrong if math.isfinite(wrong) else math.inf)
             self.first = self.looked if self.first < 0 else self.first
@@ -104,9 +104,9 @@ class Memory:
     """How much longer observations take that the policy has never seen.
 
     Args:
-        ratio: Of the medians, fresh over repeated.
-        low: Lower bound of the ratio at 99.9 %; 0 when there are too few pairs.
-        pairs: How many.
+        ratio: ratio of the medians, fresh over repeated.
+        low: lower bound of the ratio at 99.9 %; 0 when there are too few pairs.
+        pairs: number of pairs.
     """
 
     ratio: float
@@ -116,10 +116,10 @@ class Memory:
     @property
     def remembers(self) -> bool:
         """Whether repeated observations are answered from memory."""
-        return self.low > REMEMBERS
+        return self.low > MAX_FRESH_RATIO
 
 
-def remembered(
+def measure_caching(
     policy: Policy, observations: Sequence[Mapping[str, Any]], seconds: float = 5.0, pairs: int = PAIRS
 ) -> Memory | None:
     """Time repeated observations against fresh ones in turns; None when nothing of an observation can be made fresh."""
@@ -129,10 +129,10 @@ def remembered(
     taken: tuple[list[float], list[float]] = ([], [])
     end = time.monotonic() + seconds
     for number in range(pairs):
-        if number >= FEWEST and time.monotonic() > end:
+        if number >= MIN_PAIRS and time.monotonic() > end:
             break
         repeated = observations[number % len(observations)]
-        fresh = varied(repeated, spec, random)
+        fresh = vary_observation(repeated, spec, random)
         for which in (0, 1) if number % 2 else (1, 0):
             observation = fresh if which else repeated
             start = time.perf_counter_ns()
@@ -145,16 +145,16 @@ def remembered(
     return Memory(ratio, min(ratio, math.exp(low)) if math.isfinite(low) else 0.0, len(logs))
 
 
-def varied(observation: Mapping[str, Any], spec: PolicySpec, random: np.random.Generator) -> dict[str, Any]:
+def vary_observation(observation: Mapping[str, Any], spec: PolicySpec, random: np.random.Generator) -> dict[str, Any]:
     """Return an observation that differs a little in every input that holds pixels or measurements."""
-    return {tensor.name: _varied(observation[tensor.name], tensor, random) for tensor in spec.inputs}
+    return {tensor.name: _vary(observation[tensor.name], tensor, random) for tensor in spec.inputs}
 
 
 def _can_vary(tensor: TensorSpec) -> bool:
     return tensor.kind == "tensor" and (tensor.dtype == "uint8" or tensor.dtype.startswith("float"))
 
 
-def _varied(value: Any, tensor: TensorSpec, random: np.random.Generator) -> Any:
+def _vary(value: Any, tensor: TensorSpec, random: np.random.Generator) -> Any:
     if not _can_vary(tensor):
         return value
     array = np.asarray(value)

@@ -1,4 +1,4 @@
-"""A question to a fresh process: one line of JSON in, one out, and its errors come back as they were raised.
+"""Calls of fresh processes: one line of JSON in, one out; their errors are raised again in the caller.
 
 What processes say to each other are the frozen dataclasses below, each as a mapping of its name to its fields.
 """
@@ -19,7 +19,7 @@ from vlatool.errors import GateFailed, GraphError, VlatoolError
 from vlatool.files.messages import from_json, to_json
 from vlatool.machine.processes import die_with_parent
 from vlatool.measurement.jobs import Limits
-from vlatool.measurement.limited import command, ran_out
+from vlatool.measurement.process_limits import command, ran_out
 
 REINSTALL = "see whether this Python runs vlatool at all: python -m vlatool doctor"
 CRASHES = (
@@ -27,7 +27,7 @@ CRASHES = (
 )
 
 T = TypeVar("T")
-LAST_WORDS = 240
+MAX_LAST_LINE = 240
 """Characters of the last line of a process that a signal ended: the end of an assertion says most."""
 NO_MEMORY = (
     "MemoryError",
@@ -91,12 +91,12 @@ def ask(
     """Run a module of vlatool in a fresh process and return what it answers.
 
     Args:
-        module: Run as ``python -m``; it calls ``serve``.
-        job: A dataclass, for its standard input.
-        kind: What it answers.
-        about: What is asked about, for errors.
-        timeout: Seconds; endless when None.
-        limits: Of the process.
+        module: run as ``python -m``; it calls ``serve``.
+        job: a dataclass, for its standard input.
+        kind: type of its answer.
+        about: subject of the question, for errors.
+        timeout: seconds; endless when None.
+        limits: limits of the process.
 
     Raises:
         VlatoolError: what the process raised, of the same class; GraphError when it ended in another way or answered
@@ -120,7 +120,7 @@ def ask(
     if isinstance(message, Raised):
         raise error_of(message, limits)
     if done.returncode or not isinstance(message, Result):
-        raise ended(about, done.returncode, done.stderr, limits)
+        raise end_error(about, done.returncode, done.stderr, limits)
     return result_of(message, kind, about)
 
 
@@ -143,8 +143,8 @@ def read_line(text: str, check: Callable[[Any], Any] = lambda value: value) -> M
     """Return the message of a line; None for what an engine prints, and for a line that was not written to its end.
 
     Args:
-        text: The line.
-        check: Called with its JSON values, and returns those that are read.
+        text: line of text.
+        check: function called with its JSON values, and returns those that are read.
     """
     try:
         ((name, value),) = check(json.loads(text)).items()
@@ -158,7 +158,7 @@ def error_of(
     limits: Limits = Limits(),  # noqa: B008
     otherwise: type[VlatoolError] = GraphError,
 ) -> VlatoolError:
-    """Return what a process says that it raised, as ``otherwise`` where that is no error of vlatool."""
+    """Return what a process says that it raised, as ``otherwise`` where that is not an error of vlatool."""
     if limits.memory_mb and any(sign in message.message for sign in NO_MEMORY):
         return too_large(limits)
     kind = getattr(errors, message.kind, None)
@@ -166,7 +166,7 @@ def error_of(
     return raised(message.message, message.fix)
 
 
-def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fresh process") -> VlatoolError:
+def end_error(about: str, code: int, log: str, limits: Limits, when: str = "in a fresh process") -> VlatoolError:
     """Return the error of a process that ended without a result, from its exit code and what it wrote to stderr."""
     if limits.memory_mb and (ran_out(limits) or any(sign in log for sign in NO_MEMORY)):
         return too_large(limits)
@@ -175,7 +175,7 @@ def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fre
             f"{about}: the process was killed (SIGKILL) {when}, as it is when memory runs out.", "use a smaller policy"
         )
     if code < 0:
-        last = log.strip().rpartition("\n")[2][-LAST_WORDS:]
+        last = log.strip().rpartition("\n")[2][-MAX_LAST_LINE:]
         said = f" It said last: {last}" if last else ""
         return GraphError(f"{about}: the process ended with {signal_name(code)} {when}.{said}", CRASHES)
     if code == 0:
@@ -203,8 +203,8 @@ def too_large(limits: Limits, seen: str = "") -> GateFailed:
     )
 
 
-def answers_alone() -> IO[str]:
-    """Return standard output for answers alone: what anybody else prints goes to standard error from now on."""
+def reserve_stdout() -> IO[str]:
+    """Reserve standard output for replies and return it; other output goes to standard error from now on."""
     stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return stream
@@ -217,7 +217,7 @@ def say(message: Message, stream: IO[str] | None = None) -> None:
     out.flush()
 
 
-def asked(kind: type[T]) -> T:
+def read_job(kind: type[T]) -> T:
     """Return the job on standard input."""
     return from_json(kind, json.loads(sys.stdin.readline()))
 
@@ -234,4 +234,4 @@ def answer(give: Callable[[], Any], stream: IO[str] | None = None) -> None:
 def serve(kind: type[T], run: Callable[[T], Any]) -> None:
     """Answer ``ask``: run the job on standard input; this process ends with the one that started it."""
     die_with_parent()
-    answer(lambda: run(asked(kind)))
+    answer(lambda: run(read_job(kind)))

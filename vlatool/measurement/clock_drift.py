@@ -8,7 +8,7 @@ from statistics import median
 
 LOOP = 20_000
 REPEATS = 5
-MOVED = 0.05
+MAX_DRIFT = 0.05
 """Share by which the middles of both halves may differ: more, and the run saw two machines."""
 
 

@@ -14,7 +14,7 @@ from vlatool.measurement.child import ask, serve
 from vlatool.measurement.jobs import ColdStartJob, Limits
 from vlatool.measurement.memory import peak_rss_mb, resident_mb
 
-MORE = 5
+FURTHER_CALLS = 5
 """Inferences after the first: an engine's arena may grow with the second."""
 PARTS = {
     "interpreter": "Python",
@@ -31,14 +31,14 @@ class ColdStart:
     """What a fresh process took.
 
     Args:
-        start_ms: From the start of the process until its first line of Python.
-        import_ms: For numpy and the runtime.
-        engine_ms: For the engine's library.
-        load_ms: To verify and load the graphs.
-        first_ms: The first inference after the load.
-        total_ms: From the start of the process to the first action.
-        peak_rss_mb: Memory at most (10^6 bytes).
-        rss_mb: Part (of ``PARTS``) -> what the process holds once that part is done.
+        start_ms: from the start of the process until its first line of Python.
+        import_ms: time to import numpy and the runtime.
+        engine_ms: time to import the engine's library.
+        load_ms: to verify and load the graphs.
+        first_ms: time of the first inference after loading.
+        total_ms: from the start of the process to the first action.
+        peak_rss_mb: memory at most (10^6 bytes).
+        rss_mb: part (of ``PARTS``) -> what the process holds once that part is done.
     """
 
     start_ms: float
@@ -62,9 +62,9 @@ def cold_start(
     """Probe a bundle in a fresh process, which may take ``timeout`` seconds.
 
     Args:
-        bundle, engine, threads: What is loaded, and how.
-        limits, timeout: Of the process.
-        observations: File of observations (``save_drawn``) to infer on after the golden one.
+        bundle, engine, threads: bundle to load, with which engine and threads.
+        limits, timeout: limits and timeout of the process.
+        observations: file of observations (``save_drawn``) to infer on after the golden one.
 
     Raises:
         VlatoolError: what the bundle raises; GraphError when the process ends in another way, or takes longer.
@@ -96,7 +96,7 @@ def run(job: ColdStartJob) -> ColdStart:
     policy.infer(observation, noise=noise)
     acted = time.monotonic_ns()
     rss["first"] = resident_mb()
-    for _ in range(MORE):
+    for _ in range(FURTHER_CALLS):
         policy.infer(observation, noise=noise)
     if job.observations:
         _infer_on(policy, Path(job.observations))

@@ -18,11 +18,11 @@ from vlatool.runtime.policy import Policy
 from vlatool.stats.intervals import quantile_interval
 from vlatool.stats.percentiles import PERCENTILES, Percentile, percentile
 
-MOST = 2_000_000
-"""Calls of each after which a run ends before its duration does: every one of them is kept."""
+MAX_CALLS = 2_000_000
+"""Largest number of calls of each policy in a run, all of which are stored."""
 BLOCKS = 20
 """Rounds in which every policy takes its turn; ratios are taken within a round."""
-Tell = Callable[[str, "float | None"], None]
+OnProgress = Callable[[str, "float | None"], None]
 
 
 @dataclass
@@ -30,8 +30,8 @@ class Contestant:
     """One policy in the run: its bundle, how it is opened, and the milliseconds of each inference.
 
     Args:
-        starts: When each inference began, in seconds of ``time.monotonic``.
-        answers: What the policy is expected to answer; None when that is not looked at.
+        starts: begin of each inference, in seconds of ``time.monotonic``.
+        answers: expected answers of the policy; None when they are not compared.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Contestant:
     answers: Answers | None = None
 
     def warm_up(self, inferences: int) -> None:
-        """Infer so often, untimed."""
+        """Run a number of untimed inferences."""
         for index in range(inferences):
             self.policy.infer(self.observations[index % len(self.observations)])
 
@@ -57,19 +57,19 @@ def run_interleaved(
     contestants: Sequence[Contestant],
     iterations: int,
     warmup: int,
-    tell: Tell,
+    tell: OnProgress,
     duration: float = 0.0,
     between: Callable[[], None] = lambda: None,
 ) -> None:
     """Time each policy after ``warmup`` untimed inferences, in rounds of seeded random order.
 
     Args:
-        contestants: Get their samples.
-        iterations: Inferences of each, at least.
-        warmup: Untimed ones before.
-        tell: What is being done, and the share that is done.
-        duration: Seconds that each is timed for, at least.
-        between: Called before each round and after the last.
+        contestants: get their samples.
+        iterations: inferences of each, at least.
+        warmup: untimed ones before.
+        tell: callback: what is being done, and the share that is done.
+        duration: seconds that each is timed for, at least.
+        between: called before each round and after the last.
     """
     for contestant in contestants:
         contestant.warm_up(warmup)
@@ -87,17 +87,17 @@ def _time(contestant: Contestant, count: int, seconds: float) -> None:
     observations, infer, answers = contestant.observations, contestant.policy.infer, contestant.answers
     taken, starts, size = array("d"), contestant.starts, len(observations)
     end = time.perf_counter() + seconds
-    while len(taken) < count or (time.perf_counter() < end and len(starts) < MOST):
-        place = len(starts) % size
-        if not place:
+    while len(taken) < count or (time.perf_counter() < end and len(starts) < MAX_CALLS):
+        index = len(starts) % size
+        if not index:
             contestant.policy.reset()  # the same noise and kept values in every turn through the observations
-        observation = observations[place]
+        observation = observations[index]
         starts.append(time.monotonic())
         start = time.perf_counter_ns()
         action = infer(observation)
         taken.append((time.perf_counter_ns() - start) / 1e6)
         if answers is not None:
-            answers.look(place, action.outputs)
+            answers.look(index, action.outputs)
     contestant.blocks.append(taken)
 
 
@@ -107,8 +107,8 @@ def latency_measurements(
     """Return the percentiles and the maximum in ms, each percentile with its upper bound at 99 %.
 
     Args:
-        samples: In ms, in the order in which they were taken.
-        refusals, most, seconds: As ``percentile_measurements`` takes them; back to back when ``seconds`` is None.
+        samples: samples in ms, in the order in which they were taken.
+        refusals, most, seconds: as in ``percentile_measurements``; back to back when ``seconds`` is None.
     """
     taken = sum(samples) / 1e3 if seconds is None else seconds
     percentiles = percentile_measurements("latency", samples, PERCENTILES, refusals, most, taken)
@@ -130,12 +130,12 @@ def percentile_measurements(
     it. Any other percentile that is not bounded is left out, or, with ``refusals``, named with what it would take.
 
     Args:
-        what: The name before ``_p50``.
-        samples: In ms, in the order in which they were taken.
+        what: name before ``_p50``.
+        samples: samples in ms, in the order in which they were taken.
         percents: 0-100.
-        refusals: Whether a percentile that the samples cannot bound is named.
-        most: Independent calls that the samples are worth at most; 0 where nothing can be said.
-        seconds: That it took to take them, for the refusals.
+        refusals: whether a percentile that the samples cannot bound is named.
+        most: independent calls that the samples are worth at most; 0 where nothing can be said.
+        seconds: seconds that it took to take them, for the refusals.
     """
     measured, count = [], len(samples)
     for percent in percents:

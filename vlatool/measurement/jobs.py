@@ -11,10 +11,10 @@ class Limits:
     """What the measured processes may use.
 
     Args:
-        cpus: Numbers of the processors; every one that the process may use anyway when empty.
-        cores: How many of them, the first ones; all when 0.
-        memory_mb: Memory of a process in MB (10^6 bytes); 0 is no limit.
-        cgroup: Directory of the control group that holds the limit; empty when the process limits itself.
+        cpus: numbers of the processors; every one that the process may use anyway when empty.
+        cores: number of processors, the first ones; all when 0.
+        memory_mb: memory of a process in MB (10^6 bytes); 0 for no limit.
+        cgroup: directory of the control group that holds the limit; empty when the process limits itself.
     """
 
     cpus: tuple[int, ...] = ()
@@ -31,18 +31,18 @@ class LatencyJob:
     """A benchmark of the latency.
 
     Args:
-        bundles: Directories; the first is the reference of ratios.
-        engine: Of the runtime; that which each bundle was made for when empty.
-        threads: Intra-op threads.
-        iterations: Calls of each that count, at least.
-        duration: Seconds that the calls of each last, at least; with ``iterations`` the later of both.
-        warmup: Calls before the first that counts.
-        rate: Ticks in a second of a control loop; 0 calls back to back. One bundle only.
-        phases: Also time the parts of an inference.
-        cold: Fresh processes for the cold start of each.
-        check: Also look for answers that differ between runs, and for answers from memory.
-        limits: Of every process.
-        reach: Also time a large matrix product in what each policy computes in.
+        bundles: directories; the first is the reference of ratios.
+        engine: engine of the runtime; that which each bundle was made for when empty.
+        threads: intra-op threads.
+        iterations: calls of each that count, at least.
+        duration: seconds that the calls of each last, at least; with ``iterations`` the later of both.
+        warmup: calls before the first that counts.
+        rate: ticks in a second of a control loop; 0 calls back to back. One bundle only.
+        phases: also time the parts of an inference.
+        cold: fresh processes for the cold start of each.
+        check: also look for answers that differ between runs, and for answers from memory.
+        limits: limits of every process.
+        reach: also time a large matrix product in what each policy computes in.
     """
 
     bundles: tuple[str, ...]
@@ -64,8 +64,8 @@ class WorkerJob:
     """What the agent asks of the worker.
 
     Args:
-        job: The benchmark.
-        named: Folders whose code the user lets run (``trust.named_so_far``).
+        job: job of the benchmark.
+        named: folders whose code the user lets run (``trust.named_folders``).
     """
 
     job: LatencyJob
@@ -77,11 +77,11 @@ class ColdStartJob:
     """One cold start.
 
     Args:
-        bundle: Directory.
-        engine: Of the runtime; that which the bundle was made for when empty.
-        threads: Intra-op threads.
-        begun_ns: When the process was started, on the clock that is the same in every process of a machine.
-        observations: File of observations (``save_drawn``) to infer on after the golden one; none when empty.
+        bundle: directory.
+        engine: engine of the runtime; that which the bundle was made for when empty.
+        threads: intra-op threads.
+        begun_ns: start of the process, on the clock that all processes of a machine share.
+        observations: file of observations (``save_drawn``) to infer on after the golden one; none when empty.
     """
 
     bundle: str

@@ -16,7 +16,7 @@ from typing import Any
 
 from vlatool.measurement.answers import Answers
 from vlatool.measurement.interleaved import percentile_measurements
-from vlatool.measurement.measured import Pace
+from vlatool.measurement.results import Pace
 from vlatool.report import Measurement
 from vlatool.runtime.policy import Policy
 from vlatool.stats.intervals import wilson
@@ -25,7 +25,7 @@ TELL_S = 1.0
 """Seconds between two reports of progress."""
 SLACK_S = 4e-3
 """Time until the next tick in which ``between`` may be called."""
-OVERLOADED = 0.01
+OVERLOAD = 0.01
 """Share of ticks that are passed over from which a loop is too fast for the policy: ticks that share an inference are
 no independent samples, and no bound is given for them."""
 
@@ -39,13 +39,13 @@ class Ticks:
     """What a loop saw, one entry for each tick.
 
     Args:
-        period_ms: Between two ticks.
-        response_ms: From the moment at which a tick was due to the action that served it.
-        due_s: When it was due, ``time.monotonic``.
-        wakeup_ms: How late the loop woke up for a tick that it slept until.
-        served: For each inference, the ticks that it served.
-        age_ms: How old the observation behind the newest action was when the tick was due; from the second action on.
-        passed_over: Ticks that began and ended while the policy computed.
+        period_ms: between two ticks.
+        response_ms: from the moment at which a tick was due to the action that served it.
+        due_s: time at which it was due (``time.monotonic``).
+        wakeup_ms: delay with which the loop woke up for a tick that it slept until.
+        served: ticks that each inference served.
+        age_ms: age of the observation behind the newest action when the tick was due; from the second action on.
+        passed_over: ticks that began and ended while the policy computed.
     """
 
     period_ms: float
@@ -88,14 +88,14 @@ def run_paced(
     """Serve ticks of a control loop.
 
     Args:
-        policy: Answers.
-        observations: In turns.
-        rate: Ticks in a second.
-        ticks: How many.
-        answers: What the policy is expected to answer.
-        tell: What is being done, and the share that is done.
-        clock, sleep: In seconds; other ones in tests.
-        between: Called with the share of ticks that are done, where there is time until the next.
+        policy: answers.
+        observations: observations, used in turns.
+        rate: ticks in a second.
+        ticks: number of ticks.
+        answers: expected answers of the policy.
+        tell: callback: what is being done, and the share that is done.
+        clock, sleep: functions in seconds, replaced in tests.
+        between: function called with the share of ticks that are done, where there is time until the next.
     """
     period = 1.0 / rate
     ticked = Ticks(period * 1e3)
@@ -103,8 +103,8 @@ def run_paced(
     tick, served, last_told = 0, 0, -TELL_S
     actions: list[tuple[float, float]] = []  # the last two: when the observation was taken, when the action was there
     while tick < ticks:
-        place = served % len(observations)
-        if not place:
+        index = served % len(observations)
+        if not index:
             policy.reset()
         if (now := clock()) - last_told >= TELL_S:
             tell(f"serving ticks at {rate:g} Hz", tick / ticks)
@@ -115,7 +115,7 @@ def run_paced(
             ticked.wakeup_ms.append((clock() - due) * 1e3)
         now = clock()
         newest = min(ticks - 1, max(tick, int((now - begun) / period)))
-        action = policy.infer(observations[place])
+        action = policy.infer(observations[index])
         done = clock()
         ticked.passed_over += newest - tick
         ticked.served.append(newest + 1 - tick)
@@ -128,7 +128,7 @@ def run_paced(
         actions = [*actions[-1:], (now, done)]
         served, tick = served + 1, newest + 1
         if answers is not None:
-            answers.look(place, action.outputs)
+            answers.look(index, action.outputs)
         if begun + tick * period - clock() > SLACK_S:
             between(tick / ticks)
     return ticked
@@ -136,7 +136,7 @@ def run_paced(
 
 def paced_measurements(pace: Pace, ticks: int, rate: float) -> list[Measurement]:
     """Return misses, ages and lateness of a loop."""
-    size = 0 if overloaded(pace, ticks) else int(pace.effective_sample_size)
+    size = 0 if is_overloaded(pace, ticks) else int(pace.effective_sample_size)
     low, high = wilson(min(size, round(pace.misses * size / ticks)), size) if size else (None, None)
     note = f"ticks at {rate:g} Hz whose action came after the next tick, {pace.period_ms:g} ms later; "
     note += f"{pace.inferences:,} inferences, {pace.passed_over:,} ticks passed over while the policy computed"
@@ -156,6 +156,6 @@ def _percentiles(what: str, samples: Sequence[float], size: float, seconds: floa
     return [replace(percentile, note=percentile.note or about) for percentile in percentiles]
 
 
-def overloaded(pace: Pace, ticks: int) -> bool:
+def is_overloaded(pace: Pace, ticks: int) -> bool:
     """Say whether so many ticks share an inference that nothing can be bounded."""
-    return pace.passed_over > OVERLOADED * ticks
+    return pace.passed_over > OVERLOAD * ticks

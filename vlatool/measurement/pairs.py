@@ -20,14 +20,14 @@ class PairJob:
     """What a process measures.
 
     Args:
-        baseline, candidate: Directories of bundles.
-        engine: Of the runtime; that which each bundle was made for when empty.
-        threads: Intra-op threads.
-        warmup: Calls of each before the first that counts.
-        pairs: Calls of each that count.
-        seconds: After which no further pair begins, once ``FEWEST`` are measured.
-        seed: Of the order in which the bundles are loaded and called, and of noise and changes to observations.
-        observations: File of observations (``save_drawn``); drawn by the seed from the baseline alone when empty.
+        baseline, candidate: directories of bundles.
+        engine: engine of the runtime; that which each bundle was made for when empty.
+        threads: intra-op threads.
+        warmup: calls of each before the first that counts.
+        pairs: calls of each that count.
+        seconds: time after which no further pair begins, once ``FEWEST`` are measured.
+        seed: seed of the order in which the bundles are loaded and called, and of noise and changes to observations.
+        observations: file of observations (``save_drawn``); drawn by the seed from the baseline alone when empty.
     """
 
     baseline: str
@@ -46,7 +46,7 @@ class PairJob:
         return f"{self.candidate} beside {self.baseline}"
 
 
-MOST = 2.0
+MAX_FACTOR = 2.0
 """The largest factor that one observation counts for in the mean."""
 FEWEST = 30
 """Pairs that are measured however long they take: a median of fewer says little."""
@@ -57,15 +57,15 @@ class Pairs:
     """What a process found.
 
     Args:
-        baseline_ms, candidate_ms: Milliseconds of each call, in the order of the pairs.
-        places: What each pair was called with: an observation given exactly, or the same one varied, are two places
+        baseline_ms, candidate_ms: milliseconds of each call, in the order of the pairs.
+        places: what each pair was called with: an observation given exactly, or the same one varied, are two places
             (``turns.place_of``); each pair has one of its own when empty.
-        slow: Logarithms of candidate over baseline, of further pairs at the place that seemed the slowest for the
+        slow: logarithms of candidate over baseline, of further pairs at the place that seemed the slowest for the
             candidate; empty when none seemed slow.
-        slow_input: The observation of that place, in words.
-        looked: Timed answers of the candidate that were held against those of a fresh session.
-        strays: How many of those differ.
-        unsteady: How many of the baseline's differ likewise, looked at when the candidate's do.
+        slow_input: observation of that place, in words.
+        looked: timed answers of the candidate that were held against those of a fresh session.
+        strays: number of those that differ.
+        unsteady: number of the baseline's that differ, compared when the candidate's do.
     """
 
     baseline_ms: tuple[float, ...]
@@ -86,24 +86,24 @@ class Pairs:
     def mean_log_ratio(self) -> float:
         """The mean over places of the same, each from the medians of its calls: what some slow ones change.
 
-        One place counts for a factor of ``MOST`` at most: a call that the machine interrupted would outweigh all
+        One place counts for a factor of ``MAX_FACTOR`` at most: a call that the machine interrupted would outweigh all
         others, and what is slower than that at few places is found by ``slow``.
         """
         mine, theirs = (self.medians(taken) for taken in (self.candidate_ms, self.baseline_ms))
-        most = math.log(MOST)
-        return fmean(min(most, max(-most, math.log(mine[place] / theirs[place]))) for place in mine)
+        most = math.log(MAX_FACTOR)
+        return fmean(min(most, max(-most, math.log(mine[index] / theirs[index]))) for index in mine)
 
     def medians(self, taken: Sequence[float]) -> dict[int, float]:
         """Return place -> median of its calls, of one of the two series."""
         return medians(taken, self.places or range(len(taken)))
 
 
-def medians(taken: Sequence[float], places: Sequence[int]) -> dict[int, float]:
+def medians(taken: Sequence[float], indices: Sequence[int]) -> dict[int, float]:
     """Return place -> median of its calls."""
     calls: dict[int, list[float]] = {}
-    for value, place in zip(taken, places, strict=True):
-        calls.setdefault(place, []).append(value)
-    return {place: median(values) for place, values in calls.items()}
+    for value, index in zip(taken, indices, strict=True):
+        calls.setdefault(index, []).append(value)
+    return {index: median(values) for index, values in calls.items()}
 
 
 def measure_pairs(job: PairJob, timeout: float | None = None) -> Pairs:

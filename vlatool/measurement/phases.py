@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.measurement.measured import Phase
+from vlatool.measurement.results import Phase
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program, Session
 
@@ -35,9 +35,9 @@ def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], secon
     """Return the parts of an inference, in their order.
 
     Args:
-        policy: Left as it was.
-        observations: In turns.
-        seconds: After which no further action begins, once ``FEWEST`` are timed.
+        policy: left as it was.
+        observations: observations, used in turns.
+        seconds: time after which no further action begins, once ``FEWEST`` are timed.
     """
     sessions = {name: _Timed(session) for name, session in policy.program.sessions.items()}
     timed = Policy(policy.bundle, Program(policy.program.steps, sessions, seed=0), policy.engine)

@@ -24,7 +24,7 @@ MACS = SIZE**3
 DTYPES = (INT8, FLOAT32, BFLOAT16)
 REPEATS = 5
 """Timed products of each dtype; the fastest counts, since other work only slows a product down."""
-LIKELY, POSSIBLE = 1.25, 4.0
+LIKELY_SHARE, POSSIBLE = 1.25, 4.0
 """Speed beside the large product's from which it is told, and beyond which no kernel is: OpenVINO's convolutions
 reach 2.8 times the speed of its int8 products with AVX2."""
 IN_FLOAT = (
@@ -50,9 +50,9 @@ class Product:
     """The product, open in an engine.
 
     Args:
-        engine: Name of the engine; the default one when empty.
+        engine: name of the engine; the default one when empty.
         dtype: ``int8``, ``float32`` or ``bfloat16``.
-        threads: Of the engine.
+        threads: threads of the engine.
 
     Raises:
         GraphError: when the engine refuses it, or does not compute in that dtype.
@@ -69,7 +69,7 @@ class Product:
         return outputs
 
 
-def reached(engine: str, dtype: str, threads: int | None) -> float:
+def measure_reach(engine: str, dtype: str, threads: int | None) -> float:
     """Return how many multiply-accumulates an engine does in a second in a dtype, in 10^9.
 
     Raises:
@@ -85,12 +85,12 @@ def reached(engine: str, dtype: str, threads: int | None) -> float:
     return MACS / min(seconds) / 1e9
 
 
-def reached_in(engine: str, dtypes: Iterable[str], threads: int | None) -> dict[str, float]:
+def reach_by_dtype(engine: str, dtypes: Iterable[str], threads: int | None) -> dict[str, float]:
     """Return what an engine reaches in each of some dtypes, as far as it computes the product in them."""
     found: dict[str, float] = {}
     for dtype in set(dtypes).intersection(DTYPES):
         with contextlib.suppress(GraphError):
-            found[dtype] = round(reached(engine, dtype, threads), 3)
+            found[dtype] = round(measure_reach(engine, dtype, threads), 3)
     return found
 
 
@@ -98,9 +98,9 @@ def share_of_reach(macs: Mapping[str, float], reach: Mapping[str, float], second
     """Return which part of a time the work would take at the speed of the large products.
 
     Args:
-        macs: Dtype -> multiply-accumulates.
-        reach: Dtype -> 10^9 multiply-accumulates in a second.
-        seconds: What it took.
+        macs: dtype -> multiply-accumulates.
+        reach: dtype -> 10^9 multiply-accumulates in a second.
+        seconds: time that it took.
 
     Returns:
         A share, above 1 where another kernel is faster than that of the product; None where a dtype was not timed.

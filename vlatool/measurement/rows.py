@@ -1,4 +1,4 @@
-"""From what a measurement found to the rows of a report."""
+"""The rows of a report from the result of a benchmark."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 
 from vlatool.measurement.cold_start import PARTS, ColdStart
 from vlatool.measurement.interleaved import latency_measurements, percentile_measurements, speedup_of
-from vlatool.measurement.measured import Measured, PolicyRun
-from vlatool.measurement.paced import overloaded, paced_measurements
+from vlatool.measurement.paced import is_overloaded, paced_measurements
+from vlatool.measurement.results import Benchmark, PolicyRun
 from vlatool.report import Measurement
 from vlatool.telemetry import DEGREE, THROTTLE, Absent, Summary
 
 ENERGY_S = 10.0
 """Seconds below which the energy of a run says little (MLPerf Tiny: runs of 10 s)."""
-OWN = ("process.cpu", "process.involuntary_switches")
+OWN_COUNTERS = ("process.cpu", "process.involuntary_switches")
 """Counters that the measurements hold over exactly the timed part."""
 OTHER_BOARDS = ("this is no ", "virtual machine or ", "NVIDIA card", "NVML tells nothing")
 """What the reason says where a source of telemetry belongs to another kind of board: told in one line."""
@@ -27,21 +27,21 @@ WINDOW = 0.1
 """Share of a sustained run that is its start, and its end."""
 
 
-def measurements(measured: Measured, policy: PolicyRun, reference: PolicyRun | None, rate: float) -> list[Measurement]:
+def measurements(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | None, rate: float) -> list[Measurement]:
     """Return the numbers of one policy.
 
     Args:
-        measured: The whole run.
-        policy: One of its policies.
-        reference: What its speed is compared with; None when it ran alone.
-        rate: Ticks in a second; 0 for calls back to back.
+        measured: result of the whole run.
+        policy: one of its policies.
+        reference: policy that its speed is compared with; None when it ran alone.
+        rate: ticks in a second; 0 for calls back to back.
     """
     samples, pace = policy.samples, policy.pace
-    most = math.inf if not pace else 0.0 if overloaded(pace, len(samples)) else pace.effective_sample_size
+    most = math.inf if not pace else 0.0 if is_overloaded(pace, len(samples)) else pace.effective_sample_size
     seconds = len(samples) / rate if pace else None
     numbers = latency_measurements(samples, refusals=reference is None, most=most, seconds=seconds)
     if reference is not None:
-        return [*numbers, speedup_of(policy.blocks_ms, reference.blocks_ms, reference.name), *cold(policy)]
+        return [*numbers, speedup_of(policy.blocks_ms, reference.blocks_ms, reference.name), *cold_rows(policy)]
     if pace:
         note = "from the moment at which the tick was due"
         numbers = [replace(number, note=number.note or note) for number in numbers]
@@ -51,7 +51,12 @@ def measurements(measured: Measured, policy: PolicyRun, reference: PolicyRun | N
     numbers.append(_jitter(samples))
     busy = measured.cpu_s / max(measured.wall_s, 1e-9)
     numbers.append(Measurement("cpu", busy, "cores", note="user and system time of the process over the run"))
-    return [*numbers, *_board(measured, pace.inferences if pace else len(samples)), *_golden(policy), *cold(policy)]
+    return [
+        *numbers,
+        *_board(measured, pace.inferences if pace else len(samples)),
+        *_golden(policy),
+        *cold_rows(policy),
+    ]
 
 
 def _throughput(samples: Sequence[float]) -> Measurement:
@@ -63,7 +68,7 @@ def _jitter(samples: Sequence[float]) -> Measurement:
     return Measurement("jitter", value, "ms", samples=len(samples), note="between the quartiles of the latency")
 
 
-def _board(measured: Measured, actions: int) -> list[Measurement]:
+def _board(measured: Benchmark, actions: int) -> list[Measurement]:
     """Return power, energy and the highest temperature, where the board tells them."""
     telemetry = measured.telemetry
     if telemetry is None:
@@ -90,7 +95,7 @@ def _golden(policy: PolicyRun) -> list[Measurement]:
     return [] if error is None else [Measurement("golden_error", error, "1", samples=1, note=note)]
 
 
-def cold(policy: PolicyRun) -> list[Measurement]:
+def cold_rows(policy: PolicyRun) -> list[Measurement]:
     """Return the cold start and the memory of fresh processes."""
     starts = policy.cold
     if policy.cold_error:
@@ -109,7 +114,7 @@ def cold(policy: PolicyRun) -> list[Measurement]:
     ]
 
 
-def sustained(samples: Sequence[float]) -> list[Measurement]:
+def sustained_rows(samples: Sequence[float]) -> list[Measurement]:
     """Return the median at the start of a long run and at its end, each with its bound, and their ratio."""
     count = max(1, int(WINDOW * len(samples)))
     ends = []
@@ -121,7 +126,7 @@ def sustained(samples: Sequence[float]) -> list[Measurement]:
     return [*ends, Measurement("sustained_slowdown", slowdown, "x", samples=2 * count, note=note)]
 
 
-def raw(measured: Measured, policy: PolicyRun, alone: bool) -> dict[str, list[float]]:
+def raw(measured: Benchmark, policy: PolicyRun, alone: bool) -> dict[str, list[float]]:
     """Return every sample: latencies, when each call began, and, of a run alone, what the board told meanwhile."""
     series = {"latency_ms": policy.samples, "at_s": list(policy.at_s)}
     if not alone or measured.telemetry is None:
@@ -135,7 +140,7 @@ def raw(measured: Measured, policy: PolicyRun, alone: bool) -> dict[str, list[fl
     return {**series, **({"throttled_at_s": sorted(moments)} if moments else {})}
 
 
-def tables(measured: Measured, policy: PolicyRun, alone: bool) -> dict[str, list[dict[str, Any]]]:
+def tables(measured: Benchmark, policy: PolicyRun, alone: bool) -> dict[str, list[dict[str, Any]]]:
     """Return what belongs to a policy as tables: engine, phases, memory and cold start by part, telemetry."""
     details: dict[str, list[dict[str, Any]]] = {}
     if policy.engines:
@@ -183,13 +188,13 @@ def _telemetry(telemetry: Summary) -> dict[str, list[dict[str, Any]]]:
     counters = [
         {"reading": name, "unit": counter.unit, "difference": round(counter.difference, 4)}
         for name, counter in telemetry.counters.items()
-        if name not in OWN
+        if name not in OWN_COUNTERS
     ]
-    unmeasured = _unmeasured(telemetry.unmeasured)
+    unmeasured = _absent_table(telemetry.unmeasured)
     return {"telemetry": [*gauges, *counters], **({"unmeasured": unmeasured} if unmeasured else {})}
 
 
-def _unmeasured(absent: Sequence[Absent]) -> list[dict[str, str]]:
+def _absent_table(absent: Sequence[Absent]) -> list[dict[str, str]]:
     """Return what is unmeasured and why; sources of other kinds of boards in one line."""
     others = [part.reader for part in absent if any(sign in part.reason for sign in OTHER_BOARDS)]
     lines = [{"what": part.reader, "why": part.reason} for part in absent if part.reader not in others]

@@ -7,7 +7,7 @@ same observation, with the same bits and the same noise, goes to both bundles. E
 three times but never twice in a row, so that however early a slow policy is cut off, its latency is a median, of exact
 calls or of varied ones. Afterwards fresh sessions answer some of the timed calls again.
 
-A place is what a call was made with: an observation, exact or varied (``place_of``).
+A place is what a call was made with: an observation, exact or varied (``variant_index``).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import DRAWN, RECORDED, Drawer, Drawn, read_drawn
 from vlatool.errors import GraphError, VlatoolError
-from vlatool.measurement.answers import Answers, varied
+from vlatool.measurement.answers import Answers, vary_observation
 from vlatool.measurement.child import serve
 from vlatool.measurement.pairs import FEWEST, PairJob, Pairs, medians
 from vlatool.runtime import Policy, load
@@ -41,7 +41,7 @@ SUSPECT = 1.25
 """Candidate over baseline from which an observation is called further times."""
 CONFIRM = 20
 """Those further pairs."""
-REPLAYED = 24
+MAX_REPLAYED = 24
 """Timed answers that a fresh session gives again."""
 
 
@@ -99,7 +99,7 @@ class Turns:
 
     def _load(self, which: int) -> Policy:
         path = (self.job.baseline, self.job.candidate)[which]
-        return loaded(path, self.job)
+        return load_policy(path, self.job)
 
     def _warm_up(self, policy: Policy) -> None:
         begun, number = time.monotonic(), 0
@@ -116,31 +116,31 @@ class Turns:
         while called < self.job.pairs:
             if called >= FEWEST and time.monotonic() - begun > self.job.seconds:
                 break
-            block = [(number * BLOCK + place) % len(self.pool) for place in range(min(BLOCK, len(self.pool)))]
-            block = halved(block, self.order)
+            block = [(number * BLOCK + offset) % len(self.pool) for offset in range(min(BLOCK, len(self.pool)))]
+            block = halve(block, self.order)
             called += self._time_block(sequence(block, self.order)[: self.job.pairs - called])
             number += 1
 
-    def _time_block(self, places: Sequence[int]) -> int:
+    def _time_block(self, indices: Sequence[int]) -> int:
         """Time a block and keep its calls for the replay, or some of them; return how many there were."""
         for policy in self.policies:
             policy.reset()
-        calls = [call for place in places if (call := self._pair(place)) is not None]
+        calls = [call for index in indices if (call := self._pair(index)) is not None]
         if self._keeps_values():  # what they answer depends on all that came before: one block, from its start
-            whole = len(calls) == len(places)
+            whole = len(calls) == len(indices)
             self.kept = calls if whole and (not self.kept or self.order.random() < 0.5) else self.kept
         else:
             self.kept += self.order.sample(calls, min(len(calls), REPEATS + 2))
-        return len(places)
+        return len(indices)
 
     def _keeps_values(self) -> bool:
         return any(step.keep for step in self.steps)
 
-    def _pair(self, place: int) -> Call | None:
+    def _pair(self, index: int) -> Call | None:
         """Time both with an observation, exact or varied; None when the baseline cannot answer it."""
-        if place in self.unusable:
+        if index in self.unusable:
             return None
-        observation, noise = self._variant(place)
+        observation, noise = self._variant(index)
         took = [0.0, 0.0]
         outputs: list[dict[str, Any]] = [{}, {}]
         failed: dict[int, GraphError] = {}
@@ -155,66 +155,66 @@ class Turns:
             took[which] = (time.perf_counter_ns() - start) / 1e6
             outputs[which] = {name: np.array(value) for name, value in action.outputs.items()}
         if failed:
-            self._skip(place, failed)
+            self._skip(index, failed)
             return None
-        self.places.append(place)
+        self.places.append(index)
         for which in (0, 1):
             self.taken[which].append(took[which])
         return Call(observation, noise, (outputs[0], outputs[1]))
 
-    def _skip(self, place: int, failed: Mapping[int, GraphError]) -> None:
+    def _skip(self, index: int, failed: Mapping[int, GraphError]) -> None:
         """Leave out what the baseline cannot answer.
 
         Raises:
             GraphError: when it is the candidate alone that cannot.
         """
         if 0 not in failed:
-            what = f"{self.job.candidate} fails where the baseline answers ({self._told(place)})"
+            what = f"{self.job.candidate} fails where the baseline answers ({self._describe(index)})"
             raise GraphError(f"{what}: {failed[1].message}", failed[1].fix)
-        self.unusable.add(place)
+        self.unusable.add(index)
         for policy in self.policies:
             policy.reset()
 
-    def _variant(self, place: int) -> tuple[dict[str, Any], dict[str, Any] | None]:
-        number, exact = observation_of(place)
+    def _variant(self, index: int) -> tuple[dict[str, Any], dict[str, Any] | None]:
+        number, exact = observation_of(index)
         drawn = self.pool[number].observation
-        observation = dict(drawn) if exact else varied(drawn, self.spec, self.noise)
+        observation = dict(drawn) if exact else vary_observation(drawn, self.spec, self.noise)
         noise = {name: draw(wanted, self.noise) for step in self.steps for name, wanted in step.noise.items()}
         return observation, noise or None
 
-    def _told(self, place: int) -> str:
-        number, exact = observation_of(place)
-        return described(self.pool[number], exact)
+    def _describe(self, index: int) -> str:
+        number, exact = observation_of(index)
+        return describe(self.pool[number], exact)
 
     def _confirm(self) -> tuple[tuple[float, ...], str]:
         """Time further pairs of the place (an observation, exact or varied) where the candidate seemed the slowest."""
         mine, theirs = (medians(self.taken[which], self.places) for which in (1, 0))
-        place = max(mine, key=lambda place: mine[place] / theirs[place])
-        if mine[place] / theirs[place] < SUSPECT:
+        index = max(mine, key=lambda index: mine[index] / theirs[index])
+        if mine[index] / theirs[index] < SUSPECT:
             return (), ""
         before = len(self.places)
         logs: list[float] = []
         for _ in range(CONFIRM):
             self._pair(self.order.choice(self.places[:before]))  # another one between them
-            if self._pair(place) is not None:
+            if self._pair(index) is not None:
                 logs.append(math.log(self.taken[1][-1] / self.taken[0][-1]))
         del self.places[before:], self.taken[0][before:], self.taken[1][before:]
-        return tuple(logs), f"{self._told(place)}: {math.exp(median(logs)):.2f}x" if logs else ""
+        return tuple(logs), f"{self._describe(index)}: {math.exp(median(logs)):.2f}x" if logs else ""
 
     def _replay(self, which: int) -> tuple[int, int]:
         """Let a fresh session answer the kept calls; return how many, and how many it answers otherwise."""
         policy = self._load(which)
         keeps = self._keeps_values()
-        calls = self.kept if keeps else self.order.sample(self.kept, min(REPLAYED, len(self.kept)))
+        calls = self.kept if keeps else self.order.sample(self.kept, min(MAX_REPLAYED, len(self.kept)))
         answers = Answers([call.outputs[which] for call in calls])
-        for place, call in enumerate(calls):
-            if place == 0 or not keeps:
+        for number, call in enumerate(calls):
+            if number == 0 or not keeps:
                 policy.reset()
-            answers.look(place, policy.infer(call.observation, noise=call.noise).outputs)
+            answers.look(number, policy.infer(call.observation, noise=call.noise).outputs)
         return answers.looked, answers.strays
 
 
-def loaded(path: str, job: PairJob) -> Policy:
+def load_policy(path: str, job: PairJob) -> Policy:
     """Load a bundle as a robot does: every file is hashed, and the golden action is computed.
 
     What a stage found to be wrong was looked at by the gate before.
@@ -223,7 +223,7 @@ def loaded(path: str, job: PairJob) -> Policy:
         VlatoolError: what ``load`` raises, with the bundle's path.
     """
     try:
-        known = [finding["name"] for finding in Bundle.described(path).manifest.findings]
+        known = [finding["name"] for finding in Bundle.open_lazily(path).manifest.findings]
         return load(path, engine=job.engine, threads=job.threads, seed=job.seed, accept=known)
     except VlatoolError as error:
         if path in error.message:
@@ -235,42 +235,42 @@ def pool_of(job: PairJob, baseline: Bundle) -> list[Drawn]:
     """Return the observations of a process: those of its file, else drawn from the baseline's spec alone."""
     if job.observations:
         return read_drawn(Path(job.observations))
-    return Drawer(baseline).draw(wanted(job.pairs), np.random.default_rng([job.seed, 2]))
+    return Drawer(baseline).draw(observation_count(job.pairs), np.random.default_rng([job.seed, 2]))
 
 
-def wanted(pairs: int) -> int:
+def observation_count(pairs: int) -> int:
     """Return how many observations so many pairs take."""
     return max(BLOCK, math.ceil(pairs / REPEATS))
 
 
-def place_of(number: int, exact: bool) -> int:
+def variant_index(number: int, exact: bool) -> int:
     """Return the place of an observation: ``exact`` when it is given to the bit as it was drawn, else varied."""
     return 2 * number + exact
 
 
-def observation_of(place: int) -> tuple[int, bool]:
+def observation_of(index: int) -> tuple[int, bool]:
     """Return the number of a place's observation, and whether it is given exactly."""
-    return place // 2, bool(place % 2)
+    return index // 2, bool(index % 2)
 
 
-def halved(numbers: Sequence[int], order: random.Random) -> list[int]:
+def halve(numbers: Sequence[int], order: random.Random) -> list[int]:
     """Return the places of observations, a random half of them exact; which half is the larger is drawn as well."""
     exact = set(order.sample(numbers, (len(numbers) + order.randrange(2)) // 2))
-    return [place_of(number, number in exact) for number in numbers]
+    return [variant_index(number, number in exact) for number in numbers]
 
 
 def sequence(pool: Sequence[int], order: random.Random) -> list[int]:
     """Return each place ``REPEATS`` times in random order, never twice in a row unless there is one alone."""
-    places: list[int] = []
+    indices: list[int] = []
     for _ in range(REPEATS):
         part = order.sample(pool, len(pool))
-        if places and part[0] == places[-1]:
+        if indices and part[0] == indices[-1]:
             part.reverse()
-        places += part
-    return places
+        indices += part
+    return indices
 
 
-def described(drawn: Drawn, exact: bool = True) -> str:
+def describe(drawn: Drawn, exact: bool = True) -> str:
     """Return an observation in a few words; one that is not ``exact`` is varied."""
     texts = [f"{name} {value!r}" for name, value in drawn.observation.items() if isinstance(value, str)]
     kind = {RECORDED: "as recorded", DRAWN: "drawn"}.get(drawn.kind, "recorded otherwise")

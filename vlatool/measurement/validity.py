@@ -1,4 +1,4 @@
-"""Whether a measurement can be trusted: what was seen beside the latencies, what it means and what to do about it."""
+"""Validity of a measurement: findings beside the latencies, what they mean and what to do about them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from vlatool.measurement.answers import REMEMBERS
-from vlatool.measurement.clock_drift import MOVED, drift
-from vlatool.measurement.interleaved import MOST
+from vlatool.measurement.answers import MAX_FRESH_RATIO
+from vlatool.measurement.clock_drift import MAX_DRIFT, drift
+from vlatool.measurement.interleaved import MAX_CALLS
 from vlatool.measurement.jobs import LatencyJob
-from vlatool.measurement.measured import Measured, PolicyRun
+from vlatool.measurement.results import Benchmark, PolicyRun
 from vlatool.report import Finding
 
 SWITCHES_A_SECOND = 50.0
 """Involuntary context switches of a thread that has its processor for itself: a few in a second."""
-STOLEN = 0.01
+MAX_STOLEN_SHARE = 0.01
 LATER = 0.05
 """Share by which the last quarter may be slower than the first."""
 FEWEST = 40
@@ -25,20 +25,20 @@ BUSY, BUSY_SHARE = 0.15, 0.1
 """Processors that may be busy before the run: so many, and so many more for each that there is."""
 
 
-def findings(measured: Measured, job: LatencyJob, duration_is_sustained: bool = False) -> tuple[Finding, ...]:
+def findings(measured: Benchmark, job: LatencyJob, duration_is_sustained: bool = False) -> tuple[Finding, ...]:
     """Return what bears on the measurement, the worst first.
 
     Args:
-        measured: What ``agent.measure`` returned.
-        job: What it was asked to do.
-        duration_is_sustained: Whether the run was meant to heat the board up: then throttling is its result.
+        measured: what ``agent.measure`` returned.
+        job: what it was asked to do.
+        duration_is_sustained: whether the run was meant to heat the board up: then throttling is its result.
     """
     seen = [
         *_answers(measured.policies),
-        *_golden(measured.policies),
+        *_golden_findings(measured.policies),
         *_threads(measured, job),
         *busy(measured.host),
-        *_contended(measured, job),
+        *_contention(measured, job),
         *_clock(measured, duration_is_sustained),
         *_later(measured, job, duration_is_sustained),
         *_memory(measured),
@@ -65,13 +65,13 @@ def _answers(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
                 "invalid",
                 f"{policy.name} answered {answers.strays} of {answers.looked} observations otherwise than in "
                 f"an unhurried pass before ({how}, first in call {answers.first + 1})",
-                "a fast wrong answer is no inference: check the engine and its version, then the memory of the machine",
+                "a fast wrong answer is not an inference: check engine and version, then the machine's memory",
             )
         if memory and memory.remembers:
             yield Finding(
                 "invalid",
                 f"{policy.name} takes {memory.ratio:.2f} times as long for observations that it has not seen "
-                f"(at least {memory.low:.2f} times; allowed {REMEMBERS:g}): it answers repeated ones from memory",
+                f"(at least {memory.low:.2f} times; allowed {MAX_FRESH_RATIO:g}): it answers repeated ones from memory",
                 "measure without the cache, or with --no-answers if a robot's observations do repeat",
             )
 
@@ -87,7 +87,7 @@ def busy(host: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
-def _golden(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
+def _golden_findings(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
     for policy in policies:
         error = policy.golden_error
         if error is not None and error > policy.golden_explained:
@@ -101,14 +101,14 @@ def _golden(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
             yield Finding("note", f"the answers of {policy.name} were not looked at (--no-answers)")
 
 
-def _crowded(measured: Measured, job: LatencyJob) -> tuple[int, int]:
+def _threads_and_processors(measured: Benchmark, job: LatencyJob) -> tuple[int, int]:
     """Return the threads of the engine, and the processors that they share."""
     usable = int(measured.host.get("cores") or 1)
     return job.threads, min(usable, len(job.limits.cpus) or usable, job.limits.cores or usable)
 
 
-def _threads(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
-    threads, processors = _crowded(measured, job)
+def _threads(measured: Benchmark, job: LatencyJob) -> Iterator[Finding]:
+    threads, processors = _threads_and_processors(measured, job)
     if threads > processors:
         yield Finding(
             "suspect",
@@ -117,9 +117,9 @@ def _threads(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
         )
 
 
-def _contended(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
+def _contention(measured: Benchmark, job: LatencyJob) -> Iterator[Finding]:
     switches = measured.switches / max(measured.wall_s, 1e-9)
-    threads, processors = _crowded(measured, job)
+    threads, processors = _threads_and_processors(measured, job)
     if switches > SWITCHES_A_SECOND * threads and threads <= processors:
         yield Finding(
             "suspect",
@@ -129,7 +129,7 @@ def _contended(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
         )
     stolen = measured.telemetry.counters.get("process.machine_steal") if measured.telemetry else None
     seconds = stolen.seconds * (measured.host.get("cores") or 1) if stolen else 0.0
-    if stolen and stolen.difference > STOLEN * seconds:
+    if stolen and stolen.difference > MAX_STOLEN_SHARE * seconds:
         yield Finding(
             "suspect",
             f"the host of this virtual machine took {stolen.difference / seconds:.1%} of its processors' time",
@@ -137,18 +137,18 @@ def _contended(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
         )
 
 
-def throttled(causes: Sequence[str], effect: str = "suspect") -> Iterator[Finding]:
+def throttling(causes: Sequence[str], effect: str = "suspect") -> Iterator[Finding]:
     """Tell of a board that throttled, from what throttled it in words."""
     if causes:
         reason = f"the board was throttled: {'; '.join(causes)}"
         yield Finding(effect, reason, "cool it, or choose a power mode that it can hold")
 
 
-def _clock(measured: Measured, sustained: bool) -> Iterator[Finding]:
+def _clock(measured: Benchmark, sustained: bool) -> Iterator[Finding]:
     effect = "note" if sustained else "suspect"
-    yield from throttled(measured.telemetry.throttling if measured.telemetry else (), effect)
+    yield from throttling(measured.telemetry.throttling if measured.telemetry else (), effect)
     moved = drift(measured.canary_ms)
-    if abs(moved) > MOVED:
+    if abs(moved) > MAX_DRIFT:
         yield Finding(
             effect,
             f"the processor became {_slower(moved)} from the first half of the run to the second (a fixed piece "
@@ -161,7 +161,7 @@ def _slower(share: float) -> str:
     return f"{abs(share):.0%} {'slower' if share > 0 else 'faster'}"
 
 
-def _later(measured: Measured, job: LatencyJob, sustained: bool) -> Iterator[Finding]:
+def _later(measured: Benchmark, job: LatencyJob, sustained: bool) -> Iterator[Finding]:
     """Tell of a policy alone that did not settle; several in turns slow down together, and their ratios stand."""
     policy, *others = measured.policies
     samples = policy.samples
@@ -178,7 +178,7 @@ def _later(measured: Measured, job: LatencyJob, sustained: bool) -> Iterator[Fin
         )
 
 
-def _memory(measured: Measured) -> Iterator[Finding]:
+def _memory(measured: Benchmark) -> Iterator[Finding]:
     held = measured.telemetry.gauges.get("process.memory") if measured.telemetry else None
     values = held.values if held else ()
     third = len(values) // 3
@@ -193,10 +193,10 @@ def _memory(measured: Measured) -> Iterator[Finding]:
         )
 
 
-def _full(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
+def _full(measured: Benchmark, job: LatencyJob) -> Iterator[Finding]:
     for policy in measured.policies:
-        if len(policy.at_s) == MOST > job.iterations:
-            yield Finding("note", f"{policy.name} ended after {MOST:,} calls: every one of them is kept")
+        if len(policy.at_s) == MAX_CALLS > job.iterations:
+            yield Finding("note", f"{policy.name} ended after {MAX_CALLS:,} calls: every one of them is kept")
 
 
 def _governor(host: Mapping[str, Any]) -> Iterator[Finding]:

@@ -1,7 +1,7 @@
 """The process that calls the policies: ``python -m vlatool.measurement.worker``.
 
-It reads a ``WorkerJob``, opens and warms up, says ``Ready`` and waits for a line: whoever started it begins to record
-the board then, and ends it when the worker says ``Timed`` and waits again. It says ``Progress`` meanwhile and in the
+It reads a ``WorkerJob``, opens and warms up, says ``Ready`` and waits for a line: its parent then begins to record
+the board, and ends it when the worker says ``Timed`` and waits again. It says ``Progress`` meanwhile and in the
 end ``Measured``, or what it raised. It imports what a robot imports, so that its memory is that of a robot's process.
 """
 
@@ -17,19 +17,19 @@ from pathlib import Path
 from typing import IO
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.bundle.unexported import export_command
+from vlatool.bundle.module_bundle import export_command
 from vlatool.data import observations_for
 from vlatool.errors import BundleError
 from vlatool.machine.processes import die_with_parent
 from vlatool.measurement import child
-from vlatool.measurement.answers import Memory, expected_answers, remembered
+from vlatool.measurement.answers import Memory, expected_answers, measure_caching
 from vlatool.measurement.clock_drift import canary_ms
-from vlatool.measurement.interleaved import BLOCKS, Contestant, Tell, run_interleaved, unique_names
+from vlatool.measurement.interleaved import BLOCKS, Contestant, OnProgress, run_interleaved, unique_names
 from vlatool.measurement.jobs import LatencyJob, WorkerJob
-from vlatool.measurement.measured import GraphEngine, Measured, Pace, Phase, PolicyRun
 from vlatool.measurement.paced import run_paced
 from vlatool.measurement.phases import time_phases
-from vlatool.measurement.reach import reached_in
+from vlatool.measurement.reach import reach_by_dtype
+from vlatool.measurement.results import Benchmark, GraphEngine, Pace, Phase, PolicyRun
 from vlatool.runtime.policy import Policy
 from vlatool.user_code import trust
 
@@ -40,16 +40,16 @@ EXTRA_S = 3.0
 """Seconds at most for the phases, and for the look at repeated observations."""
 
 
-def main(stream: IO[str]) -> Measured:
+def main(stream: IO[str]) -> Benchmark:
     """Run the job that standard input names, and say on a stream how far it is."""
     die_with_parent()
-    asked = child.asked(WorkerJob)
+    asked = child.read_job(WorkerJob)
     trust.restore(asked.named)
 
     def pause(message: child.Ready | child.Timed) -> None:
         child.say(message, stream)
         if not sys.stdin.readline():
-            raise SystemExit("whoever started the measurement has gone")
+            raise SystemExit("the process that started the measurement has ended")
 
     return run_job(
         asked.job,
@@ -60,21 +60,21 @@ def main(stream: IO[str]) -> Measured:
 
 
 def run_job(
-    job: LatencyJob, tell: Tell, wait: Callable[[], None] = lambda: None, timed: Callable[[], None] = lambda: None
-) -> Measured:
+    job: LatencyJob, tell: OnProgress, wait: Callable[[], None] = lambda: None, timed: Callable[[], None] = lambda: None
+) -> Benchmark:
     """Measure in this process.
 
     Args:
-        job: What to measure.
-        tell: What is being done, and the share that is done.
-        wait: Called when all is open and warm, before the first call that counts.
-        timed: Called after the last one.
+        job: what to measure.
+        tell: callback: what is being done, and the share that is done.
+        wait: called when all is open and warm, before the first call that counts.
+        timed: called after the last one.
 
     Raises:
         VlatoolError: what a bundle raises.
     """
     tell("opening", None)
-    contestants = [opened(path, job) for path in job.bundles]
+    contestants = [open_policy(path, job) for path in job.bundles]
     unique_names(contestants)
     return measure(contestants, job, tell, wait, timed)
 
@@ -82,10 +82,10 @@ def run_job(
 def measure(
     contestants: Sequence[Contestant],
     job: LatencyJob,
-    tell: Tell,
+    tell: OnProgress,
     wait: Callable[[], None] = lambda: None,
     timed: Callable[[], None] = lambda: None,
-) -> Measured:
+) -> Benchmark:
     """Measure policies that are open."""
     for contestant in contestants:
         tell("warming up", None)
@@ -114,7 +114,7 @@ def measure(
         run_interleaved(contestants, job.iterations, 0, tell, job.duration, lambda: canaries.append(canary_ms()))
     ended, after = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF)
     timed()
-    return Measured(
+    return Benchmark(
         begun_s=begun,
         ended_s=ended,
         cpu_s=after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
@@ -125,7 +125,7 @@ def measure(
     )
 
 
-def opened(path: str, job: LatencyJob) -> Contestant:
+def open_policy(path: str, job: LatencyJob) -> Contestant:
     """Open a bundle through the runtime, or a torch source in eager torch.
 
     Raises:
@@ -150,12 +150,12 @@ def opened(path: str, job: LatencyJob) -> Contestant:
     return Contestant(name, bundle, policy, observations_for(bundle, OBSERVATIONS))
 
 
-def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | None, tell: Tell) -> PolicyRun:
+def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | None, tell: OnProgress) -> PolicyRun:
     policy = contestant.policy
     memory: Memory | None = None
     if contestant.answers is not None:
         tell("repeated against fresh observations", None)
-        memory = remembered(policy, contestant.observations, EXTRA_S)
+        memory = measure_caching(policy, contestant.observations, EXTRA_S)
     phases: Sequence[Phase] = ()
     if job.phases and contestant.bundle.manifest.graphs:
         tell("timing the phases", None)
@@ -181,7 +181,7 @@ def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | 
 def _reach(policy: Policy, threads: int) -> dict[str, float]:
     """Return what the policy's engine reaches in each dtype that its graphs compute in, as far as it can be asked."""
     graphs = policy.bundle.manifest.graphs.values()
-    return reached_in(policy.engine, {dtype for graph in graphs for dtype in graph.precision}, threads)
+    return reach_by_dtype(policy.engine, {dtype for graph in graphs for dtype in graph.precision}, threads)
 
 
 def _engines(policy: Policy) -> Iterator[GraphEngine]:
@@ -193,12 +193,14 @@ def _engines(policy: Policy) -> Iterator[GraphEngine]:
             graph=name,
             engine=policy.engine,
             version=session.version() if hasattr(session, "version") else "",
-            providers=", ".join(getattr(session, "providers", [])) or "CPU",
+            providers=getattr(session, "identity", str)()
+            or ", ".join(dict(getattr(session, "providers", ())))
+            or "CPU",
             computes_in=getattr(session, "precision", graph.compute or "float32"),
             macs_in=", ".join(f"{kind} {share:.1%}" for kind, share in shares),
         )
 
 
 if __name__ == "__main__":
-    answers = child.answers_alone()
+    answers = child.reserve_stdout()
     child.answer(lambda: main(answers), answers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from vlatool.module._silent import Silent
+from vlatool.module._zero_values import ZeroValues
 from vlatool.module.factors import Axis, Factors, Shape
 
 
@@ -13,14 +13,14 @@ class Values:
     """The axes of the values of a graph, and the products that it computes.
 
     Attributes:
-        factors: What axes are made of.
-        products: Axes over which each multiply-accumulate runs.
-        widths: Of each product, axes of the weights that it takes, without those of a kernel.
-        reads: Factors of axes of weights over which a product sums: what reads units, where others write them.
-        counts: Node -> argument that states a number, and its place in a list -> axes that have so many elements.
-        apart: Nodes whose equal parts are not the same, as they are where nothing keeps their elements.
-        shapes: Node -> axes of its value, of several values, or None where it is no tensor.
-        stored: Nodes whose values are weights, or weights with their axes in another order.
+        factors: what axes are made of.
+        products: axes over which each multiply-accumulate runs.
+        widths: widths of each product, axes of the weights that it takes, without those of a kernel.
+        reads: factors of axes of weights over which a product sums: what reads units, where others write them.
+        counts: node -> argument that states a number, and its place in a list -> axes that have so many elements.
+        apart: nodes whose equal parts are not the same, as they are where nothing keeps their elements.
+        shapes: node -> axes of its value, of several values, or None where it is not a tensor.
+        stored: nodes whose values are weights, or weights with their axes in another order.
     """
 
     def __init__(self) -> None:
@@ -33,18 +33,18 @@ class Values:
         self._alike: dict[Any, Axis] = {}
         self.shapes: dict[Any, Any] = {}
         self.stored: set[Any] = set()
-        self._silent = Silent(self.stored)
+        self._silent = ZeroValues(self.stored)
 
     def shape(self, node: Any) -> Shape | None:
-        """Return the axes of a node's value, None where it is no tensor."""
+        """Return the axes of a node's value, None where it is not a tensor."""
         found = self.shapes.get(node)
         return found if isinstance(found, list) and (not found or isinstance(found[0], tuple)) else None
 
-    def needed(self, node: Any) -> Shape:
+    def shape_of(self, node: Any) -> Shape:
         """Return the axes of an argument.
 
         Raises:
-            TypeError: when it is no tensor.
+            TypeError: when it is not a tensor.
         """
         shape = self.shape(node) if hasattr(node, "op") else None
         if shape is None:
@@ -82,8 +82,8 @@ class Values:
         """Note a product.
 
         Args:
-            axes: Over which it runs.
-            widths: Those of its weights, without those of a kernel.
+            axes: axes over which it runs.
+            widths: those of its weights, without those of a kernel.
         """
         self.products.append(axes)
         self.widths.append(list(widths))
@@ -94,20 +94,20 @@ class Values:
         alike = len(set(sizes)) == 1 and not (first and self.factors.inside(first[0])) and node not in self.apart
         if not alike or self.factors.size(first) % len(sizes):
             return self.factors.pieces(axis, sizes)
-        which, piece = self.factors.parted(axis, len(sizes))
+        which, piece = self.factors.split_axis(axis, len(sizes))
         self.factors.freeze(which)
         if not self._is_stuck(piece):
             self._alike[node] = piece
         return [piece for _ in sizes]
 
-    def stuck(self) -> frozenset[Any]:
+    def stuck_nodes(self) -> frozenset[Any]:
         """Return the nodes with equal pieces all of whose elements stay, though some of one piece might go."""
         return frozenset(node for node, axis in self._alike.items() if self._is_stuck(axis))
 
     def _is_stuck(self, axis: Axis) -> bool:
         return all(self.factors.is_frozen(leaf) for leaf in self.factors.leaves(axis))
 
-    def frozen(self, sizes: Sequence[int]) -> Shape:
+    def frozen_axes(self, sizes: Sequence[int]) -> Shape:
         """Return new axes whose elements stay."""
         return [self.factors.new(size, frozen=True) for size in sizes]
 

@@ -13,32 +13,32 @@ Rule = Callable[[Values, Any], Any]
 
 def _channels(walk: Values, node: Any) -> Shape:
     """Treat every channel by itself: batch and instance normalisation, PReLU."""
-    given = walk.needed(node.args[0])
+    given = walk.shape_of(node.args[0])
     for each in node.args[1:5]:
         if hasattr(each, "op"):
-            walk.broadcast([[given[1]], walk.needed(each)])
+            walk.broadcast([[given[1]], walk.shape_of(each)])
     return given
 
 
 def _in_groups(walk: Values, node: Any) -> Shape:
     """Normalise over groups of channels: a group may go, a part of one may not."""
-    given = walk.needed(node.args[0])
-    groups, inside = walk.factors.parted(given[1], node.args[1])
+    given = walk.shape_of(node.args[0])
+    groups, inside = walk.factors.split_axis(given[1], node.args[1])
     for axis in (inside, *given[2:]):
         walk.factors.freeze(axis)
     for name in ("weight", "bias"):
         if argument(node, name) is not None:
-            walk.factors.unite(given[1], walk.needed(argument(node, name))[0])
+            walk.factors.unite(given[1], walk.shape_of(argument(node, name))[0])
     walk.counts[node] = {("num_groups", None): [groups]}
     return given
 
 
 def _over_last(walk: Values, node: Any) -> Shape:
     """Normalise over the last axes: all of their elements count."""
-    given = walk.needed(node.args[0])
+    given = walk.shape_of(node.args[0])
     for each in node.args[2:4]:
         if hasattr(each, "op"):
-            walk.broadcast([given, walk.needed(each)])
+            walk.broadcast([given, walk.shape_of(each)])
     for axis in given[-len(node.args[1]) :]:
         walk.factors.freeze(axis)
     return given
@@ -46,28 +46,28 @@ def _over_last(walk: Values, node: Any) -> Shape:
 
 def _weight_norm(walk: Values, node: Any) -> Shape:
     """Scale the rows of a weight, each of which is normalised."""
-    given, along = walk.needed(node.args[0]), argument(node, "dim", 0) % len(walk.needed(node.args[0]))
+    given, along = walk.shape_of(node.args[0]), argument(node, "dim", 0) % len(walk.shape_of(node.args[0]))
     for number, axis in enumerate(given):
         if number != along:
             walk.factors.freeze(axis)
-    return walk.broadcast([given, walk.needed(node.args[1])])
+    return walk.broadcast([given, walk.shape_of(node.args[1])])
 
 
-def _over_places(walk: Values, node: Any) -> Any:
+def _over_space(walk: Values, node: Any) -> Any:
     """Pool or interpolate: batch and channels stay as they are, places become others."""
-    given, rank = walk.needed(node.args[0]), _rank(node)
+    given, rank = walk.shape_of(node.args[0]), _rank(node)
     for axis in given[-rank:]:
         walk.factors.freeze(axis)
     value = node.meta["val"]
     values = value if isinstance(value, list | tuple) else [value]
-    shapes = [[*given[:-rank], *walk.frozen(sizes_of(each)[-rank:])] for each in values]
+    shapes = [[*given[:-rank], *walk.frozen_axes(sizes_of(each)[-rank:])] for each in values]
     return shapes if isinstance(value, list | tuple) else shapes[0]
 
 
-def _unpooled(walk: Values, node: Any) -> Any:
+def _unpool(walk: Values, node: Any) -> Any:
     """Put what was pooled back to its places."""
-    walk.broadcast([walk.needed(each) for each in node.args[:2]])
-    return _over_places(walk, node)
+    walk.broadcast([walk.shape_of(each) for each in node.args[:2]])
+    return _over_space(walk, node)
 
 
 def _rank(node: Any) -> int:
@@ -76,65 +76,66 @@ def _rank(node: Any) -> int:
 
 
 def _grid_sample(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
-    for axis in (*given[2:], *walk.needed(node.args[1])[1:]):
+    given = walk.shape_of(node.args[0])
+    for axis in (*given[2:], *walk.shape_of(node.args[1])[1:]):
         walk.factors.freeze(axis)
-    return [*given[:2], *walk.frozen(sizes_of(node.meta["val"])[2:])]
+    return [*given[:2], *walk.frozen_axes(sizes_of(node.meta["val"])[2:])]
 
 
 def _pixel_shuffle(walk: Values, node: Any) -> Shape:
     """Turn the faster part of the channels into places."""
-    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
-    channels, places = walk.factors.parted(given[-3], sizes[-3])
-    for axis in (places, *given[-2:]):
+    given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
+    channels, space = walk.factors.split_axis(given[-3], sizes[-3])
+    for axis in (space, *given[-2:]):
         walk.factors.freeze(axis)
-    return [*given[:-3], channels, *walk.frozen(sizes[-2:])]
+    return [*given[:-3], channels, *walk.frozen_axes(sizes[-2:])]
 
 
 def _pixel_unshuffle(walk: Values, node: Any) -> Shape:
     """Turn places into the faster part of the channels."""
-    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
-    return _patched(walk, given, 3, sizes[-3], sizes[-2:])
+    given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
+    return _patches(walk, given, 3, sizes[-3], sizes[-2:])
 
 
-def _unfolded(walk: Values, node: Any) -> Shape:
+def _unfold(walk: Values, node: Any) -> Shape:
     """Let the channels of the places of a patch follow each other."""
-    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
-    return _patched(walk, given, 3, sizes[-2], sizes[-1:])
+    given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
+    return _patches(walk, given, 3, sizes[-2], sizes[-1:])
 
 
-def _patched(walk: Values, given: Shape, back: int, size: int, places: list[int]) -> Shape:
+def _patches(walk: Values, given: Shape, back: int, size: int, space: list[int]) -> Shape:
     for axis in given[-back + 1 :]:
         walk.factors.freeze(axis)
     channels = given[-back]
-    return [*given[:-back], (*channels, *walk.frozen([size // walk.factors.size(channels)])[0]), *walk.frozen(places)]
+    (patch,) = walk.frozen_axes([size // walk.factors.size(channels)])
+    return [*given[:-back], (*channels, *patch), *walk.frozen_axes(space)]
 
 
-def _folded(walk: Values, node: Any) -> Shape:
-    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
-    channels, inside = walk.factors.parted(given[-2], sizes[-3])
+def _fold(walk: Values, node: Any) -> Shape:
+    given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
+    channels, inside = walk.factors.split_axis(given[-2], sizes[-3])
     for axis in (inside, given[-1]):
         walk.factors.freeze(axis)
-    return [*given[:-2], channels, *walk.frozen(sizes[-2:])]
+    return [*given[:-2], channels, *walk.frozen_axes(sizes[-2:])]
 
 
-def _shuffled(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
-    groups, inside = walk.factors.parted(given[1], node.args[1])
+def _channel_shuffle(walk: Values, node: Any) -> Shape:
+    given = walk.shape_of(node.args[0])
+    groups, inside = walk.factors.split_axis(given[1], node.args[1])
     walk.counts[node] = {("groups", None): [groups]}
     return [given[0], (*inside, *groups), *given[2:]]
 
 
 _POOLS = ("max_pool{}d", "avg_pool{}d", "adaptive_avg_pool{}d", "adaptive_max_pool{}d", "max_pool{}d_with_indices")
-_UPSAMPLED = ("nearest1d", "nearest2d", "nearest3d", "linear1d", "bilinear2d", "trilinear3d", "bicubic2d")
+_UPSAMPLE_MODES = ("nearest1d", "nearest2d", "nearest3d", "linear1d", "bilinear2d", "trilinear3d", "bicubic2d")
 LAYERS: dict[str, Rule] = {
     **dict.fromkeys(("batch_norm", "instance_norm", "prelu"), _channels), "group_norm": _in_groups,
     **dict.fromkeys(("layer_norm", "rms_norm"), _over_last), "_weight_norm": _weight_norm,
-    **{pool.format(rank): _over_places for pool in _POOLS for rank in (1, 2, 3)},
-    **{f"upsample_{kind}": _over_places for kind in _UPSAMPLED},
-    **{f"_upsample_{kind}": _over_places for kind in ("bilinear2d_aa", "bicubic2d_aa")},
-    **{f"_upsample_nearest_exact{rank}d": _over_places for rank in (1, 2, 3)},
-    **{f"max_unpool{rank}d": _unpooled for rank in (2, 3)},
+    **{pool.format(rank): _over_space for pool in _POOLS for rank in (1, 2, 3)},
+    **{f"upsample_{kind}": _over_space for kind in _UPSAMPLE_MODES},
+    **{f"_upsample_{kind}": _over_space for kind in ("bilinear2d_aa", "bicubic2d_aa")},
+    **{f"_upsample_nearest_exact{rank}d": _over_space for rank in (1, 2, 3)},
+    **{f"max_unpool{rank}d": _unpool for rank in (2, 3)},
     "grid_sampler": _grid_sample, "pixel_shuffle": _pixel_shuffle, "pixel_unshuffle": _pixel_unshuffle,
-    "im2col": _unfolded, "col2im": _folded, "channel_shuffle": _shuffled,
+    "im2col": _unfold, "col2im": _fold, "channel_shuffle": _channel_shuffle,
 }  # fmt: skip

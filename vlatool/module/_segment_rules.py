@@ -9,7 +9,7 @@ from vlatool.module._axis_values import Values, argument, sizes_of
 from vlatool.module.factors import Axis, Shape
 
 Rule = Callable[[Values, Any], Any]
-FIXED = {"hstack": 1, "column_stack": 1, "vstack": 0, "dstack": 2, "hsplit": 1, "vsplit": 0, "dsplit": 2}
+FIXED_AXES = {"hstack": 1, "column_stack": 1, "vstack": 0, "dstack": 2, "hsplit": 1, "vsplit": 0, "dsplit": 2}
 """Operators that join or split along one axis, of values of rank 2 or more -> which it is."""
 SPLITS = ("chunk", "split", "split_with_sizes", "tensor_split", "unsafe_chunk", "unsafe_split",
           "unsafe_split_with_sizes", "hsplit", "vsplit", "dsplit")  # fmt: skip
@@ -21,7 +21,7 @@ def along_of(node: Any, rank: int) -> int:
     Raises:
         ValueError: for a vector, or a value that the operator makes a matrix of first.
     """
-    fixed = FIXED.get(node.target._opname)
+    fixed = FIXED_AXES.get(node.target._opname)
     if fixed is None:
         return int(argument(node, "dim", 0)) % rank
     if rank <= max(fixed, 1):
@@ -30,37 +30,37 @@ def along_of(node: Any, rank: int) -> int:
 
 
 def _concatenate(walk: Values, node: Any) -> Shape:
-    shapes = [walk.needed(part) for part in node.args[0]]
+    shapes = [walk.shape_of(part) for part in node.args[0]]
     shapes = [shape for shape in shapes if len(shape) > 1 or walk.factors.size(shape[0])]  # torch skips empty vectors
     along = along_of(node, len(shapes[0]))
     result = walk.broadcast([[*shape[:along], (), *shape[along + 1 :]] for shape in shapes])
-    result[along] = walk.factors.concatenated([shape[along] for shape in shapes])
+    result[along] = walk.factors.concatenate([shape[along] for shape in shapes])
     return result
 
 
 def _stack(walk: Values, node: Any) -> Shape:
-    result = walk.broadcast([walk.needed(part) for part in node.args[0]])
+    result = walk.broadcast([walk.shape_of(part) for part in node.args[0]])
     along = argument(node, "dim", 0) % (len(result) + 1)
-    return [*result[:along], *walk.frozen([len(node.args[0])]), *result[along:]]
+    return [*result[:along], *walk.frozen_axes([len(node.args[0])]), *result[along:]]
 
 
 def _unbind(walk: Values, node: Any) -> list[Shape]:
-    given, along = walk.needed(node.args[0]), argument(node, "dim", 0)
+    given, along = walk.shape_of(node.args[0]), argument(node, "dim", 0)
     walk.factors.freeze(given[along])
     rest = [axis for number, axis in enumerate(given) if number != along % len(given)]
     return [rest for _ in node.meta["val"]]
 
 
 def _split(walk: Values, node: Any) -> list[Shape]:
-    given = walk.needed(node.args[0])
+    given = walk.shape_of(node.args[0])
     along = along_of(node, len(given))
     pieces = walk.pieces(node, given[along], [sizes_of(value)[along] for value in node.meta["val"]])
     return [_with(given, along, piece) for piece in pieces]
 
 
-def _gated(walk: Values, node: Any) -> Shape:
+def _glu(walk: Values, node: Any) -> Shape:
     """Multiply the first half of an axis by a sigmoid of the second one."""
-    given, along = walk.needed(node.args[0]), argument(node, "dim", -1)
+    given, along = walk.shape_of(node.args[0]), argument(node, "dim", -1)
     one, other = walk.pieces(node, given[along], [walk.factors.size(given[along]) // 2] * 2)
     walk.factors.unite(one, other)
     return _with(given, along, one)
@@ -71,23 +71,23 @@ def _slice(walk: Values, node: Any) -> Shape:
 
 
 def _put_slice(walk: Values, node: Any) -> Shape:
-    """Put a value in the place of a slice."""
+    """Replace a slice by a value."""
     part, along = _piece(walk, node, node.args[1])
-    put = walk.needed(node.args[1])
+    put = walk.shape_of(node.args[1])
     walk.broadcast([[*part[:along], (), *part[along + 1 :]], [*put[:along], (), *put[along + 1 :]]])
     walk.factors.unite(part[along], put[along])
-    return walk.needed(node.args[0])
+    return walk.shape_of(node.args[0])
 
 
 def _piece(walk: Values, node: Any, like: Any) -> tuple[Shape, int]:
     """Return the axes of a slice, and the axis that it is one of.
 
     Args:
-        walk: Of the graph.
-        node: With the arguments of a slice.
-        like: Node whose value has its sizes.
+        walk: walk of the graph.
+        node: node with the arguments of a slice.
+        like: node whose value has its sizes.
     """
-    given = walk.needed(node.args[0])
+    given = walk.shape_of(node.args[0])
     along = argument(node, "dim", 0) % len(given)
     whole, count = walk.factors.size(given[along]), sizes_of(like.meta["val"])[along]
     if count == whole:
@@ -108,8 +108,8 @@ def _every(walk: Values, node: Any, axis: Axis, count: int) -> Axis:
     step = argument(node, "step")
     if count * step != walk.factors.size(axis) or _number(argument(node, "start") or 0) not in range(step):
         walk.factors.freeze(axis)
-        return walk.frozen([count])[0]
-    slow, fast = walk.factors.parted(axis, count)
+        return walk.frozen_axes([count])[0]
+    slow, fast = walk.factors.split_axis(axis, count)
     walk.factors.freeze(fast)
     walk.counts[node] = {("end", None): [axis]}
     return slow
@@ -117,7 +117,7 @@ def _every(walk: Values, node: Any, axis: Axis, count: int) -> Axis:
 
 def _pad(walk: Values, node: Any) -> Shape:
     """Put elements of one value before and after those that there are; copies of others keep them."""
-    given, sizes, pads = list(walk.needed(node.args[0])), sizes_of(node.meta["val"]), node.args[1]
+    given, sizes, pads = list(walk.shape_of(node.args[0])), sizes_of(node.meta["val"]), node.args[1]
     alike, counts = argument(node, "mode", "constant") == "constant", dict[tuple[str, int | None], list[Axis]]()
     for number in range(len(given) - len(pads) // 2, len(given)):
         at = 2 * (len(given) - 1 - number)
@@ -126,11 +126,11 @@ def _pad(walk: Values, node: Any) -> Shape:
             continue
         if not alike or min(before, after) < 0 or all(map(walk.factors.is_frozen, walk.factors.leaves(given[number]))):
             walk.factors.freeze(given[number])
-            (given[number],) = walk.frozen(sizes[number : number + 1])
+            (given[number],) = walk.frozen_axes(sizes[number : number + 1])
             continue
         one, other = walk.factors.new(before), walk.factors.new(after)
         counts |= {("pad", at): [one], ("pad", at + 1): [other]}
-        given[number] = walk.factors.concatenated([one, given[number], other])
+        given[number] = walk.factors.concatenate([one, given[number], other])
     walk.counts[node] = counts
     return given
 
@@ -149,7 +149,7 @@ def _number(value: Any) -> int:
 
 SEGMENTS: dict[str, Rule] = {
     **dict.fromkeys(("cat", "concat", "concatenate", "hstack", "vstack", "dstack", "column_stack"), _concatenate),
-    **dict.fromkeys(SPLITS, _split), "stack": _stack, "unbind": _unbind, "glu": _gated,
+    **dict.fromkeys(SPLITS, _split), "stack": _stack, "unbind": _unbind, "glu": _glu,
     **dict.fromkeys(("slice", "narrow"), _slice), "slice_scatter": _put_slice,
     **dict.fromkeys(("pad", "constant_pad_nd"), _pad),
 }  # fmt: skip

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from vlatool.errors import require
 from vlatool.module._axis_values import Values, sizes_of
-from vlatool.module.axis_rules import TRANSPOSED, rule_for
+from vlatool.module.axis_rules import TRANSPOSES, rule_for
 from vlatool.module.factors import Atom, Axis, Shape
 
-REORDERING = (*TRANSPOSED, "permute", "movedim", "detach", "to", "_to_copy", "contiguous", "clone")
+REORDERING = (*TRANSPOSES, "permute", "movedim", "detach", "to", "_to_copy", "contiguous", "clone")
 """Operators after which a weight is still one."""
 INPUT, OUTPUT = "the policy's inputs", "the policy's outputs"
 """What keeps axes, beside operators."""
@@ -40,11 +40,11 @@ class Member:
     """One axis of a weight that a factor is a part of.
 
     Args:
-        weight: Name in the state of the module.
-        axis: Number of the axis.
-        atom: Which factor of the axis.
-        reads: Whether a product sums over the axis: the weight reads the units, which others write.
-        numbers: Of each element of the axis, the unit that it belongs to; -1 for none.
+        weight: name in the state of the module.
+        axis: number of the axis.
+        atom: position of the factor in the axis.
+        reads: whether a product sums over the axis: the weight reads the units, which others write.
+        numbers: unit that each element of the axis belongs to; -1 for none.
     """
 
     weight: str
@@ -63,16 +63,16 @@ class Walk(Values):
     """Walks a graph of torch.export and finds out which axes belong together.
 
     Args:
-        program: An ``ExportedProgram``.
+        program: an ``ExportedProgram``.
 
     Attributes:
-        unknown: Operators without a rule, or of a form that theirs does not know; all axes that touch them stay.
+        unknown: operators without a rule, or of a form that theirs does not know; all axes that touch them stay.
     """
 
     def __init__(self, program: Any) -> None:
         super().__init__()
         self._walk(program)
-        if stuck := self.stuck():
+        if stuck := self.stuck_nodes():
             super().__init__()
             self.apart = stuck
             self._walk(program)
@@ -161,14 +161,14 @@ class Walk(Values):
     def _visit(self, node: Any) -> None:
         if node.target is operator.getitem:
             whole = self.shapes.get(node.args[0])
-            self.shapes[node] = whole[node.args[1]] if isinstance(whole, list) and whole else self._fresh(node)
+            self.shapes[node] = whole[node.args[1]] if isinstance(whole, list) and whole else self._frozen_outputs(node)
             return
         if not hasattr(node.meta["val"], "shape") and not isinstance(node.meta["val"], list | tuple):
             return  # a size
         self.factors.operator = _name_of(node)
-        self.shapes[node] = self._given(node)
+        self.shapes[node] = self._output_axes(node)
 
-    def _given(self, node: Any) -> Any:
+    def _output_axes(self, node: Any) -> Any:
         """Return the axes of what an operator gives; frozen, as those of what it is given, where no rule says them."""
         rule, counted = rule_for(node.target), len(self.products)
         try:
@@ -186,9 +186,9 @@ class Walk(Values):
         del self.products[counted:], self.widths[counted:]
         self.counts.pop(node, None)
         if macs := macs_of(node) if node in self._live else 0:
-            widths = [axis for each in node.all_input_nodes if each in self.stored for axis in self.needed(each)]
-            self.multiply(self.frozen([macs]), widths)
-        return self._fresh(node)
+            widths = [axis for each in node.all_input_nodes if each in self.stored for axis in self.shape_of(each)]
+            self.multiply(self.frozen_axes([macs]), widths)
+        return self._frozen_outputs(node)
 
     def _fits(self, node: Any, given: Any) -> bool:
         """Check what a rule says against the sizes that torch.export noted."""
@@ -199,14 +199,14 @@ class Walk(Values):
             for each, shape in zip(values, shapes, strict=True)
         )
 
-    def _fresh(self, node: Any) -> Any:
+    def _frozen_outputs(self, node: Any) -> Any:
         """Return frozen axes for what a node gives."""
         value = node.meta.get("val")
         if isinstance(value, list | tuple):
-            return [self._frozen(each) for each in value]
-        return self._frozen(value)
+            return [self._frozen_value(each) for each in value]
+        return self._frozen_value(value)
 
-    def _frozen(self, value: Any) -> Shape | None:
+    def _frozen_value(self, value: Any) -> Shape | None:
         return [self.factors.new(size, frozen=True) for size in sizes_of(value)] if hasattr(value, "shape") else None
 
     def _freeze_all(self, arguments: Any) -> None:

@@ -17,7 +17,7 @@ Rule = Callable[[Values, Any], Any]
 
 
 def _same(walk: Values, node: Any) -> Shape:
-    return walk.needed(node.args[0])
+    return walk.shape_of(node.args[0])
 
 
 def _elementwise(walk: Values, node: Any) -> Shape:
@@ -30,9 +30,9 @@ def _uniform(walk: Values, node: Any) -> Shape:
     return [walk.factors.new(size) for size in sizes_of(node.meta["val"])]
 
 
-def _along(walk: Values, node: Any) -> Any:
+def _along_axis(walk: Values, node: Any) -> Any:
     """Compute along an axis, all of whose elements count: sums so far, sorting, softmax."""
-    given, dims = walk.needed(node.args[0]), argument(node, "dims", argument(node, "dim", -1))
+    given, dims = walk.shape_of(node.args[0]), argument(node, "dims", argument(node, "dim", -1))
     listed = dims if isinstance(dims, list | tuple) else [dims]
     if not listed:  # of the flattened value
         raise ValueError("no axis")
@@ -41,25 +41,25 @@ def _along(walk: Values, node: Any) -> Any:
         walk.factors.freeze(given[axis])
     value = node.meta["val"]
     values = value if isinstance(value, list | tuple) else [value]
-    shapes = [_resized(walk, given, sizes_of(each)) for each in values]
+    shapes = [_resize(walk, given, sizes_of(each)) for each in values]
     return shapes if isinstance(value, list | tuple) else shapes[0]
 
 
-def _resized(walk: Values, given: Shape, sizes: list[int]) -> Shape:
+def _resize(walk: Values, given: Shape, sizes: list[int]) -> Shape:
     """Return axes; new ones, whose elements stay, where a size is another one."""
     return [axis if walk.factors.size(axis) == size else walk.factors.new(size, frozen=True)
             for axis, size in zip(given, sizes, strict=True)]  # fmt: skip
 
 
 def _triangle(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
+    given = walk.shape_of(node.args[0])
     for axis in given[-2:]:
         walk.factors.freeze(axis)
     return given
 
 
 def _reduce(walk: Values, node: Any) -> Any:
-    given, which = walk.needed(node.args[0]), argument(node, "dim")
+    given, which = walk.shape_of(node.args[0]), argument(node, "dim")
     if node.target._opname in ("max", "min") and argument(node, "other") is not None:
         return _elementwise(walk, node)
     axes = range(len(given)) if which is None or which == [] else ([which] if isinstance(which, int) else which)
@@ -72,47 +72,47 @@ def _reduce(walk: Values, node: Any) -> Any:
 
 
 def _reshape(walk: Values, node: Any) -> Shape:
-    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
+    given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
     leaves = list(walk.factors.leaves(factor for axis in given for factor in axis))
     result: Shape = []
     for number, size in enumerate(sizes):
-        axis = walk.factors.taken(leaves, size)
+        axis = walk.factors.take_front(leaves, size)
         if axis is None:  # what is left is divided otherwise
             walk.factors.freeze(leaves)
-            return [*result, *walk.frozen(sizes[number:])]
+            return [*result, *walk.frozen_axes(sizes[number:])]
         result.append(axis)
     return result
 
 
 def _reshape_as(walk: Values, node: Any) -> Shape:
-    return walk.broadcast([_reshape(walk, node), walk.needed(node.args[1])])
+    return walk.broadcast([_reshape(walk, node), walk.shape_of(node.args[1])])
 
 
 def _windows(walk: Values, node: Any) -> Shape:
     """Take pieces of an axis that may overlap."""
-    given, sizes = list(walk.needed(node.args[0])), sizes_of(node.meta["val"])
+    given, sizes = list(walk.shape_of(node.args[0])), sizes_of(node.meta["val"])
     along = node.args[1] % len(given)
     walk.factors.freeze(given[along])
-    (given[along],) = walk.frozen(sizes[along : along + 1])
-    return [*given, *walk.frozen(sizes[-1:])]
+    (given[along],) = walk.frozen_axes(sizes[along : along + 1])
+    return [*given, *walk.frozen_axes(sizes[-1:])]
 
 
-def _numbered(walk: Values, node: Any) -> Shape:
+def _counter_values(walk: Values, node: Any) -> Shape:
     """Give numbers that depend on nothing, or on their places."""
-    return walk.frozen(sizes_of(node.meta["val"]))
+    return walk.frozen_axes(sizes_of(node.meta["val"]))
 
 
 def _one_hot(walk: Values, node: Any) -> Shape:
-    return [*walk.needed(node.args[0]), *walk.frozen(sizes_of(node.meta["val"])[-1:])]
+    return [*walk.shape_of(node.args[0]), *walk.frozen_axes(sizes_of(node.meta["val"])[-1:])]
 
 
 def _permute(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
+    given = walk.shape_of(node.args[0])
     return [given[axis] for axis in node.args[1]]
 
 
 def _transpose(walk: Values, node: Any) -> Shape:
-    given = list(walk.needed(node.args[0]))
+    given = list(walk.shape_of(node.args[0]))
     if node.target._opname == "numpy_T" and len(given) > 2:
         raise ValueError("all axes the other way round")
     one, other = node.args[1:3] if len(node.args) > 2 else (-1, -2)
@@ -121,8 +121,8 @@ def _transpose(walk: Values, node: Any) -> Shape:
     return given
 
 
-def _moved(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
+def _movedim(walk: Values, node: Any) -> Shape:
+    given = walk.shape_of(node.args[0])
     froms, tos = ([each] if isinstance(each, int) else list(each) for each in node.args[1:3])
     placed = {to % len(given): given[one % len(given)] for one, to in zip(froms, tos, strict=True)}
     gone = {one % len(given) for one in froms}
@@ -132,50 +132,50 @@ def _moved(walk: Values, node: Any) -> Shape:
 
 def _expand(walk: Values, node: Any) -> Shape:
     """Repeat what has the size 1: its copies are alike, so that some may go."""
-    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
+    given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
     padded = [()] * (len(sizes) - len(given)) + given
     return [axis if walk.factors.size(axis) == size else walk.factors.new(size)
             for axis, size in zip(padded, sizes, strict=True)]  # fmt: skip
 
 
 def _repeat(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
+    given = walk.shape_of(node.args[0])
     stated = [1] * (len(given) - len(node.args[1])) + list(node.args[1])  # of tile, which may state fewer
     padded = [()] * (len(stated) - len(given)) + given
-    times = [walk.frozen([1 if isinstance(count, int) and count == 1 else size // walk.factors.size(axis)])[0]
+    times = [walk.frozen_axes([1 if isinstance(count, int) and count == 1 else size // walk.factors.size(axis)])[0]
              for count, size, axis in zip(stated, sizes_of(node.meta["val"]), padded, strict=True)]  # fmt: skip
     return [(*copies, *axis) for copies, axis in zip(times, padded, strict=True)]
 
 
 def _repeat_each(walk: Values, node: Any) -> Shape:
-    given, along = list(walk.needed(node.args[0])), argument(node, "dim")
+    given, along = list(walk.shape_of(node.args[0])), argument(node, "dim")
     if not isinstance(node.args[1], int) or along is None:
         raise ValueError("not as often each")
-    given[along] = (*given[along], *walk.frozen([node.args[1]])[0])
+    given[along] = (*given[along], *walk.frozen_axes([node.args[1]])[0])
     return given
 
 
 def _pairs_reduced(walk: Values, node: Any) -> Shape:
     """Compute one number of the elements of two values along an axis."""
-    given = walk.broadcast([walk.needed(each) for each in node.args[:2]])
+    given = walk.broadcast([walk.shape_of(each) for each in node.args[:2]])
     along = argument(node, "dim", -1) % len(given)
     walk.factors.freeze(given[along])
     return [axis for number, axis in enumerate(given) if number != along or argument(node, "keepdim", False)]
 
 
 def _outer(walk: Values, node: Any) -> Shape:
-    return [*walk.needed(node.args[0]), *walk.needed(node.args[1])]
+    return [*walk.shape_of(node.args[0]), *walk.shape_of(node.args[1])]
 
 
 def _kronecker(walk: Values, node: Any) -> Shape:
-    one, other = walk.needed(node.args[0]), walk.needed(node.args[1])
+    one, other = walk.shape_of(node.args[0]), walk.shape_of(node.args[1])
     rank = max(len(one), len(other))
     padded = ([()] * (rank - len(each)) + each for each in (one, other))
     return [(*slow, *fast) for slow, fast in zip(*padded, strict=True)]
 
 
 def _select(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
+    given = walk.shape_of(node.args[0])
     along = node.args[1] % len(given)
     walk.factors.freeze(given[along])
     return [axis for number, axis in enumerate(given) if number != along]
@@ -183,31 +183,31 @@ def _select(walk: Values, node: Any) -> Shape:
 
 def _index(walk: Values, node: Any) -> Shape:
     """Take elements of one axis by their numbers."""
-    given, listed = walk.needed(node.args[0]), node.args[1]
+    given, listed = walk.shape_of(node.args[0]), node.args[1]
     by_name = not isinstance(listed, list | tuple)
     numbers = [node.args[2]] if by_name else [each for each in listed if each is not None]
     if len(numbers) != 1:
         raise ValueError("several axes")
     along = listed % len(given) if by_name else next(at for at, each in enumerate(listed) if each is not None)
     walk.factors.freeze(given[along])
-    taken = sizes_of(node.meta["val"])[along : along + len(walk.needed(numbers[0]))]
-    return [*given[:along], *walk.frozen(taken), *given[along + 1 :]]
+    taken = sizes_of(node.meta["val"])[along : along + len(walk.shape_of(numbers[0]))]
+    return [*given[:along], *walk.frozen_axes(taken), *given[along + 1 :]]
 
 
 def _by_numbers(walk: Values, node: Any) -> Shape:
     """Take or put elements along one axis, each by a number of its own: the other axes go together."""
-    values = [walk.needed(each) for each in node.all_input_nodes]
+    values = [walk.shape_of(each) for each in node.all_input_nodes]
     along = argument(node, "dim") % len(values[0])
     for shape in values:
         walk.factors.freeze(shape[along])
     others = walk.broadcast([[*shape[:along], (), *shape[along + 1 :]] for shape in values])
-    return [*others[:along], *walk.frozen([sizes_of(node.meta["val"])[along]]), *others[along + 1 :]]
+    return [*others[:along], *walk.frozen_axes([sizes_of(node.meta["val"])[along]]), *others[along + 1 :]]
 
 
-def _added_at(walk: Values, node: Any) -> Shape:
+def _scatter_add(walk: Values, node: Any) -> Shape:
     """Add or put a value's elements along one axis, by their numbers."""
-    given, along, source = walk.needed(node.args[0]), argument(node, "dim"), argument(node, "source")
-    put = [walk.needed(source)] if hasattr(source, "op") else []
+    given, along, source = walk.shape_of(node.args[0]), argument(node, "dim"), argument(node, "source")
+    put = [walk.shape_of(source)] if hasattr(source, "op") else []
     for shape in (given, *put):
         walk.factors.freeze(shape[along % len(given)])
     walk.broadcast([_without(shape, along) for shape in (given, *put)])
@@ -219,43 +219,43 @@ def _without(given: Shape, along: int) -> Shape:
 
 
 def _embedding(walk: Values, node: Any) -> Shape:
-    weight, ids = walk.needed(node.args[0]), walk.needed(node.args[1])
+    weight, ids = walk.shape_of(node.args[0]), walk.shape_of(node.args[1])
     for axis in weight:
         walk.factors.freeze(axis)
     return [*ids, weight[1]]
 
 
-SAME = ("alias", "clone", "contiguous", "detach", "dropout", "alpha_dropout", "feature_dropout", "to", "_to_copy",
+IDENTITIES = ("alias", "clone", "contiguous", "detach", "dropout", "alpha_dropout", "feature_dropout", "to", "_to_copy",
         "type_as", "lift_fresh_copy")  # fmt: skip
 ELEMENTWISE = ("add", "bucketize", "copy", "expand_as", "hardswish", "hardsigmoid", "log_sigmoid", "real", "rsub",
                "rrelu", "selu", "celu", "square", "divide", "multiply", "subtract", "true_divide", "where")  # fmt: skip
 """Those that torch does not tag as elementwise."""
 UNIFORM = ("zeros", "ones", "full", "empty", "new_zeros", "new_ones", "new_full", "new_empty",
            "zeros_like", "ones_like", "full_like", "empty_like")  # fmt: skip
-REDUCED = ("mean", "sum", "amax", "amin", "max", "min", "std", "var", "prod", "logsumexp", "linalg_vector_norm", "norm",
-           "any", "all", "argmax", "argmin", "median", "nanmedian", "nanmean", "nansum", "mode", "kthvalue", "quantile",
-           "aminmax", "var_mean", "std_mean", "count_nonzero")  # fmt: skip
-ALONG = ("softmax", "_softmax", "log_softmax", "_log_softmax", "softmin", "cumsum", "cumprod", "sort", "topk",
+REDUCERS = ("mean", "sum", "amax", "amin", "max", "min", "std", "var", "prod", "logsumexp", "linalg_vector_norm",
+            "norm", "any", "all", "argmax", "argmin", "median", "nanmedian", "nanmean", "nansum", "mode", "kthvalue",
+            "quantile", "aminmax", "var_mean", "std_mean", "count_nonzero")  # fmt: skip
+SCANS = ("softmax", "_softmax", "log_softmax", "_log_softmax", "softmin", "cumsum", "cumprod", "sort", "topk",
          "argsort", "flip", "roll", "logcumsumexp", "diff", "fft_fft", "fft_ifft", "fft_rfft", "fft_irfft", "fft_fft2",
          "fft_ifft2", "fft_rfft2", "fft_irfft2")  # fmt: skip
-RESHAPED = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze", "ravel")
-NUMBERED = ("arange", "linspace", "logspace", "eye", "scalar_tensor", "tril_indices", "triu_indices")
-TRANSPOSED = ("transpose", "t", "mT", "numpy_T", "swapaxes", "swapdims", "adjoint", "mH")
+RESHAPES = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze", "ravel")
+COUNTERS = ("arange", "linspace", "logspace", "eye", "scalar_tensor", "tril_indices", "triu_indices")
+TRANSPOSES = ("transpose", "t", "mT", "numpy_T", "swapaxes", "swapdims", "adjoint", "mH")
 _RULES: dict[str, Rule] = {
     **PRODUCTS, **LAYERS, **SEGMENTS,
-    **dict.fromkeys(SAME, _same), **dict.fromkeys(ELEMENTWISE, _elementwise),
+    **dict.fromkeys(IDENTITIES, _same), **dict.fromkeys(ELEMENTWISE, _elementwise),
     **dict.fromkeys(UNIFORM[:8], _uniform), **dict.fromkeys(UNIFORM[8:], _same),
-    **dict.fromkeys(ALONG, _along), **dict.fromkeys(REDUCED, _reduce), **dict.fromkeys(RESHAPED, _reshape),
+    **dict.fromkeys(SCANS, _along_axis), **dict.fromkeys(REDUCERS, _reduce), **dict.fromkeys(RESHAPES, _reshape),
     **dict.fromkeys(("tril", "triu"), _triangle),
-    "permute": _permute, **dict.fromkeys(TRANSPOSED, _transpose), **dict.fromkeys(("movedim", "moveaxis"), _moved),
+    "permute": _permute, **dict.fromkeys(TRANSPOSES, _transpose), **dict.fromkeys(("movedim", "moveaxis"), _movedim),
     **dict.fromkeys(("expand", "broadcast_to"), _expand), **dict.fromkeys(("repeat", "tile"), _repeat),
     "repeat_interleave": _repeat_each, **dict.fromkeys(("reshape_as", "view_as"), _reshape_as), "unfold": _windows,
-    **dict.fromkeys(NUMBERED, _numbered), "one_hot": _one_hot, "outer": _outer, "kron": _kronecker,
+    **dict.fromkeys(COUNTERS, _counter_values), "one_hot": _one_hot, "outer": _outer, "kron": _kronecker,
     **dict.fromkeys(("linalg_vecdot", "cosine_similarity", "pairwise_distance"), _pairs_reduced),
     "select": _select, "embedding": _embedding,
     **dict.fromkeys(("index", "index_select"), _index),
     **dict.fromkeys(("gather", "scatter", "scatter_add", "scatter_reduce", "take_along_dim"), _by_numbers),
-    **dict.fromkeys(("index_add", "index_copy", "index_fill"), _added_at),
+    **dict.fromkeys(("index_add", "index_copy", "index_fill"), _scatter_add),
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Stacks of blocks: what lies one behind the other in a module, and gives what it takes."""
+"""Stacks of blocks: consecutive parts of a module whose outputs have the form of their inputs."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def stacks(module: nn.Module, *, mixed: bool = False) -> Iterator[tuple[str, Any
     """Yield (name, stack) of every list or sequence of at least two modules of one class with equal weights' shapes.
 
     Args:
-        module: In which they are looked for.
-        mixed: Also yield lists of modules of several kinds, such as layers that alternate.
+        module: module that is searched.
+        mixed: whether to yield also lists of modules of several kinds, such as layers that alternate.
     """
     nn = require("torch", "build").nn
     for name, part in module.named_modules():
@@ -37,8 +37,8 @@ def block_names(module: nn.Module, stack: str) -> list[str]:
     """Return the names of the blocks of a stack, in order; none where the module has no such part.
 
     Args:
-        module: As a factory makes it, or traced: then its stacks are no lists any more, and keep their names.
-        stack: Name of the list or sequence.
+        module: module as a factory makes it, or traced: then its stacks are no longer lists, but keep their names.
+        stack: name of the list or sequence.
     """
     part = dict(module.named_modules()).get(stack)
     names = [] if part is None else [name for name, _ in part.named_children() if "@" not in name]

@@ -1,4 +1,4 @@
-"""``policy.yaml``: the description of a policy that a person writes beside its code and weights."""
+"""The description of a policy, however it is written down, and ``policy.yaml``, the usual form of it."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ from vlatool.bundle.bundle import LOCATION
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.program import ProgramStep, check_program, program_from, single_graph
 from vlatool.bundle.spec import PolicySpec
-from vlatool.data import checked
-from vlatool.data.npz import NpzReader
-from vlatool.errors import MissingExtra, SourceError, SpecError, instead, nearest
-from vlatool.files.kept import carry
-from vlatool.files.printable import one_line, shortened
+from vlatool.data import PURPOSES, carry_recording
+from vlatool.errors import MissingExtra, SourceError, SpecError, fix_for, suggest
+from vlatool.files.printable import one_line, truncate
 from vlatool.files.yaml import read_mapping
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 
 FILE = "policy.yaml"
-LONGEST = 100
+MAX_LABEL_CHARACTERS = 100
 """Characters of a policy's name, and of its version."""
 KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
@@ -37,21 +35,23 @@ IN_MANIFEST = ("name", "version", "spec", "program", "environment", "parts", "de
 
 @dataclass(frozen=True)
 class Description:
-    """What ``policy.yaml`` says.
+    """What a source says of a policy.
 
     Args:
-        folder: Where relative paths start.
-        factory: ``path.py:make`` or ``package.module:make``; empty for a policy that is an ONNX file.
-        arguments: Keyword arguments of the factory.
-        program: How the graphs are run.
+        folder: where relative paths start, and whose code runs once it is trusted.
+        factory: ``path.py:make`` or ``package.module:make`` of the torch modules; empty for a policy that is graphs.
+        graphs: graph name -> ONNX file, of a policy that is graphs already.
+        arguments: keyword arguments of the factory.
+        program: how the graphs are run; one graph of all inputs and outputs when empty.
         environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation, and
             ``timeout``: seconds that a call of it may take.
-        parts: Part name -> globs of module names.
-        calibration, evaluation: Recorded observations, or None.
-        weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
+        parts: part name -> globs of module names.
+        calibration, evaluation: recordings, each a file or a directory, or None.
+        weights: glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
             module alone. Empty when the factory loads the weights.
         training: ``FILE.py:FUNCTION`` of the folder that yields batches of observations to train on; empty for none.
-        files: Globs of the files that the factory reads; None: every file of weights beside it.
+        files: globs of the files that the factory reads; None: every file of weights beside it.
+        read_from: files that the description was read from, the one that names the policy first.
     """
 
     folder: Path
@@ -59,6 +59,7 @@ class Description:
     version: str
     spec: PolicySpec
     factory: str = ""
+    graphs: Mapping[str, Path] = field(default_factory=dict)
     arguments: dict[str, Any] = field(default_factory=dict)
     program: tuple[ProgramStep, ...] = ()
     environment: dict[str, Any] = field(default_factory=dict)
@@ -70,6 +71,20 @@ class Description:
     weights: str = ""
     files: tuple[str, ...] | None = None
     training: str = ""
+    read_from: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse code of another folder: only that of the one that is trusted, with all that is in it, may run."""
+        for key, named in (("source", self.factory), ("environment", self.environment.get("make"))):
+            where = str(named or "").rpartition(":")[0]
+            if where.endswith(".py") and not _inside(where):
+                raise SourceError(
+                    f"{next(iter(self.read_from), self.folder)}: '{key}' names a file outside the folder of the "
+                    f"policy: {truncate(str(named), 200)}.",
+                    "copy or link what runs into the folder, or name an importable package: package.module:make",
+                )
+        if not self.program:
+            object.__setattr__(self, "program", single_graph(self.spec))
 
     def assets(self) -> list[Path]:
         """Files in the folder that the spec needs on the robot."""
@@ -77,19 +92,14 @@ class Description:
         return [self.folder / name for name in sorted(names)]
 
     def recordings(self) -> dict[str, Path]:
-        """Recorded observations: ``calibration``, ``evaluation`` or both -> file."""
-        files = {"calibration": self.calibration, "evaluation": self.evaluation}
-        return {name: file for name, file in files.items() if file}
+        """Purpose -> recording, a file or a directory."""
+        paths: dict[str, Path | None] = {purpose: getattr(self, purpose) for purpose in PURPOSES}
+        return {purpose: path for purpose, path in paths.items() if path}
 
     def manifest(self, **fields: Any) -> Manifest:
         """Return the manifest of a bundle of this policy, with the fields that only its source knows."""
         own = {name: getattr(self, name) for name in IN_MANIFEST}
         return Manifest(**{**own, **fields})
-
-
-def description_file(path: Path) -> Path:
-    """Return ``policy.yaml`` in a directory, any other path as it is."""
-    return path / FILE if path.is_dir() else path
 
 
 def read_description(path: Path) -> Description:
@@ -99,14 +109,14 @@ def read_description(path: Path) -> Description:
         SourceError: when it is missing, is not YAML, or lacks something.
         SpecError: when the spec or the program is impossible.
     """
-    file = description_file(path)
+    file = path / FILE if path.is_dir() else path
     if not file.exists():
         raise SourceError(f"No such file: {file}.", "a policy needs a description; see docs/guides/your-own-policy.md")
     data = read_mapping(file, str(file), SourceError)
     for key in data:
         if key not in KEYS:
             raise SourceError(
-                f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.", instead(str(key), KEYS)
+                f"{file} has the unknown key '{key}'; {suggest(str(key), KEYS)}.", fix_for(str(key), KEYS)
             )
     if data.get("schema", 1) != 1:
         raise SourceError(f"{file} has the schema {data['schema']!r}; this vlatool reads 1.", "upgrade vlatool")
@@ -121,7 +131,6 @@ def read_description(path: Path) -> Description:
             raise SourceError(f"{file} has no '{key}'.", "see docs/guides/your-own-policy.md for a complete example")
     for key in ("name", "version"):
         _check_label(file, key, data.get(key, "0.0.0"))
-    _check_code(file, data)
     _check_timeout(file, data)
     spec = PolicySpec.from_dict(data["spec"])
     _check_labels(file, spec)
@@ -137,41 +146,30 @@ def read_description(path: Path) -> Description:
         program=program,
         environment=dict(data.get("environment") or {}),
         parts=dict(data.get("parts") or {}),
-        calibration=_data_file(file, data, "calibration"),
-        evaluation=_data_file(file, data, "evaluation"),
+        calibration=_recording(file, data, "calibration"),
+        evaluation=_recording(file, data, "evaluation"),
         description=str(data.get("description", "")),
         license=str(data.get("license", "")),
         weights=_weights(file, data.get("weights", "")),
         files=_files(file, data.get("files")),
         training=_training(file, data.get("training", "")),
+        read_from=(file,),
     )
 
 
 def _check_label(file: Path, key: str, value: Any) -> None:
     """Refuse a name or version that could not stand in a line of a report."""
     label = str(value)
-    if not (0 < len(label) <= LONGEST and one_line(label, LONGEST) == label):
+    if not (0 < len(label) <= MAX_LABEL_CHARACTERS and one_line(label, MAX_LABEL_CHARACTERS) == label):
         raise SourceError(
-            f"{file}: '{key}' must be text of 1 to {LONGEST} characters without control characters; got "
-            f"{shortened(label, 40)!r}.",
+            f"{file}: '{key}' must be text of 1 to {MAX_LABEL_CHARACTERS} characters without control characters; got "
+            f"{truncate(label, 40)!r}.",
             "give it a short name in one line",
         )
 
 
-def _check_code(file: Path, data: Mapping[str, Any]) -> None:
-    """Refuse code of another folder: only that of the one that is named, or trusted with all that is in it, may run."""
-    named = {"source": data.get("source"), "environment": (data.get("environment") or {}).get("make")}
-    for key, factory in named.items():
-        where = str(factory or "").rpartition(":")[0]
-        if where.endswith(".py") and not _inside(where):
-            raise SourceError(
-                f"{file}: '{key}' names a file outside the folder of the policy: {shortened(str(factory), 200)}.",
-                "copy or link what runs into the folder, or name an importable package: package.module:make",
-            )
-
-
 def _check_timeout(file: Path, data: Mapping[str, Any]) -> None:
-    """Refuse what is no time that a call of the environment may take."""
+    """Refuse an invalid timeout for calls of the environment."""
     seconds = (data.get("environment") or {}).get("timeout", 1)
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= 1e6:
         raise SourceError(
@@ -260,16 +258,16 @@ def read_location(bundle: Path) -> Path:
     return folder
 
 
-def _data_file(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
-    """The named file must exist; the default name may be absent."""
+def _recording(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
+    """Return the recording that is named, which must exist, or the one of the default name, if there is one."""
     named = data.get(key)
     path = file.parent / str(named or f"{key}.npz")
-    if named and not path.is_file():
+    if named and not path.exists():
         raise SourceError(
             f"{file} names the {key} data {named}, which does not exist.",
             f"correct the path (it begins at {file.parent}), or leave '{key}' out",
         )
-    return path if path.is_file() else None
+    return path if path.exists() else None
 
 
 def copy_assets(described: Description, out: Path) -> None:
@@ -291,10 +289,8 @@ def copy_assets(described: Description, out: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
     check_assets(described, out / "assets")
-    for key, path in described.recordings().items():
-        checked(path, NpzReader().read(path), described.spec)  # while it has the name that the user knows
-        (out / "data").mkdir(exist_ok=True)
-        carry(path, out / "data" / f"{key}.npz")
+    for purpose, path in described.recordings().items():
+        carry_recording(path, purpose, described.spec, out)
 
 
 def check_assets(described: Description, copies: Path) -> None:

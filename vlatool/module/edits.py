@@ -2,7 +2,7 @@
 
 ``module/edits.json`` is an ordered list of structural edits, ``module/GRAPH.safetensors`` the weights of a graph's
 module after them. A module is always made in this order: the factory, the edits, the weights. Without the second file
-the weights are those of the policy's shards (``vlatool.module.stored``): blocks that are kept have them already.
+the weights are those of the policy's shards (``module.sharded_weights``): blocks that are kept have them already.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, SourceError, nearest, require
+from vlatool.errors import RecipeError, SourceError, require, suggest
 from vlatool.files.json import read_json
-from vlatool.module.cut import cut
-from vlatool.module.edit import AGAIN
+from vlatool.module.edit import REMAKE
 from vlatool.module.edit import Edit as Edit
 from vlatool.module.feeds import first_feeds
+from vlatool.module.unit_removal import remove_units
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -37,15 +37,15 @@ FORM = (
     "graph and module (names), axis (outputs, inputs, blocks, or 'units A.P' with numbers) and keep (different whole "
     "numbers from 0)"
 )
-MOST_KNOWN = 20
+MAX_LISTED = 20
 """Names of modules that a message lists."""
 SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": ("in_features", "in_channels")}
 """Axis -> attributes of a module that say its size."""
 
 
-STORED = {"torch.float32": "F32", "torch.float64": "F64", "torch.float16": "F16", "torch.bfloat16": "BF16"}
+SAFETENSORS_DTYPES = {"torch.float32": "F32", "torch.float64": "F64", "torch.float16": "F16", "torch.bfloat16": "BF16"}
 """Type of a weight that is trained -> as safetensors calls it."""
-_CHANGED: weakref.WeakSet[Any] = weakref.WeakSet()
+_CHANGED_MODULES: weakref.WeakSet[Any] = weakref.WeakSet()
 """Modules that were changed in this process."""
 
 
@@ -78,15 +78,15 @@ def edits_from(text: str | bytes, where: str) -> tuple[Edit, ...]:
         SourceError: when it is not one.
     """
     content = text.encode() if isinstance(text, str) else text
-    listed = read_json(content, where, SourceError, AGAIN, strict=True)
+    listed = read_json(content, where, SourceError, REMAKE, strict=True)
     if not isinstance(listed, list):
-        raise SourceError(f"{where} must hold a list of edits; got {type(listed).__name__}.", AGAIN)
+        raise SourceError(f"{where} must hold a list of edits; got {type(listed).__name__}.", REMAKE)
     return tuple(_edit(entry, where) for entry in listed)
 
 
 def _edit(value: Any, where: str) -> Edit:
     if not _is_edit(value):
-        raise SourceError(f"{where} has an invalid edit: {json.dumps(value)[:200]}; wanted {FORM}.", AGAIN)
+        raise SourceError(f"{where} has an invalid edit: {json.dumps(value)[:200]}; wanted {FORM}.", REMAKE)
     return Edit(str(value["graph"]), str(value["module"]), value["axis"], tuple(value["keep"]))
 
 
@@ -100,19 +100,19 @@ def _is_edit(value: Any) -> bool:
     return whole and len(set(keep)) == len(keep)
 
 
-def edited(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = True) -> dict[str, nn.Module]:
+def apply_bundle(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = True) -> dict[str, nn.Module]:
     """Change what the factory made as a bundle says.
 
     Args:
-        modules: Graph name -> module, which is changed in place, or replaced where it must be traced.
-        bundle: With edits, weights, both or none.
-        weights: Whether its weights are loaded, too; without them, only the structure counts.
+        modules: graph name -> module, which is changed in place, or replaced where it must be traced.
+        bundle: bundle with edits, weights, both or neither.
+        weights: whether its weights are loaded, too; without them, only the structure counts.
 
     Raises:
         SourceError: when an edit or a tensor does not fit the module, or the factory gives one that was changed before.
     """
     for graph, module in modules.items():
-        if module in _CHANGED:
+        if module in _CHANGED_MODULES:
             raise SourceError(
                 f"The factory gives the same module each time that it is called: '{graph}' was changed already.",
                 "let it make a new module each time",
@@ -125,15 +125,19 @@ def edited(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = 
     return made
 
 
+edited = apply_bundle
+"""Old name, for code outside vlatool."""
+
+
 def apply(
     modules: Mapping[str, nn.Module], edits: Iterable[Edit], bundle: Bundle | None = None
 ) -> dict[str, nn.Module]:
     """Keep what each edit says, in order.
 
     Args:
-        modules: Graph name -> module, changed in place, or replaced where it must be traced.
-        edits: Of any graphs.
-        bundle: Whose policy runs once where a module loses units, since it is traced then; no other edit needs it.
+        modules: graph name -> module, changed in place, or replaced where it must be traced.
+        edits: edits of any graphs.
+        bundle: bundle whose policy runs once for the trace where a module loses units; other edits do not need it.
 
     Raises:
         SourceError: when there is no such module, it has no such axis or fewer channels or blocks.
@@ -146,20 +150,20 @@ def apply(
             made = _without_units(made, tuple(group), bundle)
             continue
         for edit in group:
-            parts = dict(_named(made, edit.graph).named_modules())
+            parts = dict(_graph_module(made, edit.graph).named_modules())
             if edit.module not in parts:
-                known = [name for name in parts if name][:MOST_KNOWN]
+                known = [name for name in parts if name][:MAX_LISTED]
                 more = f" and {len(parts) - 1 - len(known)} more" if len(parts) - 1 > len(known) else ""
-                says = f"An edit names the module '{edit.module}'; {nearest(edit.module, known)}{more}."
-                raise SourceError(says, AGAIN)
-            _CHANGED.add(made[edit.graph])
+                says = f"An edit names the module '{edit.module}'; {suggest(edit.module, known)}{more}."
+                raise SourceError(says, REMAKE)
+            _CHANGED_MODULES.add(made[edit.graph])
             (_keep_blocks if edit.axis == BLOCKS else _keep)(parts[edit.module], edit)
     return made
 
 
-def _named(modules: Mapping[str, nn.Module], graph: str) -> nn.Module:
+def _graph_module(modules: Mapping[str, nn.Module], graph: str) -> nn.Module:
     if graph not in modules:
-        raise SourceError(f"An edit names the graph '{graph}'; {nearest(graph, modules)}.", AGAIN)
+        raise SourceError(f"An edit names the graph '{graph}'; {suggest(graph, modules)}.", REMAKE)
     return modules[graph]
 
 
@@ -168,7 +172,8 @@ def _without_units(modules: Mapping[str, nn.Module], edits: Sequence[Edit], bund
     feeds = first_feeds(modules, bundle)
     made = dict(modules)
     for graph in dict.fromkeys(edit.graph for edit in edits):
-        made[graph] = cut(_named(modules, graph), feeds[graph], [edit for edit in edits if edit.graph == graph])
+        own = [edit for edit in edits if edit.graph == graph]
+        made[graph] = remove_units(_graph_module(modules, graph), feeds[graph], own)
     return made
 
 
@@ -181,9 +186,9 @@ def refuse_traced(bundle: Bundle, what: str, command: str) -> None:
     """Refuse a policy that lost units: its parts are those of a trace, and not of the classes that it was made of.
 
     Args:
-        bundle: The policy.
-        what: Parts that would be looked for by their class.
-        command: That looks for them.
+        bundle: the policy.
+        what: parts that would be looked for by their class.
+        command: command that looks for them.
 
     Raises:
         RecipeError: naming the order that works.
@@ -196,7 +201,7 @@ def refuse_traced(bundle: Bundle, what: str, command: str) -> None:
         )
 
 
-def joined_edits(before: Sequence[Edit], after: Sequence[Edit]) -> tuple[Edit, ...]:
+def concatenate_edits(before: Sequence[Edit], after: Sequence[Edit]) -> tuple[Edit, ...]:
     """Return edits that do what those before and those after them do; the units of the latter are of another trace."""
     traces = max((edit.trace for edit in before), default=0)
     return (*before, *(edit.after(traces) for edit in after))
@@ -206,10 +211,12 @@ def _keep(module: Any, edit: Edit) -> None:
     torch = require("torch", "build")
     size = next((name for name in SIZES[edit.axis] if hasattr(module, name)), "")
     if not size or getattr(module, "groups", 1) != 1 or getattr(module, "transposed", False):
-        raise SourceError(f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen from.", AGAIN)
+        raise SourceError(
+            f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen from.", REMAKE
+        )
     if max(edit.keep) >= getattr(module, size):
         has = f"'{edit.module}' has {getattr(module, size)} {edit.axis}"
-        raise SourceError(f"{has}, numbered from 0; an edit keeps number {max(edit.keep)}.", AGAIN)
+        raise SourceError(f"{has}, numbered from 0; an edit keeps number {max(edit.keep)}.", REMAKE)
     axis = CHANNELS.index(edit.axis)
     for holder in (module._parameters, module._buffers):
         for name, value in holder.items():
@@ -225,12 +232,12 @@ def _keep_blocks(module: Any, edit: Edit) -> None:
     nn = require("torch", "build").nn
     if not isinstance(module, nn.ModuleList | nn.Sequential):
         kind = type(module).__name__
-        said = f"The blocks of '{edit.module}' ({kind}) cannot be chosen from: it is no nn.ModuleList or nn.Sequential."
-        raise SourceError(said, AGAIN)
+        said = f"The blocks of '{edit.module}' ({kind}) cannot be chosen: it is not an nn.ModuleList or nn.Sequential."
+        raise SourceError(said, REMAKE)
     blocks = list(module._modules.items())
     if max(edit.keep) >= len(blocks):
         has = f"'{edit.module}' has {len(blocks)} blocks, numbered from 0"
-        raise SourceError(f"{has}; an edit keeps number {max(edit.keep)}.", AGAIN)
+        raise SourceError(f"{has}; an edit keeps number {max(edit.keep)}.", REMAKE)
     module._modules.clear()
     for number, index in enumerate(edit.keep):
         name, block = blocks[index]
@@ -268,7 +275,7 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
         tensor = next((each for each in found if each is not None), None)
         if tensor is None:
             raise SourceError(
-                f"No tensor of {where} is '{first}' of '{graph}'; {nearest(first, stored)}.",
+                f"No tensor of {where} is '{first}' of '{graph}'; {suggest(first, stored)}.",
                 "store the state_dict of the module that make() gives, with its names",
             )
         if tensor.shape != value.shape:
@@ -285,9 +292,9 @@ def save_tensors(path: Path, tensors: Mapping[str, Any], about: Mapping[str, str
     """Write a safetensors file.
 
     Args:
-        path: A new file.
-        tensors: Name -> tensor.
-        about: Texts that go with them.
+        path: path of the new file.
+        tensors: name -> tensor.
+        about: texts that go with them.
 
     Raises:
         OSError: when it cannot be written; what there is of it stays.
@@ -308,10 +315,10 @@ def stream_tensors(
     """Write a safetensors file of tensors that come one after the other, so that one is in memory at a time.
 
     Args:
-        path: A new file.
-        forms: Name -> dtype and shape, in the order in which they come.
-        tensors: The tensors.
-        about: Texts that go with them.
+        path: path of the new file.
+        forms: name -> dtype and shape, in the order in which they come.
+        tensors: the tensors.
+        about: texts that go with them.
 
     Raises:
         OSError: when it cannot be written; what there is of it stays.
@@ -321,7 +328,7 @@ def stream_tensors(
     end = 0
     for name, (dtype, shape) in forms.items():
         start, end = end, end + math.prod(shape) * dtype.itemsize
-        header[name] = {"dtype": STORED[str(dtype)], "shape": list(shape), "data_offsets": [start, end]}
+        header[name] = {"dtype": SAFETENSORS_DTYPES[str(dtype)], "shape": list(shape), "data_offsets": [start, end]}
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
     with path.open("wb") as stream:
@@ -344,19 +351,19 @@ def write_module(out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Modu
     (out / EDITS).write_text(json.dumps([asdict(edit) for edit in edits]) + "\n", encoding="utf-8")
     for graph, module in modules.items():
         held = module.state_dict(keep_vars=True)
-        tensors = _apart({first: held[first] for first, _ in names_of_each(held)})
+        tensors = _separate_memory({first: held[first] for first, _ in names_of_each(held)})
         path = out / FOLDER / f"{graph}.safetensors"
         save_tensors(path, tensors)
         path.chmod((out / EDITS).stat().st_mode & 0o777)  # safetensors lets nobody else read it
 
 
-def _apart(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _separate_memory(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return tensors that share no memory, as a file of them needs; those that share none are not copied."""
     seen: set[int] = set()
     apart = {}
     for name, value in state.items():
         held = value.detach().contiguous()
-        place = held.untyped_storage().data_ptr()
-        apart[name] = held.clone() if place in seen else held
-        seen.add(place)
+        pointer = held.untyped_storage().data_ptr()
+        apart[name] = held.clone() if pointer in seen else held
+        seen.add(pointer)
     return apart

@@ -21,11 +21,11 @@ class Atom:
     """One place in an axis that a factor has, which is neither divided nor a concatenation.
 
     Args:
-        leaf: The factor.
-        path: Number of the factor in the axis; where that one is a concatenation, number of the segment and of the
+        leaf: the factor.
+        path: number of the factor in the axis; where that one is a concatenation, number of the segment and of the
             factor in it, and so on.
-        slower: Factors that it lies within, as the elements of a head lie within the heads.
-        is_fastest: Whether no factor lies within it.
+        slower: factors that it lies within, as the elements of a head lie within the heads.
+        is_fastest: whether no factor lies within it.
     """
 
     leaf: int
@@ -42,8 +42,8 @@ class Factors:
     occurs.
 
     Attributes:
-        sizes: Of each factor.
-        operator: What is being looked at; it is noted as a reason for what it freezes.
+        sizes: sizes of each factor.
+        operator: what is being looked at; it is noted as a reason for what it freezes.
     """
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class Factors:
         return tuple(found)
 
     def inside(self, leaf: int) -> tuple[Axis, ...]:
-        """Return the segments of a leaf; none for one that is no concatenation."""
+        """Return the segments of a leaf; none for one that is not a concatenation."""
         return self._segments.get(leaf, ())
 
     def segments(self, axis: Iterable[int]) -> list[Axis]:
@@ -90,21 +90,21 @@ class Factors:
     def atoms(self, axis: Iterable[int]) -> Iterator[Atom]:
         """Yield the factors in an axis that are neither divided nor concatenations, with their places."""
         leaves = self.leaves(axis)
-        for place, leaf in enumerate(leaves):
-            last = place == len(leaves) - 1
+        for index, leaf in enumerate(leaves):
+            last = index == len(leaves) - 1
             if leaf not in self._segments:
-                yield Atom(leaf, (place,), leaves[:place], last)
+                yield Atom(leaf, (index,), leaves[:index], last)
             for number, segment in enumerate(self.inside(leaf)):
                 for atom in self.atoms(segment):
-                    path, slower = (place, number, *atom.path), (*leaves[:place], *atom.slower)
+                    path, slower = (index, number, *atom.path), (*leaves[:index], *atom.slower)
                     yield Atom(atom.leaf, path, slower, last and atom.is_fastest)
 
     def numbers(self, axis: Iterable[int], path: Sequence[int]) -> NDArray[Any]:
         """Return for each element of an axis which element of a factor it belongs to; -1 for none.
 
         Args:
-            axis: Of so many elements.
-            path: Place of the factor.
+            axis: axis of so many elements.
+            path: place of the factor.
         """
         leaves = self.leaves(axis)
         leaf = leaves[path[0]]
@@ -120,8 +120,8 @@ class Factors:
         """Return the elements of an axis that stay.
 
         Args:
-            axis: Of so many elements.
-            keep: Factor -> its elements that stay; all of the others stay.
+            axis: axis of so many elements.
+            keep: factor -> its elements that stay; all of the others stay.
         """
         found = np.zeros(1, dtype=np.int64)
         for leaf in self.leaves(axis):
@@ -158,32 +158,32 @@ class Factors:
         fast = self.sizes[leaf] // slow
         segments = self._segments.pop(leaf, ())
         if segments and all(self.size(segment) % fast == 0 for segment in segments):
-            divided = [self.parted(segment, self.size(segment) // fast) for segment in segments]
+            divided = [self.split_axis(segment, self.size(segment) // fast) for segment in segments]
             for _, rest in divided[1:]:
                 self.unite(divided[0][1], rest)
-            self._parts[leaf] = self.concatenated([first for first, _ in divided]) + divided[0][1]
+            self._parts[leaf] = self.concatenate([first for first, _ in divided]) + divided[0][1]
             return
         for segment in segments:
             self.freeze(segment)
         reasons = self._frozen.get(leaf, {self.operator} if segments else set())
         self._parts[leaf] = self._new(slow, reasons) + self._new(fast, reasons)
 
-    def parted(self, axis: Iterable[int], slow: int) -> tuple[Axis, Axis]:
+    def split_axis(self, axis: Iterable[int], slow: int) -> tuple[Axis, Axis]:
         """Return a part of size ``slow`` and the rest, which turns faster; frozen where an axis is divided otherwise.
 
         Raises:
-            ValueError: when its size is no multiple of that.
+            ValueError: when its size is not a multiple of that.
         """
         size, leaves = self.size(axis), list(self.leaves(axis))
         if size % slow:
-            raise ValueError(f"{size} elements are no multiple of {slow}")
-        first = self.taken(leaves, slow)
+            raise ValueError(f"{size} elements are not a multiple of {slow}")
+        first = self.take_front(leaves, slow)
         if first is not None:
             return first, tuple(leaves)
         self.freeze(axis)
         return self.new(slow, frozen=True), self.new(size // slow, frozen=True)
 
-    def concatenated(self, axes: Sequence[Axis]) -> Axis:
+    def concatenate(self, axes: Sequence[Axis]) -> Axis:
         """Return the axis that has the elements of several ones, one after the other."""
         full = [axis for axis in axes if self.size(axis)]
         if len(full) == 1:
@@ -202,12 +202,12 @@ class Factors:
             return [self._new(size, reasons) for size in sizes]
         ends = list(accumulate(sizes))
         for end in ends:
-            self._cut(axis, end)
+            self._end_segment(axis, end)
         segments = self.segments(axis)
         starts = list(accumulate(map(self.size, segments), initial=0))
         inside = [[segment for start, segment in zip(starts, segments, strict=False) if end - size <= start < end]
                   for size, end in zip(sizes, ends, strict=True)]  # fmt: skip
-        return [self.concatenated(piece) for piece in inside]
+        return [self.concatenate(piece) for piece in inside]
 
     def unite(self, one: Axis, other: Axis) -> None:
         """Let two axes of equal size be the same; where they are divided otherwise, as far as can be, else freeze."""
@@ -227,7 +227,7 @@ class Factors:
             ours, theirs = self.leaves(ours), self.leaves(theirs)
         self.freeze((*ours, *theirs))
 
-    def taken(self, leaves: list[int], size: int) -> Axis | None:
+    def take_front(self, leaves: list[int], size: int) -> Axis | None:
         """Take factors from the front of a list until they have a size; divide the last one; None where none fits."""
         taken: list[int] = []
         while size > 1:
@@ -271,33 +271,33 @@ class Factors:
 
     def _align(self, one: Axis, other: Axis) -> None:
         """Cut two axes of equal size at the same places, and unite their segments."""
-        while places := self._ends(one) ^ self._ends(other):
-            for place in places:
-                self._cut(one, place)
-                self._cut(other, place)
+        while offsets := self._ends(one) ^ self._ends(other):
+            for offset in offsets:
+                self._end_segment(one, offset)
+                self._end_segment(other, offset)
         for ours, theirs in zip(self.segments(one), self.segments(other), strict=True):
             self.unite(ours, theirs)
 
     def _ends(self, axis: Axis) -> set[int]:
         return set(accumulate(map(self.size, self.segments(axis))))
 
-    def _cut(self, axis: Iterable[int], place: int) -> None:
+    def _end_segment(self, axis: Iterable[int], offset: int) -> None:
         """Let a segment of an axis end at a place."""
         for segment in self.segments(axis):
-            if place < self.size(segment):
+            if offset < self.size(segment):
                 break
-            place -= self.size(segment)
-        if not place:
+            offset -= self.size(segment)
+        if not offset:
             return
         first, rest = segment[0], segment[1:]
         if not rest:
-            self._cut_leaf(first, place)
+            self._cut_leaf(first, offset)
             return
-        before, within = divmod(place, self.size(rest))
+        before, within = divmod(offset, self.size(rest))
         for bound in (before, before + bool(within)):
-            self._cut((first,), bound)
-        self._cut(rest, within)
+            self._end_segment((first,), bound)
+        self._end_segment(rest, within)
 
-    def _cut_leaf(self, leaf: int, place: int) -> None:
+    def _cut_leaf(self, leaf: int, offset: int) -> None:
         reasons = self._frozen.pop(leaf, set())
-        self._segments[leaf] = self._new(place, reasons), self._new(self.sizes[leaf] - place, reasons)
+        self._segments[leaf] = self._new(offset, reasons), self._new(self.sizes[leaf] - offset, reasons)

@@ -1,4 +1,4 @@
-"""Import what ``path.py:make`` or ``package.module:make`` names."""
+"""Import of the function that ``path.py:make`` or ``package.module:make`` names."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, install, instead, nearest
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, fix_for, pip_install, suggest
 from vlatool.files.printable import message_of
-from vlatool.module.fresh import compile_afresh
-from vlatool.user_code.children import left
+from vlatool.module.bytecode import ignore_bytecode
+from vlatool.user_code.children import exit_error
 
-RAISED = "correct what fails; VLATOOL_DEBUG=1 shows where it was raised"
-"""What is done about code of a user that raises, where no more is known of it."""
+CORRECT_CODE = "correct what fails; VLATOOL_DEBUG=1 shows where it was raised"
+"""Fix for code of a user that raises, where nothing more is known."""
 
 OWN_NAME = "vlatool_source_"
-"""How the names begin that files of a policy are imported under."""
+"""Prefix of the module names under which a policy's files are imported."""
 _END = object()
-"""What comes after the last value of an iterator."""
+"""Marks the end of an iterator."""
 
 
 def split_factory(factory: str) -> tuple[str, str]:
@@ -72,9 +72,9 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
         )
     if path is None:
         _check_package(factory)
-    compile_afresh(folder)
+    ignore_bytecode(folder)
     try:
-        with exits_caught(f"importing '{where}'"):
+        with map_user_exceptions(f"importing '{where}'"):
             module = _import_path(path) if path is not None else importlib.import_module(where)
     except VlatoolError:
         raise
@@ -85,13 +85,13 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
         ) from error
     except Exception as error:  # the seam: user code may raise anything while it is imported
         raise SourceError(
-            f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.", RAISED
+            f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.", CORRECT_CODE
         ) from error
     make = getattr(module, function, None)
     if not callable(make):
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
         raise SourceError(
-            f"'{where}' has no function '{function}'; {nearest(function, known)}.", instead(function, known)
+            f"'{where}' has no function '{function}'; {suggest(function, known)}.", fix_for(function, known)
         )
     if path is None:
         _check_own(make, factory)
@@ -105,30 +105,30 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
         SourceError: when the call raises.
     """
     make = import_factory(factory, folder)
-    with _running(factory, folder, f"the factory '{factory}'"):
+    with _name_function(factory, folder, f"the factory '{factory}'"):
         return make(**arguments)
 
 
-def yielded(function: str, folder: Path, arguments: dict[str, Any]) -> Iterator[Any]:
+def iterate_function(function: str, folder: Path, arguments: dict[str, Any]) -> Iterator[Any]:
     """Import a function that yields, call it, and yield what it does.
 
     Args:
-        function: As a factory is named.
-        folder: Where its file lies.
-        arguments: Of the call.
+        function: name of the function, in the form of a factory.
+        folder: where its file lies.
+        arguments: arguments of the call.
 
     Raises:
         SourceError: when it raises, or gives nothing to go through.
     """
     make = import_factory(function, folder)
-    with _running(function, folder, f"'{function}'"):
+    with _name_function(function, folder, f"'{function}'"):
         product = make(**arguments)
         values = iter(product) if isinstance(product, Iterable) else None
     if values is None:
         kind = type(product).__name__
         raise SourceError(f"'{function}' gives a value of type {kind}; it must yield.", "let it yield its values")
     while True:
-        with _running(function, folder, f"'{function}'"):
+        with _name_function(function, folder, f"'{function}'"):
             value = next(values, _END)
         if value is _END:
             return
@@ -136,10 +136,10 @@ def yielded(function: str, folder: Path, arguments: dict[str, Any]) -> Iterator[
 
 
 @contextlib.contextmanager
-def _running(factory: str, folder: Path, what: str) -> Iterator[None]:
+def _name_function(factory: str, folder: Path, what: str) -> Iterator[None]:
     """Turn whatever a user's function raises in this block into an error that names it."""
     try:
-        with _importable(factory_file(factory, folder)), exits_caught(what):
+        with _importable(factory_file(factory, folder)), map_user_exceptions(what):
             yield
     except (VlatoolError, MemoryError):
         raise
@@ -149,11 +149,11 @@ def _running(factory: str, folder: Path, what: str) -> Iterator[None]:
         ) from error
     except Exception as error:  # the seam: user code may raise anything
         about = what[:1].upper() + what[1:]
-        raise SourceError(f"{about} failed: {type(error).__name__}: {message_of(error)}.", RAISED) from error
+        raise SourceError(f"{about} failed: {type(error).__name__}: {message_of(error)}.", CORRECT_CODE) from error
 
 
 @contextlib.contextmanager
-def exits_caught(what: str) -> Iterator[None]:
+def map_user_exceptions(what: str) -> Iterator[None]:
     """Turn what a user's code raises beside ``Exception`` (``sys.exit``, classes of its own) into an error.
 
     Errors of vlatool that say what input was bad, or what package is absent, pass: its functions raise them where the
@@ -169,11 +169,11 @@ def exits_caught(what: str) -> Iterator[None]:
         raise
     except VlatoolError as error:
         message = message_of(error).partition("\n")[0].rstrip(".")
-        raise SourceError(f"{about} raised {type(error).__name__}: {message}.", RAISED) from error
+        raise SourceError(f"{about} raised {type(error).__name__}: {message}.", CORRECT_CODE) from error
     except Exception:
         raise
     except BaseException as error:  # the seam: user code may raise anything
-        raise left(about, type(error).__name__, message_of(error)) from error
+        raise exit_error(about, type(error).__name__, message_of(error)) from error
 
 
 def _check_package(factory: str) -> None:
@@ -243,4 +243,4 @@ def _importable(path: Path | None) -> Iterator[None]:
 def _install_hint(package: str) -> str:
     extra = {"torch": "build", "minigrid": "sim", "gymnasium": "sim", "metaworld": "metaworld", "mujoco": "metaworld"}
     known = extra.get(package.partition(".")[0])
-    return install(known) if known else f"pip install {package}"
+    return pip_install(known) if known else f"pip install {package}"

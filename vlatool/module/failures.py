@@ -18,8 +18,8 @@ from vlatool.files.printable import message_of, one_line
 GUIDE = "docs/guides/your-own-policy.md"
 TOOLS = ("torch", "onnxscript", "onnx_ir", "onnx", "functorch")
 """Packages that export; a line of theirs is not where a policy goes wrong."""
-LONGEST = 300
-SEARCHED = 1 << 20
+MAX_CHARACTERS = 300
+MAX_SEARCHED_CHARACTERS = 1 << 20
 """Characters of an error's text in which a cause is looked for."""
 
 
@@ -28,9 +28,9 @@ class Cause:
     """A reason for which torch gives up.
 
     Args:
-        name: In words.
-        pattern: Found in ``TypeName: message`` of one of the chained errors, across its lines; None: not by its text.
-        remedy: What helps.
+        name: name in words.
+        pattern: found in ``TypeName: message`` of one of the chained errors, across its lines; None: not by its text.
+        remedy: what helps.
     """
 
     name: str
@@ -43,17 +43,17 @@ GENERATE = Cause(
     "export one decoding step as a graph and let the program of policy.yaml run it: 'repeat' for a fixed number of "
     "tokens, 'keep' or 'carry' for the cache; generate() itself decides from its own output when it ends",
 )  # fmt: skip
-SCRIPTED = Cause(
+TORCHSCRIPT = Cause(
     "a TorchScript module", None,
     "build the Python module that was scripted and load its weights, or save it with torch.export.save: TorchScript "
     "cannot be exported again",
 )  # fmt: skip
-QUANTIZED = Cause(
+QUANTIZED_WEIGHTS = Cause(
     "weights that torch has quantized", r"\bquantized::|quantized\.\w*PackedParams|torch\.(?:qint8|quint8|qint32)\b",
     "let make() return the module as it was before torch quantized it, in float; vlatool quantize makes int8 of what "
     "is exported",
 )  # fmt: skip
-CHECKED = Cause(
+CHECKED_DISTRIBUTION = Cause(
     "a distribution that checks its parameters", None,
     "return what the distribution is made of (its mean, its logits), or turn the checks off in policy.py: "
     "torch.distributions.Distribution.set_default_validate_args(False)",
@@ -64,9 +64,9 @@ CONTROL_FLOW = Cause(
     "decide with torch.where() instead of 'if', a fixed number of turns instead of 'while'; keep int(), "
     "float() and .item() of tensors out of forward()",
 )  # fmt: skip
-OTHER = Cause("", "", f"change what that line names; {GUIDE} says what forward() may hold")
+OTHER_CAUSE = Cause("", "", f"change what that line names; {GUIDE} says what forward() may hold")
 CAUSES = (
-    QUANTIZED,
+    QUANTIZED_WEIGHTS,
     Cause(
         "a generator of random numbers", r"Optional\[Generator\]|torch\._C\.Generator",
         "let forward() take the noise as an input, and declare it in the program: "
@@ -93,7 +93,7 @@ CAUSES = (
         "call the operator with explicit arguments, or write it with simpler operators",
     ),
     Cause(
-        "an output that is no tensor", r"translating node return",
+        "an output that is not a tensor", r"translating node return",
         "return a tensor, or a tuple of tensors in the order of 'gives'",
     ),
     Cause(
@@ -136,9 +136,9 @@ def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
     """Return the error for an export that failed.
 
     Args:
-        error: What ``torch.onnx.export`` raised.
-        graph: Name of the graph.
-        module: The torch module that was exported.
+        error: what ``torch.onnx.export`` raised.
+        graph: name of the graph.
+        module: the torch module that was exported.
     """
     chain = list(_chain(error))
     cause = _cause(chain, module)
@@ -148,9 +148,9 @@ def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
     operator = _operator(chain, node)
     where = _of_node(node) if node is not None else _of_frames(chain)
     parts.append(_line(chain))
-    places = [f"operator {operator}"] if operator and operator not in parts[-1] else []
-    places += [where] if where else []
-    return GraphError(f"{': '.join(parts)}{' (' + '; '.join(places) + ')' if places else ''}.", cause.remedy)
+    lines = [f"operator {operator}"] if operator and operator not in parts[-1] else []
+    lines += [where] if where else []
+    return GraphError(f"{': '.join(parts)}{' (' + '; '.join(lines) + ')' if lines else ''}.", cause.remedy)
 
 
 def remedy_for(error: BaseException) -> str:
@@ -173,9 +173,9 @@ def _cause(chain: list[BaseException], module: Any) -> Cause:
     if any(frame.f_code.co_name == "generate" for frame, _line in _frames(chain[-1]) if not _is_tool(frame)):
         return GENERATE
     if any(type(part).__module__.startswith("torch.jit") for part in module.modules()):
-        return SCRIPTED
-    cause = _cause_in_text(chain) or OTHER
-    return CHECKED if cause is CONTROL_FLOW and _in_distribution(chain) else cause
+        return TORCHSCRIPT
+    cause = _cause_in_text(chain) or OTHER_CAUSE
+    return CHECKED_DISTRIBUTION if cause is CONTROL_FLOW and _in_distribution(chain) else cause
 
 
 def _in_distribution(chain: list[BaseException]) -> bool:
@@ -185,7 +185,7 @@ def _in_distribution(chain: list[BaseException]) -> bool:
 
 def _cause_in_text(chain: list[BaseException]) -> Cause | None:
     """Return the first cause of the table that the text of an error names."""
-    texts = [f"{type(error).__name__}: {message_of(error, SEARCHED)}" for error in reversed(chain)]
+    texts = [f"{type(error).__name__}: {message_of(error, MAX_SEARCHED_CHARACTERS)}" for error in reversed(chain)]
     for cause in CAUSES:
         if any(re.search(cause.pattern or "", text, re.DOTALL) for text in texts):
             return cause
@@ -196,12 +196,12 @@ def _line(chain: list[BaseException]) -> str:
     """The first line of torch's own message at the root."""
     root = chain[-1]
     lines = [line.strip() for line in message_of(root).splitlines() if line.strip()]
-    text = one_line(lines[0] if lines else "", LONGEST).rstrip(".")
+    text = one_line(lines[0] if lines else "", MAX_CHARACTERS).rstrip(".")
     return f"{type(root).__name__}: {text}" if text else type(root).__name__
 
 
 def _operator(chain: list[BaseException], node: Any) -> str:
-    match = re.search(r"OpOverload\(op='([\w.]+)'", message_of(chain[-1], SEARCHED))
+    match = re.search(r"OpOverload\(op='([\w.]+)'", message_of(chain[-1], MAX_SEARCHED_CHARACTERS))
     if match:
         return match[1]
     return str(node.target) if node is not None and node.op == "call_function" else ""
@@ -228,7 +228,7 @@ def _of_node(node: Any) -> str:
     own = [line for line in lines if not set(TOOLS) & set(Path(line[0]).parts)]
     if own:
         file, number, function = own[-1]
-        parts.append(_place(file, int(number), function))
+        parts.append(_describe_line(file, int(number), function))
     return ", ".join(parts)
 
 
@@ -240,10 +240,10 @@ def _of_frames(chain: list[BaseException]) -> str:
     frame, line = frames[-1]
     owner = frame.f_locals.get("self")
     module = [f"module {type(owner).__name__}"] if hasattr(owner, "named_modules") else []
-    return ", ".join([*module, _place(frame.f_code.co_filename, line, frame.f_code.co_name)])
+    return ", ".join([*module, _describe_line(frame.f_code.co_filename, line, frame.f_code.co_name)])
 
 
-def _place(file: str, number: int, function: str) -> str:
+def _describe_line(file: str, number: int, function: str) -> str:
     parts = Path(file).parts
     packages = [index for index, part in enumerate(parts) if part in ("site-packages", "dist-packages")]
     name = "/".join(parts[packages[-1] + 1 :]) if packages else Path(file).name

@@ -1,4 +1,4 @@
-"""What each module of a policy is given, as an example."""
+"""Example inputs of each module of a policy."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import CALIBRATION, observations_for
+from vlatool.data import observations_for, recordings_of
 from vlatool.errors import require
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.runtime.observation import ObservationEncoder
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ def recorded_inputs(bundle: Bundle, count: int) -> list[dict[str, Tensor]]:
     ]
 
 
-def unrecorded(bundle: Bundle, count: int) -> tuple[str, ...]:
+def unrecorded_note(bundle: Bundle, count: int) -> tuple[str, ...]:
     """Say that a choice rests on random observations, where nothing is recorded."""
-    if CALIBRATION in bundle.manifest.files:
+    if recordings_of(bundle).calibration is not None:
         return ()
     words = f"nothing is recorded: chosen by {count} random observations, which are none that the robot meets"
     return (f"{words}; record some, and name them in policy.yaml (calibration: FILE.npz)",)
@@ -54,7 +54,7 @@ def first_feeds(modules: Mapping[str, nn.Module], bundle: Bundle) -> dict[str, l
     handles = [module.register_forward_pre_hook(note(graph)) for graph, module in modules.items()]
     try:
         with torch.no_grad():
-            program.run(recorded_inputs(bundle, 1)[0], drawn(program.noise, 1, np.random.default_rng(0)))
+            program.run(recorded_inputs(bundle, 1)[0], draw_noise(program.noise, 1, np.random.default_rng(0)))
     finally:
         for handle in handles:
             handle.remove()

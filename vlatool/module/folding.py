@@ -1,4 +1,4 @@
-"""Weights that a policy cuts or turns before it multiplies by them: done once at export."""
+"""Constant folding at export: splits and transposes of weights are computed once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def fold_weights(model: Any) -> int:
     the graph. A product whose weight is computed is not a layer to what quantizes or counts.
 
     Args:
-        model: An ``onnx_ir.Model`` whose weights are in memory.
+        model: an ``onnx_ir.Model`` whose weights are in memory.
     """
     ir = require("onnx_ir", "build")
     folded = 0
@@ -36,7 +36,7 @@ def fold_weights(model: Any) -> int:
             model.graph.register_initializer(new)
             ir.convenience.replace_all_uses_with(value, new)
         model.graph.remove(node, safe=True)
-        _forget(model.graph, weight)
+        _remove_weight(model.graph, weight)
         folded += 1
     return folded
 
@@ -67,7 +67,7 @@ def _free(graph: Any, name: str) -> str:
     return name
 
 
-def _forget(graph: Any, weight: Any) -> None:
+def _remove_weight(graph: Any, weight: Any) -> None:
     """Drop a weight that nothing reads any more."""
     if not list(weight.uses()) and not weight.is_graph_output():
         del graph.initializers[weight.name]

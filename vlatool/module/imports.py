@@ -1,4 +1,4 @@
-"""Which files of a policy's folder its code imports, as its import statements say."""
+"""Files of a policy's folder that its code imports, according to its import statements."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def imported_files(roots: Iterable[Path], folder: Path) -> set[Path]:
     ``spec_from_file_location(..., HERE / "name.py")``, every Python file of the folder counts.
 
     Args:
-        roots: Files of code in the folder.
-        folder: Where imports begin; packages below it are followed.
+        roots: files of code in the folder.
+        folder: where imports begin; packages below it are followed.
     """
     files: set[Path] = set()
     waiting = [root for root in roots if root.is_file()]
@@ -61,12 +61,12 @@ def _imports(tree: ast.AST, file: Path, folder: Path) -> Iterator[tuple[tuple[st
 
 def _files(parts: tuple[str, ...], base: Path) -> Iterator[Path]:
     """Yield the files of a module and of the packages around it, where they are in the folder."""
-    place = base
-    if (place / "__init__.py").is_file() and parts == ("*",):
-        yield place / "__init__.py"
+    path = base
+    if (path / "__init__.py").is_file() and parts == ("*",):
+        yield path / "__init__.py"
     for part in parts:
-        yield from (file for file in (place / f"{part}.py", place / part / "__init__.py") if file.is_file())
-        place /= part
+        yield from (file for file in (path / f"{part}.py", path / part / "__init__.py") if file.is_file())
+        path /= part
 
 
 def _literal_import(node: ast.Call) -> list[str]:

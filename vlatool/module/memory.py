@@ -1,6 +1,6 @@
 """What a module remembers from call to call, and whether its outputs depend on it: an exported graph remembers nothing.
 
-A buffer that ``forward()`` changes is found in what torch.export traced (``changed_buffers``). Attributes that are no
+A buffer that ``forward()`` changes is found in what torch.export traced (``changed_buffers``). Attributes that are not
 buffers (a counter, a list of past observations) leave no trace there: they are found by running the module, and by
 putting other values into those that changed.
 """
@@ -26,13 +26,13 @@ from vlatool.runtime.program import Program
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-COUNTS = (0, *(2**power for power in range(21)))
+COUNTER_VALUES = (0, *(2**power for power in range(21)))
 """Values that a counter is given: it may take effect after thousands of steps."""
-FACTORS = (0.0, -1.0, 1e3, -1e3)
+PERTURBATIONS = (0.0, -1.0, 1e3, -1e3)
 """What the numbers of other attributes are multiplied by, after 1 is added."""
-LONGER = 32
+LIST_GROWTH = 32
 """How many times as long a list is made: it may take effect once it is full."""
-SAME = 1e-5
+TOLERANCE = 1e-5
 """Relative and absolute difference of outputs up to which they are equal."""
 
 
@@ -43,8 +43,8 @@ def refuse_hidden_state(bundle: Bundle, modules: Mapping[str, nn.Module]) -> Non
     observations learns nothing of it.
 
     Args:
-        bundle: Of the policy.
-        modules: Graph name -> module.
+        bundle: bundle of the policy.
+        modules: graph name -> module.
 
     Raises:
         SourceError: naming the attribute.
@@ -64,9 +64,9 @@ def refuse_kept_values(module: nn.Module, step: ProgramStep, feeds: Sequence[Map
     """Run a module on different inputs and see whether it changes an attribute that its outputs depend on.
 
     Args:
-        module: A module of a policy.
-        step: What it is fed and gives.
-        feeds: Two inputs or more, arrays by name; of one alone nothing is learnt.
+        module: a module of a policy.
+        step: what it is fed and gives.
+        feeds: two inputs or more, arrays by name; of one alone nothing is learnt.
 
     Raises:
         SourceError: naming the attribute.
@@ -74,13 +74,13 @@ def refuse_kept_values(module: nn.Module, step: ProgramStep, feeds: Sequence[Map
     if len(feeds) < 2:
         return
     _run(module, step, feeds[0])
-    before = {place: _plain(value) for place, value in _attributes(module)}
+    before = {key: _plain(value) for key, value in _attributes(module)}
     expected = _run(module, step, feeds[1])
-    after = {place: value for place, value in _attributes(module) if _differ(before.get(place), _plain(value))}
+    after = {key: value for key, value in _attributes(module) if _differ(before.get(key), _plain(value))}
     for (owner, name), value in after.items():
         original = _copy(value)
         try:
-            for other in (original, *_others(original)):
+            for other in (original, *_alternatives(original)):
                 _put(module, owner, name, _copy(other))
                 if not _equal(_try(module, step, feeds[1]), expected):
                     raise forgets(step.graph, f"'{f'{owner}.{name}'.lstrip('.')}'")
@@ -98,7 +98,7 @@ def _attributes(module: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value that can be compared later, None for what is no number, text or tensor, or a container of them."""
+    """Return a value that can be compared later, None unless it consists of numbers, texts and tensors."""
     torch = require("torch", "build")
     if isinstance(value, torch.Tensor):
         return value.detach().clone()
@@ -147,46 +147,46 @@ def _copy(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _copy(item) for key, item in value.items()}
     if isinstance(value, (list, deque)):
-        return _filled(value, [_copy(item) for item in value])
+        return _rebuild(value, [_copy(item) for item in value])
     return _record_of(value, _copy(_fields(value))) if _is_record(value) else value
 
 
-def _others(value: Any) -> Iterator[Any]:
+def _alternatives(value: Any) -> Iterator[Any]:
     """Yield other values of the kind of an attribute."""
     torch = require("torch", "build")
     if isinstance(value, bool):
         yield not value
     elif isinstance(value, int):
-        yield from COUNTS
+        yield from COUNTER_VALUES
     elif isinstance(value, torch.Tensor) and value.numel() == 1:
-        yield from (torch.full_like(value, count) for count in COUNTS if value.dtype != torch.bool)
+        yield from (torch.full_like(value, count) for count in COUNTER_VALUES if value.dtype != torch.bool)
     elif isinstance(value, (float, torch.Tensor)) and getattr(value, "dtype", None) != torch.bool:
-        yield from ((value + 1) * factor for factor in FACTORS)
+        yield from ((value + 1) * factor for factor in PERTURBATIONS)
     elif isinstance(value, (list, deque)):
-        for items in ([], [*value] * LONGER):
-            yield _filled(value, items)
-        for place in range(len(FACTORS)):
-            yield _filled(value, [_one_of(item, place) for item in value] * LONGER)
+        for items in ([], [*value] * LIST_GROWTH):
+            yield _rebuild(value, items)
+        for index in range(len(PERTURBATIONS)):
+            yield _rebuild(value, [_one_of(item, index) for item in value] * LIST_GROWTH)
     elif isinstance(value, dict):
         yield {}
-        yield from _with_others(value)
+        yield from _with_alternatives(value)
     elif _is_record(value):
-        yield from (_record_of(value, fields) for fields in _with_others(_fields(value)))
+        yield from (_record_of(value, fields) for fields in _with_alternatives(_fields(value)))
 
 
-def _with_others(fields: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _with_alternatives(fields: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Yield a mapping with other values."""
-    most = max((len([*_others(item)]) for item in fields.values()), default=0)
-    yield from ({key: _one_of(item, place) for key, item in fields.items()} for place in range(most))
+    most = max((len([*_alternatives(item)]) for item in fields.values()), default=0)
+    yield from ({key: _one_of(item, index) for key, item in fields.items()} for index in range(most))
 
 
-def _filled(like: Any, items: list[Any]) -> Any:
+def _rebuild(like: Any, items: list[Any]) -> Any:
     return deque(items, like.maxlen) if isinstance(like, deque) else items
 
 
-def _one_of(value: Any, place: int) -> Any:
-    others = list(_others(value))
-    return others[place % len(others)] if others else value
+def _one_of(value: Any, index: int) -> Any:
+    others = list(_alternatives(value))
+    return others[index % len(others)] if others else value
 
 
 def _put(module: nn.Module, owner: str, name: str, value: Any) -> None:
@@ -210,6 +210,6 @@ def _run(module: nn.Module, step: ProgramStep, feeds: Mapping[str, Any]) -> list
 def _equal(got: list[Tensor] | None, expected: list[Tensor]) -> bool:
     torch = require("torch", "build")
     return got is not None and all(
-        one.shape == other.shape and torch.allclose(one.double(), other.double(), SAME, SAME, equal_nan=True)
+        one.shape == other.shape and torch.allclose(one.double(), other.double(), TOLERANCE, TOLERANCE, equal_nan=True)
         for one, other in zip(got, expected, strict=True)
     )

@@ -1,4 +1,4 @@
-"""What a factory gave, as torch modules in evaluation mode."""
+"""The product of a factory as torch modules in evaluation mode."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import SourceError, require, suggest
 
 
 def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
     """Return the modules that a program runs: graph name -> torch module in evaluation mode.
 
     Args:
-        product: A module, a program of ``torch.export``, or a mapping of graph names to them.
-        graphs: Names of the program's graphs.
+        product: a module, a program of ``torch.export``, or a mapping of graph names to them.
+        graphs: names of the program's graphs.
 
     Raises:
         SourceError: when one is missing or is something else.
@@ -25,7 +25,7 @@ def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
     for name in dict.fromkeys(graphs):
         if name not in products:
             raise SourceError(
-                f"The program runs '{name}', which the factory does not give; {nearest(name, products)}.",
+                f"The program runs '{name}', which the factory does not give; {suggest(name, products)}.",
                 "name the graphs of the program as make() names its modules",
             )
         module = products[name]

@@ -12,7 +12,7 @@ def divide_by_roots(model: Any) -> int:
     one operator (``SimplifiedLayerNormalization``); OpenVINO fuses both. The two differ by one rounding.
 
     Args:
-        model: An ``onnx_ir.Model``.
+        model: an ``onnx_ir.Model``.
     """
     changed = 0
     for graph in (model.graph, *(function.graph for function in model.functions.values())):

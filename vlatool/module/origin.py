@@ -13,11 +13,12 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError
-from vlatool.module.description import read_description, read_location
+from vlatool.module.description import read_location
 from vlatool.module.factory import OWN_NAME, call_factory, factory_file, split_factory
+from vlatool.module.source import describe
 from vlatool.user_code import trust
 
-AGAIN = "start again from the source"
+RESTART = "start again from the source"
 
 
 @dataclass(frozen=True)
@@ -25,13 +26,13 @@ class Origin:
     """Where a policy's modules come from.
 
     Args:
-        folder: The policy's folder, which the user named or trusted.
+        folder: the policy's folder, which the user named or trusted.
         factory: ``path.py:make`` or ``package.module:make``.
-        arguments: Of the factory.
-        weights: Glob of the shards that vlatool loads; empty when the factory does.
-        code: File beside the factory -> its SHA-256 when the source bundle was made.
+        arguments: arguments of the factory.
+        weights: glob of the shards that vlatool loads; empty when the factory does.
+        code: file beside the factory -> its SHA-256 when the source bundle was made.
         environment: ``make`` and ``tasks`` of the environment that the policy's description names.
-        program: How the description lets its graphs run.
+        program: how the description lets its graphs run.
         training: ``FILE.py:FUNCTION`` that yields batches to train on, as the description has it; empty for none.
     """
 
@@ -56,7 +57,7 @@ class Origin:
             if endings and not name.endswith(endings):
                 continue
             if not file.is_file() or hash_file(file) != digest:
-                raise SourceError(f"{file} has changed since the source bundle was made.", AGAIN)
+                raise SourceError(f"{file} has changed since the source bundle was made.", RESTART)
 
     def build(self) -> Any:
         """Call the factory.
@@ -75,12 +76,12 @@ class Origin:
             file = Path(str(getattr(module, "__file__", None) or os.devnull))
             if path is None or name.startswith(OWN_NAME) or not file.resolve().is_relative_to(path.parent):
                 continue
-            place = file.resolve().relative_to(path.parent)
-            if place.suffix == ".py" and "site-packages" not in place.parts and place.as_posix() not in self.code:
+            own = file.resolve().relative_to(path.parent)
+            if own.suffix == ".py" and "site-packages" not in own.parts and own.as_posix() not in self.code:
                 raise SourceError(
-                    f"The factory '{self.factory}' imports {place}, which no import statement of its files names, so "
+                    f"The factory '{self.factory}' imports {own}, which no import statement of its files names, so "
                     "its changes would not be noticed.",
-                    f"import it with an import statement, or name it in policy.yaml: files: [{place}]",
+                    f"import it with an import statement, or name it in policy.yaml: files: [{own}]",
                 )
 
 
@@ -111,7 +112,7 @@ def origin_of(bundle: Bundle) -> Origin:
     folder = read_location(bundle.path)
     where, function = split_factory(factory)
     named = trust.require(folder, f"{function}() of {where}")
-    described = read_description(Path(named.description) if named.description else folder)
+    described = describe(Path(named.description) if named.description else folder)
     installed = factory == described.factory and factory_file(factory, folder) is None
     if not installed and (named.remembered or factory not in (described.factory, named.factory)):
         _check_own(factory, folder, bundle)
@@ -119,7 +120,7 @@ def origin_of(bundle: Bundle) -> Origin:
     for key in own:
         if key in recorded and recorded[key] != own[key]:
             raise SourceError(
-                f"{bundle.path} says {key}: {recorded[key]!r}; the policy's description says {own[key]!r}.", AGAIN
+                f"{bundle.path} says {key}: {recorded[key]!r}; the policy's description says {own[key]!r}.", RESTART
             )
     return Origin(
         folder, factory, described.arguments, described.weights, _code(bundle), described.environment,
@@ -133,15 +134,17 @@ def _check_own(factory: str, folder: Path, bundle: Bundle) -> None:
     if file is None or not file.is_relative_to(folder.resolve()):
         raise SourceError(
             f"{bundle.path} names the factory {factory}, which the description in {folder} does not name.",
-            f"a factory is a function in the policy's own files, or what its policy.yaml names; {AGAIN}",
+            f"a factory is a function in the policy's own files, or what its policy.yaml names; {RESTART}",
         )
 
 
 def _code(bundle: Bundle) -> dict[str, str]:
     code = bundle.manifest.source.get("code", {})
     if not isinstance(code, Mapping):
-        raise SourceError(f"{bundle.path} has an invalid record of the policy's code.", AGAIN)
+        raise SourceError(f"{bundle.path} has an invalid record of the policy's code.", RESTART)
     for name in code:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or str(PurePosixPath(name)) != name:
-            raise SourceError(f"{bundle.path} records code as {name!r}, which is not a file beside the factory.", AGAIN)
+            raise SourceError(
+                f"{bundle.path} records code as {name!r}, which is not a file beside the factory.", RESTART
+            )
     return {str(name): str(digest) for name, digest in code.items()}

@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
+from vlatool.bundle.module_bundle import export_command
 from vlatool.bundle.program import ProgramStep
-from vlatool.bundle.unexported import export_command
 from vlatool.data import PLAYED, observations_for
 from vlatool.errors import BundleError, GraphError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of
 from vlatool.module.description import read_location
-from vlatool.module.edits import FOLDER, Edit, apply, holds_weights, joined_edits, read_edits, write_module
+from vlatool.module.edits import FOLDER, Edit, apply, concatenate_edits, holds_weights, read_edits, write_module
 from vlatool.module.failures import remedy_for
-from vlatool.module.faked import as_float32, run_faked
+from vlatool.module.fake_weights import as_float32, run_on_fake_tensors
 from vlatool.module.memory import refuse_hidden_state
 from vlatool.module.origin import factory_of
-from vlatool.module.stored import stored_modules, takes_shards, weights_read
+from vlatool.module.sharded_weights import stored_modules, takes_shards, weights_on_demand
 from vlatool.module.torch_policy import load_modules, policy_of, torch_policy
 from vlatool.runtime.contract import OF_THE_POLICY, off_the_robot
 from vlatool.stage.base import Context, Transform, source_of
@@ -35,23 +35,23 @@ if TYPE_CHECKING:
 
 
 TRAINING = f"{FOLDER}/training.json"
-LESS = "prune less, or leave out what it names; VLATOOL_DEBUG=1 shows where it was raised"
-RUN_BELOW = 1 << 32
+PRUNE_LESS = "prune less, or leave out what it names; VLATOOL_DEBUG=1 shows where it was raised"
+MAX_RUN_BYTES = 1 << 32
 """Bytes of weights in shards up to which the changed policy is run on them; above, shapes alone go through it."""
 
 
 @dataclass(frozen=True)
-class Changed:
+class ModuleChanges:
     """What a stage did to modules, beside the weights that it changed in place.
 
     Args:
-        edits: What is kept of the structure; the caller cuts the modules.
-        training: How they were trained, as JSON values: ``losses`` of the steps, ``rounds`` of data; None when not.
-        program: How the graphs run from now on; as before when None.
-        played: Observations that they were trained on, for the ranges of activations, name -> (N, ...); none when None.
-        options: What the stage found out on this machine, under names of options of its own, so that it is made again
+        edits: what is kept of the structure; the caller cuts the modules.
+        training: how they were trained, as JSON values: ``losses`` of the steps, ``rounds`` of data; None when not.
+        program: how the graphs run from now on; as before when None.
+        played: observations that they were trained on, for the ranges of activations, name -> (N, ...); none when None.
+        options: what the stage found out on this machine, under names of options of its own, so that it is made again
             in the same way wherever that is done.
-        record: What it came to, for the record of the bundle, as JSON values.
+        record: what it came to, for the record of the bundle, as JSON values.
     """
 
     edits: tuple[Edit, ...] = ()
@@ -84,13 +84,13 @@ class ModuleStage(Transform):
         """The policy's factory is called."""
         return factory_of(source)
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Change weights in place, and return what else is to be changed.
 
         Args:
-            modules: Graph name -> module, as the source has it.
-            source: For recordings.
-            context: For progress.
+            modules: graph name -> module, as the source has it.
+            source: bundle with the recordings.
+            context: context of the run, for progress.
         """
         raise NotImplementedError(self.name())
 
@@ -115,44 +115,44 @@ class ModuleStage(Transform):
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         if self.keeps_weights and takes_shards(bundle):
-            changed = self._written(bundle, out, self._chosen_on_shards(bundle, context), {}, context)
+            changed = self._write(bundle, out, self._chosen_on_shards(bundle, context), {}, context)
             _run_once(changed)
             return changed
-        changed = self._changed(bundle, out, context)
+        changed = self._change_and_write(bundle, out, context)
         answered = off_the_robot("the first observation", OF_THE_POLICY)
-        with answered, _weights_blamed(lambda: load_modules(changed)):
+        with answered, _name_bad_weights(lambda: load_modules(changed)):
             torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
         return changed
 
-    def _changed(self, bundle: Bundle, out: Path, context: Context) -> Bundle:
+    def _change_and_write(self, bundle: Bundle, out: Path, context: Context) -> Bundle:
         """Change the modules and write them; nothing keeps them while what was written runs."""
         modules = load_modules(bundle)
         refuse_hidden_state(bundle, modules)
         done = self.change(modules, bundle, context)
-        return self._written(bundle, out, done, apply(modules, done.edits, bundle), context)
+        return self._write(bundle, out, done, apply(modules, done.edits, bundle), context)
 
-    def _chosen_on_shards(self, bundle: Bundle, context: Context) -> Changed:
+    def _chosen_on_shards(self, bundle: Bundle, context: Context) -> ModuleChanges:
         """Return what is to be changed; no more than one weight is in memory, unless the choice needs all."""
         if not self.in_parts():
             return self.change(load_modules(bundle), bundle, context)
         stored = stored_modules(bundle)
-        with weights_read(stored):
+        with weights_on_demand(stored):
             return self.change(stored.modules, bundle, context)
 
-    def _written(
-        self, bundle: Bundle, out: Path, done: Changed, modules: Mapping[str, nn.Module], context: Context
+    def _write(
+        self, bundle: Bundle, out: Path, done: ModuleChanges, modules: Mapping[str, nn.Module], context: Context
     ) -> Bundle:
         """Write what was changed, with the modules; without them, where the weights stay in shards."""
         made_by = self.made_by()
         made_by |= {"options": {**made_by["options"], **done.options}, **done.record}
-        edits = joined_edits(read_edits(bundle), done.edits)
-        changed = write_changed(bundle, out, edits, modules, made_by, done.training, done.program, done.played)
-        context.tell("running the changed policy", None)
+        edits = concatenate_edits(read_edits(bundle), done.edits)
+        changed = write_modules(bundle, out, edits, modules, made_by, done.training, done.program, done.played)
+        context.progress("running the changed policy", None)
         return changed
 
 
 @contextlib.contextmanager
-def _weights_blamed(modules: Callable[[], Mapping[str, nn.Module]]) -> Iterator[None]:
+def _name_bad_weights(modules: Callable[[], Mapping[str, nn.Module]]) -> Iterator[None]:
     """Say of an answer that is not finite which weight makes it so, where one does.
 
     Raises:
@@ -188,23 +188,23 @@ def _run_once(bundle: Bundle) -> None:
         SourceError: when it fails.
     """
     stored = stored_modules(bundle)
-    if stored.nbytes < RUN_BELOW:
+    if stored.nbytes < MAX_RUN_BYTES:
         answered = off_the_robot("the first observation", OF_THE_POLICY)
-        with weights_read(stored), answered, _weights_blamed(lambda: stored.modules):
+        with weights_on_demand(stored), answered, _name_bad_weights(lambda: stored.modules):
             policy_of(bundle, stored.modules, SEED).infer(observations_for(bundle, 1)[0])
         return
     try:
-        run_faked(bundle, as_float32(stored.modules), lambda *_: None)
+        run_on_fake_tensors(bundle, as_float32(stored.modules), lambda *_: None)
     except VlatoolError:
         raise
     except Exception as error:  # the seam: the user's module may raise anything
         reason = (message_of(error).splitlines() or [""])[0]
         raise SourceError(
-            f"The changed policy fails: {type(error).__name__}: {reason}.", remedy_for(error) or LESS
+            f"The changed policy fails: {type(error).__name__}: {reason}.", remedy_for(error) or PRUNE_LESS
         ) from error
 
 
-def write_changed(
+def write_modules(
     source: Bundle,
     out: Path,
     edits: Sequence[Edit],
@@ -217,14 +217,14 @@ def write_changed(
     """Write a source bundle with other modules.
 
     Args:
-        source: What it is made from.
-        out: An empty directory.
-        edits: All edits since the factory.
-        modules: Graph name -> module after the edits; none where the weights are those of the policy's shards.
-        made_by: Stage, options and versions.
-        training: How they were trained, if they were.
-        program: How they run; as in the source when None.
-        played: Observations that they were trained on, which the bundle keeps.
+        source: what it is made from.
+        out: an empty directory.
+        edits: all edits since the factory.
+        modules: graph name -> module after the edits; none where the weights are those of the policy's shards.
+        made_by: stage, options and versions.
+        training: how they were trained, if they were.
+        program: how they run; as in the source when None.
+        played: observations that they were trained on, which the bundle keeps.
     """
     write_module(out, edits, modules)
     if training is not None:

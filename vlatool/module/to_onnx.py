@@ -17,17 +17,17 @@ from vlatool.graph.gemm_factors import extract_gemm_factors
 from vlatool.graph.nodes import FOLDED_MODULE_KEY
 from vlatool.graph.random_ops import refuse_random_ops
 from vlatool.module.changed_buffers import refuse_changed_buffers
-from vlatool.module.factory import exits_caught
+from vlatool.module.factory import map_user_exceptions
 from vlatool.module.failures import export_error
 from vlatool.module.norms import divide_by_roots
-from vlatool.module.torchlib import built_once
+from vlatool.module.torchlib import shared_table
 
 if TYPE_CHECKING:
     from torch import nn
 
 IMPORTS = (
     "torch._dynamo", "torch.export._trace", "torch.onnx._internal.exporter._compat",
-    "onnxscript.function_libs.torch_lib.ops", "vlatool.module.torchlib_built",
+    "onnxscript.function_libs.torch_lib.ops", "vlatool.module.torchlib_preload",
 )  # fmt: skip
 """What the first export of a process imports, half of its time; names that a release has no more cost that alone."""
 OPSET = 20
@@ -40,8 +40,8 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     """Export a module with torch's dynamo exporter; return its ``ONNXProgram``.
 
     Args:
-        arguments: One tensor for each feed of the step, real or fake.
-        options: For ``torch.onnx.export``.
+        arguments: one tensor for each feed of the step, real or fake.
+        options: options of ``torch.onnx.export``.
 
     Raises:
         GraphError: when torch cannot, or the graph would draw random numbers.
@@ -49,7 +49,7 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     """
     torch = require("torch", "build")
     try:
-        with quiet_exporter(), built_once(), torch.no_grad(), exits_caught("the policy's forward()"):
+        with quiet_exporter(), shared_table(), torch.no_grad(), map_user_exceptions("the policy's forward()"):
             exported = torch.onnx.export(
                 module, tuple(arguments), dynamo=True, opset_version=opset, input_names=list(step.feeds),
                 output_names=list(step.gives), verbose=False, **options,

@@ -12,11 +12,11 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import require
-from vlatool.module.batched import run_module
-from vlatool.module.edits import edited, is_changed, load_tensors, read_tensors
+from vlatool.module.batched_program import run_module
+from vlatool.module.edits import apply_bundle, is_changed, load_tensors, read_tensors
 from vlatool.module.modules import modules_of
 from vlatool.module.origin import origin_of
-from vlatool.module.stored import filled, stored_modules, takes_shards
+from vlatool.module.sharded_weights import fill_modules, stored_modules, takes_shards
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.weights.shards import read_header, shard_files
@@ -36,8 +36,8 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
     if is_changed(source) and takes_shards(source):
         require("torch", "build")
         origin_of(source).check()
-        return filled(stored_modules(source))
-    return edited(unedited_modules(source), source)
+        return fill_modules(stored_modules(source))
+    return apply_bundle(unedited_modules(source), source)
 
 
 def unedited_modules(source: Bundle) -> dict[str, nn.Module]:
@@ -73,8 +73,8 @@ def torch_policy(source: Bundle, seed: int | None = None) -> Policy:
     """Open a source bundle in eager torch behind the interface of the runtime's policy.
 
     Args:
-        source: Of a torch policy.
-        seed: Of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
+        source: source of a torch policy.
+        seed: seed of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
     """
     return policy_of(source, load_modules(source), seed)
 
@@ -89,8 +89,8 @@ class TorchSession:
     """One torch module behind the session interface; remembers the feeds of its first run and of the last two.
 
     Args:
-        module: The module; takes the feeds positionally in the order of ``step.feeds``.
-        step: The program step that runs it.
+        module: the module; takes the feeds positionally in the order of ``step.feeds``.
+        step: the program step that runs it.
     """
 
     def __init__(self, module: nn.Module, step: ProgramStep) -> None:

@@ -11,12 +11,12 @@ import copy
 from collections.abc import Iterator
 from typing import Any
 
-_built: dict[Any, Any] = {}
+_tables: dict[Any, Any] = {}
 """Arguments of the builder -> table."""
 
 
 @contextlib.contextmanager
-def built_once() -> Iterator[None]:
+def shared_table() -> Iterator[None]:
     """Let exports of this block, one at a time, share the table; each gets a copy, since it may add to it."""
     registry = _registry()
     if registry is None:
@@ -26,9 +26,9 @@ def built_once() -> Iterator[None]:
 
     def from_torchlib(kind: Any, /, **options: Any) -> Any:
         key = tuple(sorted(options.items()))
-        if key not in _built:
-            _built[key] = original.__get__(None, kind)(**options)
-        table = copy.copy(_built[key])
+        if key not in _tables:
+            _tables[key] = original.__get__(None, kind)(**options)
+        table = copy.copy(_tables[key])
         table.functions = {name: list(functions) for name, functions in table.functions.items()}
         return table
 
@@ -43,7 +43,7 @@ def build(opset: int) -> None:
     """Build the table of an opset ahead of the first export."""
     registry = _registry()
     if registry is not None:
-        with built_once():
+        with shared_table():
             registry.from_torchlib(opset_version=opset)
 
 

@@ -1,4 +1,4 @@
-"""Single weights that pruning set to zero: which policies have them, how many they are, and that they stay."""
+"""Weights that pruning set to zero: which policies have them, how many there are, and how they are kept."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from vlatool.errors import RecipeError, nearest
+from vlatool.errors import RecipeError, suggest
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
@@ -52,7 +52,7 @@ class Budget:
         units = {f"unit:{m.unit}" for m in row.measurements if m.name.startswith("error_baseline.")}
         raise RecipeError(
             f"--max-drop names '{self.name}', which is not measured on this policy; "
-            f"{nearest(self.name, [*known, *sorted(units)])}.",
+            f"{suggest(self.name, [*known, *sorted(units)])}.",
             "leave the name out to bound the success or the error that is measured",
         )
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from vlatool.accuracy.paired import ABSENT, compare_success, with_chance
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import EVALUATION
+from vlatool.data import carries_evaluation, recordings_of
 from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.evaluate.recorded import Recorded, carries_recordings
+from vlatool.evaluate.recorded import Recorded
 from vlatool.optimize.budget import distance_of
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
@@ -95,7 +95,7 @@ def _distance(row: Row) -> float:
 
 def is_recorded(bundle: Bundle, loop: ClosedLoop | None) -> bool:
     """Say whether recordings judge a bundle: its own, or where nothing else would, half of its calibration data."""
-    return EVALUATION in bundle.manifest.files or (loop is None and carries_recordings(bundle))
+    return recordings_of(bundle).evaluation is not None or (loop is None and carries_evaluation(bundle))
 
 
 def _recorded(
@@ -121,7 +121,7 @@ def told_wrong(bundle: Bundle, loop: ClosedLoop | None, cache: Path, context: Co
     """
     if loop is None or not any(tensor.kind == "text" for tensor in bundle.manifest.spec.inputs):
         return None
-    context.tell("episodes with the wrong instruction", None)
+    context.progress("episodes with the wrong instruction", None)
     try:
         rate = cached_measure(loop.told_wrong(), bundle, cache, context).rows[-1].get("success")
     except (DataError, SourceError):  # it played the right one: what it cannot do is another
@@ -141,7 +141,7 @@ def _with_controls(loop: ClosedLoop, baseline: Bundle, row: Row, cache: Path, co
     """Play what does not look, and add how often that succeeds to the row of float32."""
     rows = []
     for control in loop.controls():
-        context.tell(f"episodes of the control: {control.control} actions", None)
+        context.progress(f"episodes of the control: {control.control} actions", None)
         played = cached_measure(control, baseline, cache, context).rows[-1]
         rows.append(replace(played, name=control.control))
     return with_chance(row, rows)

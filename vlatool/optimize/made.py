@@ -17,7 +17,7 @@ def chain(stages: tuple[Transform, ...], source: Bundle, plan: Plan, context: Co
     """
     made = [source]
     for stage in stages:
-        context.tell(stage.name(), None)
+        context.progress(stage.name(), None)
         stage.check(made[-1], plan.profile)
         made.append(cached_transform(stage, made[-1], plan.cache, context))
     refuse_findings(made[-1], plan.recipe.limits.accept)

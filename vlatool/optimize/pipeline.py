@@ -16,11 +16,11 @@ from typing import Any
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.moved import with_task_speedup
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import NOT_MADE, DataError, RecipeError, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, DataError, RecipeError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.explain.child_process import explanation_in_child
+from vlatool.files.directory_writer import write_directory
 from vlatool.files.messages import from_json, to_json
-from vlatool.files.writing import writing
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.optimize.budget import budget_of
@@ -39,7 +39,7 @@ from vlatool.optimize.trained import trainings, with_trainings, with_wrong_instr
 from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
-from vlatool.stage.base import Context, Tell
+from vlatool.stage.base import Context, OnProgress
 from vlatool.stage.controls import controls, predicted_for, removed_by
 from vlatool.stage.finish import reseal
 from vlatool.stage.run import cached_measure, cached_transform
@@ -89,7 +89,7 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         float32 where none could be judged), ``inconclusive``
         when float32 does no better than actions that do not look at the observation.
     """
-    with writing(out, force=force) as draft:
+    with write_directory(out, force=force) as draft:
         if plan.profile and (confine := plan.board_set.to_set):
             return _confined(plan, plan.profile, confine, draft, context)
         return _optimized(plan, draft, context)
@@ -103,11 +103,11 @@ def _confined(plan: Plan, profile: Profile, confine: str, draft: Path, context: 
     )  # fmt: skip
     about = f"optimize, confined to {confine},"
     here = "vlatool.optimize.pipeline:optimize_here"
-    children.call(here, to_json(job), context.tell, about, environment={MAX_CPU_ISA: confine}, own=True)
+    children.call(here, to_json(job), context.progress, about, environment={MAX_CPU_ISA: confine}, own=True)
     return read_report(draft / "reports")
 
 
-def optimize_here(request: Mapping[str, Any], tell: Tell) -> None:
+def optimize_here(request: Mapping[str, Any], tell: OnProgress) -> None:
     """Run an ``OptimizeJob`` in this process; its report is in the draft."""
     job = from_json(OptimizeJob, request)
     profile, recipe = Profile.model_validate(job.profile), Recipe.model_validate(job.recipe)
@@ -189,7 +189,7 @@ def _candidates(
             made = candidate(stages, source, baseline, plan, context)
             bundles[name], trained[name] = made[-1], trainings(made)
         except VlatoolError as error:
-            if error.exit_code not in NOT_MADE:
+            if error.exit_code not in NOT_POSSIBLE:
                 raise
             failures.append(Row(name, "failed", error.message))
     if not bundles:

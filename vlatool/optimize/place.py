@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import DataError, UsageError, VlatoolError, require
-from vlatool.files.limits import VARIABLE, limit
-from vlatool.files.printable import secrets_in, without_password
+from vlatool.files.limits import LIMITS_VARIABLE, limit
+from vlatool.files.printable import mask_passwords, secrets_in
 
 EXAMPLES = "name a file, such as trials.journal, or a database, such as sqlite:///trials.db"
 DRIVERS = {"psycopg": "psycopg[binary]", "psycopg2": "psycopg2-binary", "MySQLdb": "mysqlclient"}
@@ -39,8 +39,8 @@ def check_place(url: str) -> None:
         _check_database(url)
         return
     path = Path(url)
-    if without_password(url) != url and not path.exists():
-        raise UsageError(f"The study {without_password(url)} is neither a file nor an address of a database.", EXAMPLES)
+    if mask_passwords(url) != url and not path.exists():
+        raise UsageError(f"The study {mask_passwords(url)} is neither a file nor an address of a database.", EXAMPLES)
     _check_file(path, url)
     if path.is_file():
         _sound_until(path)
@@ -49,7 +49,7 @@ def check_place(url: str) -> None:
 def _check_database(url: str) -> None:
     require("optuna", "search")
     sqlalchemy = require("sqlalchemy", "search")
-    shown = without_password(url)
+    shown = mask_passwords(url)
     try:
         made = sqlalchemy.engine.make_url(url)
         dialect = made.get_dialect()
@@ -182,7 +182,7 @@ class FileLock:
                 os.close(handle)
                 raise UsageError(
                     f"Another process has held the lock {self._path} for {limit('study_seconds')} s.",
-                    f"see which: fuser {self._path}; to wait longer: {VARIABLE}=study_seconds=600",
+                    f"see which: fuser {self._path}; to wait longer: {LIMITS_VARIABLE}=study_seconds=600",
                 )
             time.sleep(0.01)
         self._handle = handle
@@ -213,6 +213,6 @@ def used(url: str) -> Iterator[None]:
         for secret in secrets_in(url):
             reason = reason.replace(secret, "***")
         raise UsageError(
-            f"The study {without_password(url)} cannot be used: {without_password(reason)}.",
+            f"The study {mask_passwords(url)} cannot be used: {mask_passwords(reason)}.",
             "see that the place is there, and can be written; or take a new one: " + EXAMPLES.removeprefix("name "),
         ) from error

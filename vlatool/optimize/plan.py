@@ -8,11 +8,10 @@ from pathlib import Path
 
 from vlatool.errors import RecipeError, require_present
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.files.printable import without_password
+from vlatool.files.printable import mask_passwords
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import fingerprint, matches
 from vlatool.machine.instruction_sets import BoardSet, board_set
-from vlatool.module.description import read_description
 from vlatool.optimize.place import check_place
 from vlatool.optimize.recipe import Limits, Pruning, Recipe, StageList, stage_entries
 from vlatool.sources import Source, source_stage
@@ -64,10 +63,8 @@ class Plan:
     @property
     def closed_loop(self) -> ClosedLoop | None:
         """The closed-loop evaluation, None when the policy names no environment or no episodes are wanted."""
-        if self.source.policy is None or not self.recipe.effort.episodes:
-            return None
-        described = read_description(self.source.policy)
-        if not described.environment:
+        described = self.source.describe() if self.recipe.effort.episodes else None
+        if described is None or not described.environment:
             return None
         effort = self.recipe.effort
         return ClosedLoop(
@@ -131,7 +128,7 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
         if recipe.pruning.study:
             check_place(recipe.pruning.study)
     elif study := recipe.pruning.study:
-        raise RecipeError(f"The study {without_password(study)} keeps trials; none are asked for.", "add --trials 8")
+        raise RecipeError(f"The study {mask_passwords(study)} keeps trials; none are asked for.", "add --trials 8")
     plan = Plan(stage, export, candidates, recipe, profile, cache, fresh, source)
     asked = {"--max-motion": recipe.limits.max_motion, "--worst-task": recipe.limits.worst_task}
     if plan.closed_loop is None and (named := [name for name, limit in asked.items() if limit is not None]):
@@ -201,7 +198,7 @@ def _limits(limits: Limits) -> list[str]:
 def _trials(pruning: Pruning) -> str:
     """Return the trials in words."""
     trained = ", ".join(f"{stage.name()} {_options(stage)}".rstrip() for stage in transforms(pruning.recover))
-    study = f", shared through {without_password(pruning.study)}" if pruning.study else ""
+    study = f", shared through {mask_passwords(pruning.study)}" if pruning.study else ""
     return f"{pruning.trials} policies, pruned, trained ({trained}), quantized and tried{study}"
 
 

@@ -12,10 +12,11 @@ from typing import Any
 from vlatool.accuracy.paired import compare_success
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import carries_evaluation
 from vlatool.episodes.play import EVALUATION_SEEDS
-from vlatool.errors import NOT_MADE, VlatoolError
-from vlatool.evaluate.recorded import Recorded, carries_recordings
-from vlatool.files.work import work_directory
+from vlatool.errors import NOT_POSSIBLE, VlatoolError
+from vlatool.evaluate.recorded import Recorded
+from vlatool.files.resumable_work import work_directory
 from vlatool.machine.version import VERSION
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.made import candidate
@@ -79,7 +80,7 @@ class PrunedSearch:
         while (asked := study.ask(pruning.trials)) is not None:
             number, shape = asked
             place = len(study.tried()) + 1  # numbers of the study count shapes that were asked for twice, too
-            self.context.tell(f"trial {place} of {pruning.trials}: {space.name(shape)}", None)
+            self.context.progress(f"trial {place} of {pruning.trials}: {space.name(shape)}", None)
             study.tell(number, self._try(shape, space))
         tried = study.tried()
         chosen = self._finalists(tried, space)
@@ -105,7 +106,7 @@ class PrunedSearch:
             try:
                 speeds[name] = self._speedup(self._made(stages)[-1])
             except VlatoolError as failure:
-                if failure.exit_code not in NOT_MADE:
+                if failure.exit_code not in NOT_POSSIBLE:
                     raise
         return {name: found[name] for name in sorted(speeds, key=lambda name: -speeds[name])}
 
@@ -117,7 +118,7 @@ class PrunedSearch:
             return Tried(shape, self._speedup(made[-1]), drop, _training_s(made), refused="; ".join(moves.reasons),
                          miss=moves.miss)  # fmt: skip
         except VlatoolError as failure:
-            if failure.exit_code not in NOT_MADE:
+            if failure.exit_code not in NOT_POSSIBLE:
                 raise
             return Tried(shape, note=failure.message)
 
@@ -146,7 +147,7 @@ class PrunedSearch:
         return compared.value("success_drop"), judge_moves(compared, self.plan.recipe.limits)
 
     def _error(self, bundle: Bundle) -> float:
-        if not carries_recordings(self.baseline):
+        if not carries_evaluation(self.baseline):
             return math.inf
         recorded = Recorded(baseline=self.baseline.path)
         row = cached_measure(recorded, bundle, self.plan.cache, self.context).rows[-1]

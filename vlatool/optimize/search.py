@@ -19,24 +19,23 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlatool import registry
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import recorded_observations
-from vlatool.errors import NOT_MADE, GraphError, PluginError, VlatoolError
+from vlatool.data import recorded_observations, recordings_of
+from vlatool.errors import NOT_POSSIBLE, GraphError, PluginError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
-from vlatool.machine.host import isa
 from vlatool.machine.instruction_sets import board_set
+from vlatool.machine.target import target_of
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Limits, StageList
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, installed
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, is_installed
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context
 from vlatool.stage.build import stage_class
@@ -45,7 +44,6 @@ from vlatool.stage.run import cached_measure, cached_transform
 if TYPE_CHECKING:
     from vlatool.sensitivity.layers import LayerError
 
-CALIBRATION = "data/calibration.npz"
 FINALISTS = 3
 FINE = 0.9
 """Share of the budget that a plan may use on calibration observations: those that it is judged on are others."""
@@ -164,8 +162,8 @@ class Search:
         self._planned = max(self._planned, done + 1)
         left = (time.monotonic() - self._begun) / done * (self._planned - done) if done else math.nan
         rest = f", about {left:.0f} s left" if done else ""
-        self.context.tell(f"search: plan {done + 1} of at most {self._planned}{rest}: {name}", done / self._planned)
-        quiet = replace(self.context, tell=lambda _what, _share: None)
+        self.context.progress(f"search: plan {done + 1} of at most {self._planned}{rest}: {name}", done / self._planned)
+        quiet = replace(self.context, progress=lambda _what, _share: None)
         try:
             bundle = self.baseline
             for stage in transforms(stages):
@@ -182,7 +180,7 @@ class Search:
             error = self._error(bundle, quiet)
             trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine, fastest)
         except VlatoolError as failure:
-            if failure.exit_code not in NOT_MADE:
+            if failure.exit_code not in NOT_POSSIBLE:
                 raise
             trial = Trial(name, stages, note=failure.message)
         self.trials.append(trial)
@@ -190,7 +188,8 @@ class Search:
 
     def _error(self, bundle: Bundle, context: Context) -> float:
         count = max(8, min(len(self._observations), 64))
-        recorded = Recorded(data=self.baseline.path / CALIBRATION, baseline=self.baseline.path, samples=count)
+        whole = recordings_of(self.baseline).calibration
+        recorded = Recorded(data=whole, baseline=self.baseline.path, samples=count)
         row = cached_measure(recorded, bundle, self.cache, context).rows[-1]
         error = self.budget.of(row)
         return math.inf if error is None or not error.known else error.value
@@ -277,7 +276,7 @@ class Search:
             try:
                 self._layers = sensitivities_in_child(self.baseline, stage, RECORDED, SAMPLES, self.context, SECONDS)
             except GraphError as error:  # the plans that were tried stand
-                self.context.tell(f"search: the layers could not be measured: {error.message}", None)
+                self.context.progress(f"search: the layers could not be measured: {error.message}", None)
                 self._layers = []
         return self._layers
 
@@ -321,9 +320,10 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
     known = engine_names()
     board = known if profile is None else [name for name in known if name in profile.engines]
     variants: dict[str, StageList] = {}
+    target = target_of(profile)
     for name in board:
-        if installed(name):
-            variants |= engine_class(name).variants(partial(processor_has, profile), calibrated)
+        if is_installed(name):
+            variants |= engine_class(name).variants(target, calibrated)
     for name in registry.names("quantize"):
         try:
             method = stage_class(f"quantize.{name}")
@@ -339,10 +339,3 @@ def graphs_of(bundle: Bundle) -> str:
     files = sorted(f"{path} {record.sha256}" for path, record in manifest.files.items() if path.startswith("graphs/"))
     computes = sorted(f"{name} {graph.compute}" for name, graph in manifest.graphs.items())
     return "\n".join([manifest.engine, *computes, *files])
-
-
-def processor_has(profile: Profile | None, *features: str) -> bool:
-    """Say whether the board's processor (this host's, for None) has one of these features."""
-    if profile is not None:
-        return any(name in features for unit in profile.units.values() for name in unit.isa)
-    return any(name in features for name in isa() or [])

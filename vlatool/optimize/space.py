@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import NOT_MADE, RecipeError, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, RecipeError, VlatoolError
 from vlatool.module.edits import BLOCKS, read_edits
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Pruning, StageList
 from vlatool.stage.base import Context
-from vlatool.stage.controls import PRUNED
+from vlatool.stage.controls import PRUNED_KEY
 from vlatool.stage.run import cached_transform
 
 WIDTHS = 6
@@ -135,7 +135,7 @@ def space_of(
             stage.check(source, None)
             return cached_transform(stage, source, cache, context)
         except VlatoolError as error:
-            if error.exit_code not in NOT_MADE:
+            if error.exit_code not in NOT_POSSIBLE:
                 raise
             refused.append(f"{name}: {error.message}")
             return None
@@ -148,7 +148,7 @@ def space_of(
     def reached(width: float) -> bool:
         """Say whether so much can go; a result that falls a little short would be the same at all smaller widths."""
         made = tried("prune.structured", ratio=(ratio := round(1 - width, 4)))
-        return made is not None and made.manifest.made_by[PRUNED]["reached"] >= ratio
+        return made is not None and made.manifest.made_by[PRUNED_KEY]["reached"] >= ratio
 
     works = next((width for width in narrow if reached(width)), 1.0)
     widths = widths if works == half else tuple(width for width in widths if width >= works)

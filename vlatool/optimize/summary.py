@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from vlatool.accuracy.credibility import Credibility
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import install
+from vlatool.errors import pip_install
 from vlatool.machine.host import fingerprint
 from vlatool.machine.instruction_sets import ENGINE, BoardSet, about_onnx_runtime
 from vlatool.optimize.choice import chosen_of
@@ -100,7 +100,7 @@ def about_int8(rows: Mapping[str, Row], engines: Mapping[str, str], where: Board
         f"{where.board} has no VNNI: int8 products are added in pairs of 16 bits there, which can saturate, and int8 "
         "may be slower than float32. "
     )
-    if not (where.confined or where.alike):
+    if not (where.confined or where.same_set):
         return (f"{words}Whether it is was not measured: OpenVINO does not compute in that set here.",)
     words += "It was tried all the same: "
     tried = {name: speedup for name, row in rows.items()
@@ -118,4 +118,4 @@ def _needs(engine: str) -> tuple[str, ...]:
     """Say what the robot must have installed beside the default engine."""
     if engine == DEFAULT_ENGINE:
         return ()
-    return (f"It runs on the engine {engine}: {install(engine, 'vlatool-runtime')} on the robot.",)
+    return (f"It runs on the engine {engine}: {pip_install(engine, 'vlatool-runtime')} on the robot.",)

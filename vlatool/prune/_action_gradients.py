@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 from vlatool.errors import require
-from vlatool.module.batched import no_gradient
+from vlatool.module.batched_program import no_gradient_error
 
 SEED = 0
 PROBES = 4
@@ -31,7 +31,7 @@ def action_gradients(actions: Iterable[Any], values: Mapping[Key, Any]) -> Itera
     random = torch.Generator().manual_seed(SEED)
     for action in actions:
         if not action.requires_grad:
-            raise no_gradient(NO_GRADIENT_FIX)
+            raise no_gradient_error(NO_GRADIENT_FIX)
         for probe in range(PROBES):
             direction = torch.randn(action.shape, generator=random)
             gradients = torch.autograd.grad(

@@ -10,9 +10,9 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, require
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.module.blocks import first, stacks
-from vlatool.module.carried import LEADING, passages
+from vlatool.module.episode_context import LEADING_OBSERVATIONS, passages
 from vlatool.prune._action_gradients import action_gradients
 from vlatool.runtime.policy import relative_error
 
@@ -38,8 +38,8 @@ class BlockRanking:
     def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> None:
         self._program = BatchedProgram(source.manifest.program, modules)
         self._action = source.manifest.spec.action.name
-        self._noise = drawn(self._program.noise, 1, np.random.default_rng(SEED))
-        self._passages = passages(source, self._program, self._noise, samples, LEADING)
+        self._noise = draw_noise(self._program.noise, 1, np.random.default_rng(SEED))
+        self._passages = passages(source, self._program, self._noise, samples, LEADING_OBSERVATIONS)
         self._blocks = {
             (graph, name, number): block
             for graph, module in modules.items()

@@ -15,8 +15,8 @@ from vlatool.hardware.profile import Profile
 from vlatool.latency_model.predict import predictions
 from vlatool.measurement import agent
 from vlatool.measurement.jobs import LatencyJob
-from vlatool.module.edits import Edit, apply, joined_edits, read_edits
-from vlatool.module.stage import write_changed
+from vlatool.module.edits import Edit, apply, concatenate_edits, read_edits
+from vlatool.module.stage import write_modules
 from vlatool.module.torch_policy import load_modules
 from vlatool.stage.base import Context, Transform
 from vlatool.stage.build import build_stage
@@ -54,7 +54,7 @@ class LatencyMeter:
         """
         paths = [self._unpruned, *self._export_each(edit_lists)]
         job = LatencyJob(tuple(map(str, paths)), self._engine, self._threads, MIN_CALLS, MIN_SECONDS, check=False)
-        measured = agent.measure(job, self._context.tell)
+        measured = agent.measure(job, self._context.progress)
         low, *others = (float(np.percentile(policy.samples, RATIO_PERCENTILE)) for policy in measured.policies)
         whole = float(np.median(measured.policies[0].samples))
         return whole, [ms / low * whole for ms in others]
@@ -63,7 +63,7 @@ class LatencyMeter:
         """Export the policy after each list of edits, with progress."""
         for number, edits in enumerate(edit_lists, 1):
             if len(edit_lists) > 1:
-                self._context.tell(f"exporting a trial: {number} of {len(edit_lists)}", number / len(edit_lists))
+                self._context.progress(f"exporting a trial: {number} of {len(edit_lists)}", number / len(edit_lists))
             yield self._export(edits)
 
     def _export(self, edits: Sequence[Edit]) -> Path:
@@ -73,10 +73,10 @@ class LatencyMeter:
         modules_dir.mkdir()
         graphs_dir.mkdir()
         modules = apply(load_modules(self._source), edits, self._source)
-        everything = joined_edits(read_edits(self._source), edits)
-        bundle = write_changed(self._source, modules_dir, everything, modules, self._made_by)
+        everything = concatenate_edits(read_edits(self._source), edits)
+        bundle = write_modules(self._source, modules_dir, everything, modules, self._made_by)
         stage = cast(Transform, build_stage("export.onnx", {}))
-        stage.run(bundle, graphs_dir, replace(self._context, tell=lambda _what, _share: None))
+        stage.run(bundle, graphs_dir, replace(self._context, progress=lambda _what, _share: None))
         return graphs_dir
 
 

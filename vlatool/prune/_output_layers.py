@@ -9,7 +9,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import require
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.module.feeds import recorded_inputs
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def output_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Coll
     """
     torch = require("torch", "build")
     program = BatchedProgram(source.manifest.program, modules)
-    noise = drawn(program.noise, 1, np.random.default_rng(0))
+    noise = draw_noise(program.noise, 1, np.random.default_rng(0))
     weights = {layer.weight: id(layer) for layer in layers if layer.weight.is_floating_point()}
     frozen = [weight for weight in weights if not weight.requires_grad]
     try:

@@ -9,7 +9,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import FallsShort
 from vlatool.module.axes import Walk
 from vlatool.prune._unit_groups import Macs
-from vlatool.stage.controls import PRUNED
+from vlatool.stage.controls import PRUNED_KEY
 
 MIN_REACHED = 0.9
 """Share of the requested reduction that a result must reach."""
@@ -59,7 +59,7 @@ def refuse_shortfall(bundle: Bundle) -> None:
     Raises:
         FallsShort: with the operators that keep the rest, and their shares of the remaining work.
     """
-    record = bundle.manifest.made_by[PRUNED]
+    record = bundle.manifest.made_by[PRUNED_KEY]
     if record["reached"] >= MIN_REACHED * record["asked"]:
         return
     names = [f"{name} ({share:.1%})" for name, share in list(record["keeps"].items())[:MAX_NAMED]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from vlatool.errors import RecipeError, instead, nearest
+from vlatool.errors import RecipeError, fix_for, suggest
 from vlatool.graph.nodes import matches
 
 
@@ -33,7 +33,7 @@ class Selection:
         for pattern in (*self.include, *self.exclude):
             if not any(matches(name, (pattern,)) for name in names):
                 raise RecipeError(
-                    f"No {what} matches '{pattern}'; {nearest(pattern, list(names))}.", instead(pattern, list(names))
+                    f"No {what} matches '{pattern}'; {suggest(pattern, list(names))}.", fix_for(pattern, list(names))
                 )
 
     def selects(self, names: Iterable[str]) -> bool:

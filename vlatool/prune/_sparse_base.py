@@ -11,10 +11,10 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
-from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.carried import passages
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.batched_program import BatchedProgram, draw_noise
+from vlatool.module.episode_context import passages
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._output_layers import output_layers
 from vlatool.prune._product_observer import is_product_layer, observe_products
@@ -50,7 +50,7 @@ class SparsePruning(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")
     exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Set weights to zero.
 
         Raises:
@@ -58,16 +58,16 @@ class SparsePruning(ModuleStage):
         """
         check_pattern(self.pattern, self.ratio)
         selection = select_layers(modules, source, self.include, self.exclude)
-        context.said.extend(selection.describe())
+        context.messages.extend(selection.describe())
         layers = selection.prunable
-        context.said.extend(unrecorded(source, self.samples) if self.uses_inputs else ())
+        context.messages.extend(unrecorded_note(source, self.samples) if self.uses_inputs else ())
         moments = self._input_moments(layers, modules, source, context) if self.uses_inputs else {}
         for number, (name, layer) in enumerate(layers.items()):
-            context.tell(f"pruning {name}", number / len(layers))
+            context.progress(f"pruning {name}", number / len(layers))
             flat = layer.weight.detach().reshape(len(layer.weight), -1)
             pruned = self.prune_weight(flat, moments.get(name))
             layer.weight.data = pruned.reshape(layer.weight.shape).to(layer.weight.dtype)
-        return Changed()
+        return ModuleChanges()
 
     def prune_weight(self, weight: Tensor, moments: Tensor | None) -> Tensor:
         """Return a weight with zeros.
@@ -96,7 +96,7 @@ class SparsePruning(ModuleStage):
     ) -> dict[str, Tensor]:
         """Return name of a layer -> mean of x xT over its inputs on recorded observations."""
         program = BatchedProgram(source.manifest.program, modules)
-        noise = drawn(program.noise, 1, np.random.default_rng(0))
+        noise = draw_noise(program.noise, 1, np.random.default_rng(0))
         sums: dict[str, Any] = {}
         counts: dict[str, int] = {}
         names = {id(layer.weight): name for name, layer in layers.items()}
@@ -109,7 +109,7 @@ class SparsePruning(ModuleStage):
         recorded = passages(source, program, noise, self.samples, 1)
         with require("torch", "build").no_grad(), observe_products(observe):
             for number, passage in enumerate(recorded):
-                context.tell("collecting the inputs of layers", number / len(recorded))
+                context.progress("collecting the inputs of layers", number / len(recorded))
                 passage.run(program, noise)
         return {name: total / counts[name] for name, total in sums.items()}
 

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.axes import Member, Walk
-from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.carried import LEADING, passages
-from vlatool.module.cut import traced
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.module.edits import Edit
+from vlatool.module.episode_context import LEADING_OBSERVATIONS, passages
 from vlatool.module.feeds import first_feeds
+from vlatool.module.unit_removal import trace_module
 from vlatool.prune._action_gradients import action_gradients
 from vlatool.prune._selection import Selection
 
@@ -94,7 +94,7 @@ def trace_walks(modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, W
     Raises:
         SourceError: when torch.export cannot trace a module.
     """
-    return {graph: Walk(traced(modules[graph], feeds)) for graph, feeds in first_feeds(modules, source).items()}
+    return {graph: Walk(trace_module(modules[graph], feeds)) for graph, feeds in first_feeds(modules, source).items()}
 
 
 def find_groups(walks: Mapping[str, Walk], selection: Selection, multiple: int, name: str) -> list[UnitGroup]:
@@ -272,6 +272,6 @@ def _sum_by_unit(values: Tensor, member: Member) -> NDArray[Any]:
 def _actions(modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> Iterator[Any]:
     """Yield the raw action of each recorded observation, with the state from earlier ones."""
     program = BatchedProgram(source.manifest.program, modules)
-    noise = drawn(program.noise, 1, np.random.default_rng(SEED))
-    for passage in passages(source, program, noise, samples, LEADING):
+    noise = draw_noise(program.noise, 1, np.random.default_rng(SEED))
+    for passage in passages(source, program, noise, samples, LEADING_OBSERVATIONS):
         yield passage.run(program, noise)[source.manifest.spec.action.name]

@@ -12,8 +12,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import BLOCKS, Edit, refuse_traced
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._block_ranking import BlockId, BlockRanking, StackId
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.stage.base import Context
@@ -74,7 +74,7 @@ class Depth(ModuleStage):
         """Return whether one weight at a time suffices: ``gate`` needs all, ``error`` would reload them very often."""
         return bool(self.keep) or self.rank in ("even", "cosine")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the blocks to keep.
 
         Raises:
@@ -83,13 +83,13 @@ class Depth(ModuleStage):
         sizes = self._selected_stacks(self._sizes(modules), source)
         explicit = _explicit_blocks(sizes, self.keep) if self.keep else {}
         remaining = explicit or self._remaining_blocks(sizes, modules, source, context)
-        context.said.extend(
+        context.messages.extend(
             f"kept {len(kept)} of {sizes[graph, name]} blocks of {name or 'the module itself'}: "
             f"{', '.join(map(str, kept))}"
             for (graph, name), kept in remaining.items()
         )
         edits = [Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in remaining.items()]
-        return Changed(tuple(sorted(edits, key=lambda edit: -len(edit.module))))  # stacks within blocks first
+        return ModuleChanges(tuple(sorted(edits, key=lambda edit: -len(edit.module))))  # stacks within blocks first
 
     def _sizes(self, modules: Mapping[str, nn.Module]) -> dict[StackId, int]:
         """Return the number of blocks of each stack; a shared stack belongs to its first graph."""
@@ -106,7 +106,7 @@ class Depth(ModuleStage):
             raise RecipeError(f"{requested} removes no block of {_list_stacks(sizes)}.", "ask for more")
         if self.rank == "even":
             return {stack: evenly_spaced(sizes[stack], sizes[stack] - count) for stack, count in removals.items()}
-        context.said.extend(unrecorded(source, self.samples))
+        context.messages.extend(unrecorded_note(source, self.samples))
         ranking = BlockRanking(modules, source, self.samples)
         remaining = {stack: list(range(sizes[stack])) for stack in removals}
         for (graph, name), block in self._removal_order(ranking, remaining, removals, context):
@@ -127,7 +127,7 @@ class Depth(ModuleStage):
         scores: dict[BlockId, float] = {}
         for done in range(total):
             blocks = [(*stack, block) for stack, count in pending.items() if count for block in remaining[stack]]
-            context.tell(f"ranking {len(blocks)} blocks", done / total)
+            context.progress(f"ranking {len(blocks)} blocks", done / total)
             if not scores or self.rank == "error":
                 scores = rank(blocks, removed)
             graph, name, block = least = min(blocks, key=scores.__getitem__)

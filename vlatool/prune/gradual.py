@@ -10,7 +10,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
-from vlatool.module.stage import Changed
+from vlatool.module.stage import ModuleChanges
 from vlatool.prune._sparse_base import Pattern, check_pattern, describe_zeros, select_layers, smallest_mask
 from vlatool.stage.base import Context
 from vlatool.training.constraint import GrowingZeros
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vlatool.hardware.profile import Profile
-    from vlatool.training.lesson import Lesson
+    from vlatool.training.objective import Objective
     from vlatool.training.teacher import Teacher
 
 
@@ -66,16 +66,16 @@ class Gradual(ImitationStage):
         numbers = [*range(self.interval, last, self.interval), last]
         return {number: self.ratio * (1 - (1 - number / last) ** 3) for number in numbers}
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Train, and report the layers that stay dense."""
-        context.said.extend(select_layers(modules, source, self.include, self.exclude).describe())
+        context.messages.extend(select_layers(modules, source, self.include, self.exclude).describe())
         return super().change(modules, source, context)
 
-    def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
+    def objective(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Objective:
         """Return the objective: imitate the teacher with a growing share of zeros."""
         layers = select_layers(modules, source, self.include, self.exclude).prunable.values()
         zeros = GrowingZeros([layer.weight for layer in layers], self._pruned_mask, self.shares())
-        return replace(super().lesson(modules, source, teacher), constraint=zeros)
+        return replace(super().objective(modules, source, teacher), constraint=zeros)
 
     def lines(self, pruned: Bundle) -> tuple[str, ...]:
         """Report the share of zeros, and the training."""

@@ -20,8 +20,8 @@ from vlatool.latency_model.board_measurements import calibrations
 from vlatool.machine.host import fingerprint, matches
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import Edit, edits_from
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._block_ranking import BlockRanking
 from vlatool.prune._latency_costs import (
     Stack,
@@ -131,7 +131,7 @@ class LatencyPruning(ModuleStage):
         predicted = f"predicted, not measured: {self.target_ms:g} ms or up to {TOLERANCE:.0%} less on {self.board}"
         return (*super().lines(bundle), *([predicted] if self.board and not self.chosen else []))
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the blocks and units to keep.
 
         Raises:
@@ -140,16 +140,16 @@ class LatencyPruning(ModuleStage):
             DataError: when the latency is not met because it varies from run to run.
         """
         if self.chosen:
-            return Changed(_parse_edits(self.chosen))
+            return ModuleChanges(_parse_edits(self.chosen))
         if self.board:
             self._predict_whole(source, context)
-        context.tell("tracing the policy", None)
+        context.progress("tracing the policy", None)
         walks = trace_walks(modules, source)
         groups = find_groups(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         if not groups:
             raise no_units(source.manifest.name)
-        context.tell(f"ranking the units of {len(groups)} groups", None)
-        context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
+        context.progress(f"ranking the units of {len(groups)} groups", None)
+        context.messages.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
         work = Macs(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
@@ -157,11 +157,11 @@ class LatencyPruning(ModuleStage):
             meter = self._meter(source, scratch, context)
             edits = self._meet_target(groups, blocks, work, meter, context)
         board = {"board": load_profile(self.board).name} if self.board else {}
-        return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
+        return ModuleChanges(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
 
     def _predict_whole(self, source: Bundle, context: Context) -> None:
         """Predict the unpruned policy before the ranking, in case the target is met already."""
-        context.tell(f"predicting for {self.board}", None)
+        context.progress(f"predicting for {self.board}", None)
         with scratch_directory() as scratch:
             whole, _ = self._meter(source, scratch, context).times([])
         self._refuse_if_met(whole)
@@ -200,7 +200,7 @@ class LatencyPruning(ModuleStage):
         self, groups: Sequence[UnitGroup], blocks: Sequence[Stack], work: Macs, meter: LatencyMeter, context: Context
     ) -> tuple[Edit, ...]:
         """Return edits that meet the target, selecting again until they do."""
-        context.tell(f"measuring {len({role_of(group) for group in groups})} kinds of layers", None)
+        context.progress(f"measuring {len({role_of(group) for group in groups})} kinds of layers", None)
         whole, prices = measure_costs(groups, blocks, work, meter)
         self._refuse_if_met(whole)
         selector = _Selector(groups, blocks, work, prices, self.least)
@@ -213,7 +213,7 @@ class LatencyPruning(ModuleStage):
             if self._is_met(trials.measure(edits)):  # confirm with a second run
                 trials.measure(edits)
             ms = trials.record_result(edits, wanted)
-            context.tell(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / MAX_ROUNDS)
+            context.progress(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / MAX_ROUNDS)
             if self._is_met(ms):
                 return edits
             next_one = TARGET_SHARE * self.target_ms / trials.result_ratio

@@ -11,7 +11,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.edits import Edit, refuse_traced
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._selection import Selection
 from vlatool.stage.base import Context
 
@@ -38,7 +38,7 @@ class Neurons(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of module names (of the first Linear); all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of module names to leave as they are")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the neurons to keep.
 
         Raises:
@@ -53,7 +53,7 @@ class Neurons(ModuleStage):
         edits: list[Edit] = []
         for graph, first, second, incoming, outgoing in layers:
             if selection.selects((first,)):
-                context.tell(f"pruning {first}", None)
+                context.progress(f"pruning {first}", None)
                 keep = self._kept_neurons(incoming, outgoing)
                 edits += [Edit(graph, first, "outputs", keep), Edit(graph, second, "inputs", keep)]
         if not edits:
@@ -62,7 +62,7 @@ class Neurons(ModuleStage):
                 "elementwise modules between them.",
                 "look at --include and --exclude; other structures cannot be pruned yet",
             )
-        return Changed(tuple(edits))
+        return ModuleChanges(tuple(edits))
 
     def _kept_neurons(self, incoming: Any, outgoing: Any) -> tuple[int, ...]:
         """Return the indices of the neurons to keep, in ascending order."""

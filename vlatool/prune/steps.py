@@ -14,7 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import RecipeError
 from vlatool.hardware.profile import Profile
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -46,14 +46,14 @@ class Steps(ModuleStage):
         """Return True: no weight is needed."""
         return True
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Change the program alone."""
         before, program = source.manifest.program, self._program(source.manifest.program)
-        context.said.extend(
+        context.messages.extend(
             f"steps of '{old.graph}': {old.repeat} -> {new.repeat}"
             for old, new in zip(before, program, strict=True) if old != new
         )  # fmt: skip
-        return Changed(program=program)
+        return ModuleChanges(program=program)
 
     def _program(self, steps: Sequence[ProgramStep]) -> tuple[ProgramStep, ...]:
         if all(step.repeat == 1 for step in steps):

@@ -9,13 +9,13 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.module.axes import Walk
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._reduction_record import MIN_REACHED, describe_reduction, reduction_record, refuse_shortfall
 from vlatool.prune._selection import Selection
 from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, rank_units, trace_walks
 from vlatool.stage.base import Context
-from vlatool.stage.controls import PRUNED
+from vlatool.stage.controls import PRUNED_KEY
 
 if TYPE_CHECKING:
     from torch import nn
@@ -39,25 +39,25 @@ class Structured(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of weights to prune; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the units to keep.
 
         Raises:
             RecipeError: when everything removable is excluded, or a pattern matches nothing.
             SourceError: when torch.export cannot trace a module.
         """
-        context.tell("tracing the policy", None)
+        context.progress("tracing the policy", None)
         walks = trace_walks(modules, source)
         groups = find_groups(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
-        context.tell(f"ranking the units of {len(groups)} groups", None)
+        context.progress(f"ranking the units of {len(groups)} groups", None)
         if groups:
-            context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
+            context.messages.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
             rank_units(groups, self.rank, modules, source, self.samples)
         return self.choose(walks, groups, {step.graph: step.repeat for step in source.manifest.program}, context)
 
     def choose(
         self, walks: Mapping[str, Walk], groups: Sequence[UnitGroup], runs: Mapping[str, int], context: Context
-    ) -> Changed:
+    ) -> ModuleChanges:
         """Remove units from ranked groups.
 
         Args:
@@ -70,9 +70,9 @@ class Structured(ModuleStage):
         self._remove(groups, work, context)
         whole, remaining = [group.size for group in groups], [group.remaining for group in groups]
         record = reduction_record(self.ratio, work, whole, remaining, walks.values())
-        context.said.extend(describe_reduction(record))
+        context.messages.extend(describe_reduction(record))
         edits = tuple(group.edit() for group in groups if group.remaining < group.size)
-        return Changed(edits, record={PRUNED: record})
+        return ModuleChanges(edits, record={PRUNED_KEY: record})
 
     def accept(self, bundle: Bundle) -> None:
         """Refuse a bundle that falls short of the ratio.
@@ -89,7 +89,7 @@ class Structured(ModuleStage):
         goal = whole * (1 - self.ratio)
         before, last = left, list[int]()
         while left > goal:
-            context.tell("choosing what goes", min(1.0, (whole - left) / (whole - goal)))
+            context.progress("choosing what goes", min(1.0, (whole - left) / (whole - goal)))
             prices = []
             for number, group in enumerate(groups):
                 cost, removed = group.cheapest_units(self.least)

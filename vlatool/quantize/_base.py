@@ -16,9 +16,9 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
-from vlatool.bundle.unexported import no_graph
+from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.data import calibration_recording, observations_for
-from vlatool.errors import BundleError, RecipeError, instead, nearest
+from vlatool.errors import BundleError, RecipeError, fix_for, suggest
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import foreign_errors, load, read, save, split_phases
 from vlatool.graph.layers import Layer, find_layers
@@ -28,9 +28,9 @@ from vlatool.quantize.calibration.non_finite import finite_layers
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of
-from vlatool.stage.counted import counted_shares
-from vlatool.stage.finish import HELD, carry_over, finish, history
-from vlatool.stage.products import products_apart
+from vlatool.stage.finish import MAX_COMPARED, carry_over, finish, history
+from vlatool.stage.precision_shares import count_shares
+from vlatool.stage.products import int8_arithmetic
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -69,12 +69,12 @@ class Quantization(Transform):
         if source is None:
             return
         if not source.manifest.graphs:
-            raise no_graph(source, "quantize")
+            raise no_graph_error(source, "quantize")
         for pattern in self.graphs:
             if not fnmatch.filter(source.manifest.graphs, pattern):
                 raise RecipeError(
-                    f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.",
-                    instead(pattern, source.manifest.graphs),
+                    f"No graph matches '{pattern}'; {suggest(pattern, source.manifest.graphs)}.",
+                    fix_for(pattern, source.manifest.graphs),
                 )
         for name in self.chosen_graphs(source):
             graph = source.manifest.graphs[name]
@@ -108,7 +108,7 @@ class Quantization(Transform):
         graphs: dict[str, Graph] = {}
         program = bundle.manifest.program
         for number, (name, graph) in enumerate(bundle.manifest.graphs.items()):
-            context.tell(f"quantizing {name}", number / len(bundle.manifest.graphs))
+            context.progress(f"quantizing {name}", number / len(bundle.manifest.graphs))
             original, target = bundle.file(graph.file), out / graph.file
             selected = name in self.chosen_graphs(bundle)
             compute: str | None = None
@@ -120,12 +120,12 @@ class Quantization(Transform):
                 if compute == "bfloat16":
                     program, phase_graphs = split_phases(program, name, target)
                     graphs.update({key: replace(part, opset=graph.opset) for key, part in phase_graphs.items()})
-                shares = counted_shares(target, context)
+                shares = count_shares(target, context)
             if compute:
                 shares = {compute if key == "float32" else key: share for key, share in shares.items()}
             graphs[name] = Graph(graph.file, shares, graph.opset, compute or "")
         carry_over(bundle, out)
-        context.tell("running the quantized graphs", None)
+        context.progress("running the quantized graphs", None)
         observations = self.golden_observations(bundle)
         changes = {"program": program, "engine": engine or bundle.manifest.engine}
         made_by = made_by or self.made_by()
@@ -145,7 +145,7 @@ class Quantization(Transform):
         They are taken from the stage's own recording, where it has one: synthetic observations, whose ids are zero, do
         not reveal every fault of an engine.
         """
-        return observations_for(bundle, HELD, self.recording)
+        return observations_for(bundle, MAX_COMPARED, self.recording)
 
     def is_recorded(self, bundle: Bundle) -> bool:
         """Return whether golden observations are recorded instead of synthetic."""
@@ -197,13 +197,13 @@ class Quantization(Transform):
         for pattern in (*self.include, *self.exclude):
             if not any(meets(name, (pattern,)) for name in candidates):
                 raise RecipeError(
-                    f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.",
-                    instead(pattern, candidates[:200]),
+                    f"No node matches '{pattern}'; {suggest(pattern, candidates[:200])}.",
+                    fix_for(pattern, candidates[:200]),
                 )
         parts = bundle.manifest.parts
         for part in self.parts:
             if part not in parts:
-                raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.", instead(part, parts))
+                raise RecipeError(f"The policy has no part '{part}'; {suggest(part, parts)}.", fix_for(part, parts))
         globs = tuple(pattern for part in self.parts for pattern in parts[part])
         kept = {name for name in candidates if not self.include or meets(name, self.include)}
         if self.parts:
@@ -222,8 +222,8 @@ def check_ops(ops: Iterable[str]) -> None:
     for name in ops:
         if name not in QUANTIZED_OPS:
             raise RecipeError(
-                f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.",
-                instead(name, QUANTIZED_OPS),
+                f"The operator '{name}' cannot be quantized; {suggest(name, QUANTIZED_OPS)}.",
+                fix_for(name, QUANTIZED_OPS),
             )
 
 
@@ -250,7 +250,7 @@ def fit_range_to_host(stage: StageT, engine: str) -> StageT:
         stage: Stage with the option.
         engine: Engine that will run the bundle; the default one when empty.
     """
-    if "reduce_range" in stage.model_fields_set or products_apart(engine) in (EXACT, UNKNOWN):
+    if "reduce_range" in stage.model_fields_set or int8_arithmetic(engine) in (EXACT, UNKNOWN):
         return stage
     return stage.model_copy(update={"reduce_range": True})
 

@@ -56,7 +56,7 @@ class DynamicInt8(Quantization):
 
         def quantize(name: str, original: Path, target: Path) -> None:
             model = load(original)
-            context.said.extend(describe_float_layers(name, model))
+            context.messages.extend(describe_float_layers(name, model))
             self._quantize(model, target, layers[name])
 
         return self.transform(bundle, out, context, quantize)

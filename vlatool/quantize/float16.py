@@ -15,7 +15,7 @@ from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import check_opset
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._trial_compile import open_in_child
 from vlatool.quantize.calibration.samples import recorded_moments
@@ -80,7 +80,7 @@ class Float16(Quantization):
             for value, overflow in values.items():
                 size = float(f"{overflow.largest:.4g}")
                 report["beyond"].append({"graph": graph, "value": value, "sample": overflow.sample, "largest": size})
-                context.tell(
+                context.progress(
                     f"{value} reaches {size:g} in sample {overflow.sample}, beyond float16: it stays float32", None
                 )
 
@@ -131,7 +131,7 @@ def _convert_and_compare(original: Path, target: Path, kept: set[str], feeds: Se
     before, after = engine_class()(original, 1), engine_class()(target, 1)
     change = 0.0
     for feed in feeds:
-        with risky(engine_class(), f"ran {target.name}"):
+        with engine_call(engine_class(), f"ran {target.name}"):
             expected, got = before.run(feed), after.run(feed)
         floats = [name for name, value in expected.items() if value.dtype.kind == "f"]
         errors = [relative_error(got[name], expected[name]) for name in floats]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from vlatool.data import MOST
+from vlatool.data import MAX_PLAYED
 from vlatool.runtime.engine import layouts
 from vlatool.stage.build import build_stage
 from vlatool.training.fake_quantization import BLOCK, fake_quantization
@@ -34,7 +34,7 @@ class Qat(ImitationStage):
     """
 
     changed_first: ClassVar[bool] = False
-    keeps: ClassVar[int] = MOST
+    keeps: ClassVar[int] = MAX_PLAYED
 
     weights: Literal["int8", "int4"] = Field("int8", description="int8 with int8 activations; int4 weights alone")
     learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
@@ -50,11 +50,11 @@ class Qat(ImitationStage):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Check that the stages that follow take the layout."""
-        for name, options in self.then():
+        for name, options in self.following_stages():
             build_stage(name, options)
         super().check(source, profile)
 
-    def then(self) -> tuple[tuple[str, dict[str, Any]], ...]:
+    def following_stages(self) -> tuple[tuple[str, dict[str, Any]], ...]:
         """Return the stages that export and quantize to the trained grid, in the requested layout."""
         layout = {"layout": self.layout} if "layout" in self.model_fields_set else {}
         if self.weights == "int4":

@@ -176,7 +176,7 @@ class StaticInt8(CalibratedQuantization):
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
-            context.said.extend(describe_float_layers(name, model))
+            context.messages.extend(describe_float_layers(name, model))
             pixels: dict[str, Range] = {}
             if self.int8_layout.integer:
                 split_gemms(model)

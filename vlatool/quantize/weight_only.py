@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from vlatool.bundle.bundle import Bundle, hash_file, write_manifest
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
-from vlatool.bundle.unexported import export_command
+from vlatool.bundle.module_bundle import export_command
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, DataError, require
-from vlatool.files.work import forget, work_directory
+from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.graph.files import link
 from vlatool.graph.precision import precision_shares
 from vlatool.module.origin import factory_of
-from vlatool.module.stored import takes_shards
+from vlatool.module.sharded_weights import takes_shards
 from vlatool.module.to_onnx import IMPORTS
 from vlatool.quantize.streamed.graph_templates import BLOCKED_OPSET, load_templates, weights_fingerprint
 from vlatool.quantize.streamed.options import WeightOptions
@@ -30,8 +30,8 @@ from vlatool.quantize.streamed.tensor_jobs import records_for
 from vlatool.quantize.streamed.weights_plan import WeightsPlan, make_plan
 from vlatool.runtime.engine import STANDARD_LAYOUT, class_for
 from vlatool.stage.base import Context, SampleSet, source_of
-from vlatool.stage.counted import counted_shares
 from vlatool.stage.finish import SEED, carry_over, finish, history
+from vlatool.stage.precision_shares import count_shares
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -72,7 +72,7 @@ class WeightOnly(WeightOptions):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Check that there is something to quantize, and calibration data for the methods that need it."""
-        if self.calibration and not self.calibration.is_file():
+        if self.calibration and not self.calibration.exists():
             raise DataError(
                 f"The calibration file {self.calibration} does not exist.",
                 "check the path, or leave --calibration out for the bundle's own recording",
@@ -102,16 +102,18 @@ class WeightOnly(WeightOptions):
         self.check(bundle, None)
         for package in ("onnx", "onnx_ir"):
             require(package, "build")
-        context.tell("reading the graphs", None)
+        context.progress("reading the graphs", None)
         (out / "graphs").mkdir()
         plan = make_plan(load_templates(bundle, BLOCKED_OPSET), self, bundle, WEIGHTS_FILE)
         samples = SampleSet() if self.method in CALIBRATED_METHODS else None
         with work_directory(self.work(bundle)) as directory:
             records = self._records(plan, bundle, directory, samples)
-            written = write_records(records, self._identity(plan, bundle), directory, _processes(records), context.tell)
+            written = write_records(
+                records, self._identity(plan, bundle), directory, _processes(records), context.progress
+            )
             link(written.path, out / WEIGHTS_FILE)
             quantized = self._finish(plan, bundle, out, written, samples, context)
-            forget(directory)
+            remove_work(directory)
         return quantized
 
     def _finish(
@@ -127,15 +129,15 @@ class WeightOnly(WeightOptions):
         opsets = plan.save(out)
         carry_over(bundle, out)
         made_by = {**self.made_by(calibration=samples), **_summarize(written, out / LOSS_REPORT)}
-        context.tell("counting", None)
+        context.progress("counting", None)
         runs = self.verify == "run" or (self.verify == "auto" and written.bytes < MAX_RUN_BYTES)
         graphs = {}
         for name, opset in opsets.items():
             file = out / f"graphs/{name}.onnx"
-            shares = counted_shares(file, context) if runs else precision_shares(file)
+            shares = count_shares(file, context) if runs else precision_shares(file)
             graphs[name] = Graph(f"graphs/{name}.onnx", shares, opset)
         if runs:
-            context.tell("running the quantized graphs", None)
+            context.progress("running the quantized graphs", None)
             return finish(
                 bundle, out, made_by=made_by, graphs=graphs, observations=self.golden_observations(bundle),
                 recorded=self.is_recorded(bundle),

@@ -14,20 +14,20 @@ from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.errors import DataError, require
 from vlatool.files.npz import open_npz
 
-NAMED = 5
+MAX_NAMED = 5
 """How many names a sentence lists before it counts the rest."""
 BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
-class Compared:
+class FileMatch:
     """One file of a bundle beside the same file of another.
 
     Args:
-        file: Path inside the bundles.
-        bytes: Size in the first bundle; in the second where the first lacks the file.
-        identical: Whether every byte is the same (of the manifest: every field that is compared).
-        why: How the files differ, a sentence part; empty when they are identical.
+        file: path inside the bundles.
+        bytes: size in the first bundle; in the second where the first lacks the file.
+        identical: whether every byte is the same (of the manifest: every field that is compared).
+        why: how the files differ, a sentence part; empty when they are identical.
     """
 
     file: str
@@ -36,13 +36,13 @@ class Compared:
     why: str = ""
 
 
-def compare_bundles(first: Bundle, second: Bundle, leave_out: Iterable[str] = ()) -> tuple[Compared, ...]:
+def compare_bundles(first: Bundle, second: Bundle, leave_out: Iterable[str] = ()) -> tuple[FileMatch, ...]:
     """Compare every file that one of the manifests records, then the manifests themselves.
 
     Args:
-        first: The bundle that is checked; sentences call it ``recorded``.
-        second: The bundle that was made again; sentences call it ``rebuilt``.
-        leave_out: Top-level fields of the manifest that are not compared.
+        first: bundle that is checked; sentences call it ``recorded``.
+        second: bundle that was made again; sentences call it ``rebuilt``.
+        leave_out: top-level fields of the manifest that are not compared.
 
     Returns:
         One entry for each file, sorted by name, the manifest last.
@@ -51,26 +51,26 @@ def compare_bundles(first: Bundle, second: Bundle, leave_out: Iterable[str] = ()
     return (*(_compare(first, second, name) for name in names), _compare_manifests(first, second, set(leave_out)))
 
 
-def _compare(first: Bundle, second: Bundle, name: str) -> Compared:
+def _compare(first: Bundle, second: Bundle, name: str) -> FileMatch:
     one, two = first.manifest.files.get(name), second.manifest.files.get(name)
     if one is None or two is None:
         size = (one or two).bytes if one or two else 0  # type: ignore[union-attr]
-        return Compared(name, size, False, "only in the rebuilt bundle" if one is None else "not in the rebuilt bundle")
+        return FileMatch(name, size, False, f"{'only' if one is None else 'not'} in the rebuilt bundle")
     if same_bytes(first.path / name, second.path / name):
-        return Compared(name, one.bytes, True)
-    return Compared(name, one.bytes, False, explain(first.path / name, second.path / name))
+        return FileMatch(name, one.bytes, True)
+    return FileMatch(name, one.bytes, False, explain(first.path / name, second.path / name))
 
 
-def _compare_manifests(first: Bundle, second: Bundle, leave_out: set[str]) -> Compared:
+def _compare_manifests(first: Bundle, second: Bundle, leave_out: set[str]) -> FileMatch:
     path = first.path / MANIFEST
     size = path.stat().st_size
     if not leave_out and same_bytes(path, second.path / MANIFEST):
-        return Compared(MANIFEST, size, True)
+        return FileMatch(MANIFEST, size, True)
     one, two = (_fields(bundle, leave_out) for bundle in (first, second))
     if leave_out and json.dumps(one) == json.dumps(two):
-        return Compared(MANIFEST, size, True)
+        return FileMatch(MANIFEST, size, True)
     found = list(_changes(one, two, ""))
-    return Compared(MANIFEST, size, False, listed(found) if found else "the same fields in another order or layout")
+    return FileMatch(MANIFEST, size, False, name_list(found) if found else "the same fields in another order or layout")
 
 
 def _fields(bundle: Bundle, leave_out: set[str]) -> dict[str, Any]:
@@ -148,7 +148,7 @@ def _explain_npz(one: Path, two: Path) -> str:
             numbers = a[name].dtype.kind in "fiub"
             largest = np.max(np.abs(a[name].astype(np.float64) - b[name].astype(np.float64))) if numbers else None
             said.append(f"array {name}" + ("" if largest is None else f" (largest difference {largest:.3g})"))
-    return listed(said)
+    return name_list(said)
 
 
 def _explain_onnx(one: Path, two: Path) -> str:
@@ -160,10 +160,10 @@ def _explain_onnx(one: Path, two: Path) -> str:
     said = _named_difference("initializer", first.graph.initializer, second.graph.initializer)
     said += _named_difference("node", first.graph.node, second.graph.node)
     for part in ("input", "output", "value_info"):
-        if _serialized(getattr(first.graph, part)) != _serialized(getattr(second.graph, part)):
+        if _serialize(getattr(first.graph, part)) != _serialize(getattr(second.graph, part)):
             said.append(f"the graph's {part}")
     for part in ("opset_import", "functions", "metadata_props"):
-        if _serialized(getattr(first, part)) != _serialized(getattr(second, part)):
+        if _serialize(getattr(first, part)) != _serialize(getattr(second, part)):
             said.append(part)
     for part in ("ir_version", "producer_name", "producer_version", "doc_string"):
         if getattr(first, part) != getattr(second, part):
@@ -180,17 +180,17 @@ def _named_difference(kind: str, one: Any, two: Any) -> list[str]:
         f"{kind}s not rebuilt": [name for name in first if name not in second],
         f"{kind}s only rebuilt": [name for name in second if name not in first],
     }
-    said = [f"{what}: {listed(names)}" for what, names in groups.items() if names]
+    said = [f"{what}: {name_list(names)}" for what, names in groups.items() if names]
     if not said and list(first) != list(second):
         said = [f"the {kind}s are in another order"]
     return said
 
 
-def _serialized(items: Any) -> list[bytes]:
+def _serialize(items: Any) -> list[bytes]:
     return [item.SerializeToString(deterministic=True) for item in items]
 
 
-def listed(names: list[str]) -> str:
+def name_list(names: list[str]) -> str:
     """Return the first names, and how many more there are."""
-    rest = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {rest} more" if rest > 0 else "")
+    rest = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")

@@ -10,23 +10,24 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, UNRECORDED, Bundle, hash_file
+from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, UNRECORDED_NAMES, Bundle, hash_file
 from vlatool.errors import BundleError, SourceError, VlatoolError
+from vlatool.files.directory_writer import write_directory
+from vlatool.files.ownership import LEDGER
 from vlatool.files.scratch import scratch_directory
-from vlatool.files.writing import writing
-from vlatool.files.written import LEDGER
 from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
-from vlatool.rebuild.differences import Compared, compare_bundles
-from vlatool.sources import source_stage
-from vlatool.stage.base import Context, Transform, installed_version, source_of
+from vlatool.rebuild.differences import FileMatch, compare_bundles
+from vlatool.runtime.engine import identities
+from vlatool.sources import is_bundle, source_stage
+from vlatool.stage.base import Context, Transform, content_hash, installed_version, source_of
 from vlatool.stage.build import build_stage, stage_class
-from vlatool.stage.finish import DECIDED, FINALIZED, history, reseal
+from vlatool.stage.finish import FINALIZED_FIELDS, OPTIMIZE, history, reseal
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust
 
-MADE_LAST = ("graphs", "golden", MANIFEST)
+LAST_FILES = ("graphs", "golden", MANIFEST)
 UNUSABLE = "make the bundle again, with the command that made it"
 
 Entry = dict[str, Any]
@@ -36,22 +37,22 @@ GRAPHS = "graphs/"
 
 
 @dataclass(frozen=True)
-class Rebuilt:
+class RebuildResult:
     """What came of making a bundle again.
 
     Args:
-        bundle: The bundle that was checked.
+        bundle: the bundle that was checked.
         hash: ``sha256:...`` of the bundle that was made again.
-        source: What it was made from.
-        files: Every hashed file and the manifest, compared byte by byte.
-        stages: Each stage that ran, in order, and whether its graphs are the recorded ones.
-        left_out: Fields of the manifest that were not compared, because they were measured.
+        source: what it was made from.
+        files: every hashed file and the manifest, compared byte by byte.
+        stages: each stage that ran, in order, and whether its graphs are the recorded ones.
+        left_out: fields of the manifest that were not compared, because they were measured.
     """
 
     bundle: Bundle
     hash: str
     source: str
-    files: tuple[Compared, ...]
+    files: tuple[FileMatch, ...]
     stages: tuple[tuple[str, bool], ...]
     left_out: tuple[str, ...] = ()
 
@@ -61,7 +62,7 @@ class Rebuilt:
         return all(file.identical for file in self.files)
 
     @property
-    def first_difference(self) -> Compared | None:
+    def first_difference(self) -> FileMatch | None:
         """The file that differs and that others which differ were made from, None when none does."""
         differing = [file for file in self.files if not file.identical]
         return min(differing, key=lambda file: _rank(file.file), default=None)
@@ -77,16 +78,16 @@ class Rebuilt:
         return all(file.identical or file.file == MANIFEST or _is_golden(file.file) for file in self.files)
 
     @property
-    def beside(self) -> tuple[str, ...]:
+    def files_beside(self) -> tuple[str, ...]:
         """What is in the bundle, and in no hash, so that nothing of it was compared."""
         hashed = (MANIFEST, DIGEST, LEDGER)
-        return tuple(name for name in UNRECORDED if name not in hashed and (self.bundle.path / name).exists())
+        return tuple(name for name in UNRECORDED_NAMES if name not in hashed and (self.bundle.path / name).exists())
 
 
 def _rank(name: str) -> int:
     """Return how late in the making of a bundle a file comes: what differs first may be why later ones do."""
     folder = name.partition("/")[0]
-    return MADE_LAST.index(folder) + 1 if folder in MADE_LAST else 0
+    return LAST_FILES.index(folder) + 1 if folder in LAST_FILES else 0
 
 
 def _is_golden(file: str) -> bool:
@@ -104,7 +105,7 @@ class _Start:
 
 
 @dataclass
-class _Places:
+class _FileSearch:
     """Where files that an option names are looked for."""
 
     files: tuple[Path, ...]
@@ -114,8 +115,8 @@ class _Places:
         """Return the file of that name, which the record holds too, whose SHA-256 begins with ``digest``."""
         others = []
         for path in (*self.files, *(folder / name for folder in self.folders)):
-            if path.is_file():
-                got = hash_file(path)
+            if path.exists():
+                got = content_hash(path)
                 if path.name == name and got.startswith(digest):
                     return path
                 others.append(f"{path} has sha256:{got[:16]}")
@@ -155,11 +156,12 @@ def version_changes(entries: Iterable[Entry]) -> dict[str, tuple[str, str]]:
     A package that stages recorded in several versions is named with the first that is not installed.
     """
     changed: dict[str, tuple[str, str]] = {}
+    built = identities()
     for entry in entries:
         installed = {name: installed_version(name) or "not installed" for name in entry.get("versions", {})}
         recorded = {"vlatool": entry.get("vlatool", VERSION), **entry.get("versions", {})}
         for name, version in recorded.items():
-            now = {"vlatool": VERSION, **installed}[name]
+            now = {"vlatool": VERSION, **installed, **built}[name]
             if version != now:
                 changed.setdefault(name, (str(version), now))
     return changed
@@ -174,18 +176,18 @@ def rebuild(
     cache: Path,
     out: Path | None = None,
     force: bool = False,
-) -> Rebuilt:
+) -> RebuildResult:
     """Run the recorded stages again in a fresh directory and compare what they make with the bundle.
 
     Args:
-        bundle: The bundle to make again; verified.
-        context: For progress.
-        source: Policy directory, ``path.py:make``, ONNX file, or a bundle that is the input of a recorded stage; where
+        bundle: the bundle to make again; verified.
+        context: context of the run, for progress.
+        source: policy directory, ``path.py:make``, ONNX file, or a bundle that is the input of a recorded stage; where
             the policy was when the bundle was made, if not given.
-        files: Files that options name and that are not beside the source.
-        cache: Where to look for the place of the source; no output of a stage is taken from it.
-        out: Where to write the bundle that was made again.
-        force: Replace ``out``.
+        files: files that options name and that are not beside the source.
+        cache: where to look for the place of the source; no output of a stage is taken from it.
+        out: where to write the bundle that was made again.
+        force: whether to replace ``out``.
 
     Raises:
         SourceError: when the source is not found, or a file of it is not the recorded one.
@@ -198,9 +200,9 @@ def rebuild(
     with scratch_directory() as scratch:
         product = start.bundle
         for number, (entry, stage) in enumerate(start.stages):
-            before, place = product, scratch / f"{number}-{entry['stage']}"
+            before, folder = product, scratch / f"{number}-{entry['stage']}"
             product = (
-                _finalized(entry, before, place) if stage is None else run_transform(stage, before, place, context)
+                _finalize(entry, before, folder) if stage is None else run_transform(stage, before, folder, context)
             )
             same.append((entry["stage"], _graphs_as_recorded(entry, product)))
             if before is not None and before is not start.bundle:
@@ -209,19 +211,19 @@ def rebuild(
         left_out = ("accuracy",) if "candidate" in bundle.manifest.made_by else ()
         compared = compare_bundles(bundle, product, left_out)
         if out is not None:
-            with writing(out, force=force) as draft:
+            with write_directory(out, force=force) as draft:
                 shutil.copytree(
                     product.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION, LEDGER)
                 )
-        return Rebuilt(bundle, product.hash, start.source, compared, tuple(same), left_out)
+        return RebuildResult(bundle, product.hash, start.source, compared, tuple(same), left_out)
 
 
 def _start(
     bundle: Bundle, entries: tuple[Entry, ...], source: str | None, files: tuple[Path, ...], cache: Path
 ) -> _Start:
     """Find the source, check that it is the recorded one, and build every stage before any runs."""
-    places = _Places(files, [bundle.path.parent, Path()])
-    if source is not None and (Path(source) / MANIFEST).is_file():
+    search = _FileSearch(files, [bundle.path.parent, Path()])
+    if source is not None and is_bundle(source):
         begin, first = Bundle.open(source), None
         later = _from_bundle(begin, entries, bundle)
     elif not entries[0]["stage"].startswith("sources."):
@@ -236,8 +238,8 @@ def _start(
         later = entries[1:]
         policy = getattr(first, "model", None) or getattr(first, "policy", None)
         if policy is not None:
-            places.folders.insert(0, policy if policy.is_dir() else policy.parent)
-    stages = [(entry, None if entry["stage"] == FINALIZED else _stage(entry, places)) for entry in later]
+            search.folders.insert(0, policy if policy.is_dir() else policy.parent)
+    stages = [(entry, None if entry["stage"] == OPTIMIZE else _stage(entry, search)) for entry in later]
     beginning = [] if first is None else [(entries[0], first)]
     return _Start(str(source), begin, (*beginning, *stages))
 
@@ -254,7 +256,7 @@ def _from_bundle(begin: Bundle, entries: tuple[Entry, ...], bundle: Bundle) -> t
     )
 
 
-def _stage(entry: Entry, places: _Places) -> Transform:
+def _stage(entry: Entry, search: _FileSearch) -> Transform:
     """Build the stage of an entry, its files found and checked."""
     name, options = entry["stage"], dict(entry.get("options", {}))
     fields = stage_class(name).model_fields
@@ -263,7 +265,7 @@ def _stage(entry: Entry, places: _Places) -> Transform:
             match = RECORDED_FILE.fullmatch(str(value))
             if match is None:
                 raise BundleError(f"The build record names the file '{value}' of {name} without its hash.", UNUSABLE)
-            options[key] = places.find(match["name"], match["hash"], name)
+            options[key] = search.find(match["name"], match["hash"], name)
     stage = build_stage(name, options)
     if not isinstance(stage, Transform):
         raise BundleError(
@@ -277,9 +279,9 @@ def _recorded_source(
 ) -> tuple[Transform, str]:
     """Return the source stage and where its policy is; its files have the recorded hashes."""
     problem: VlatoolError | None = None
-    for place in [source] if source is not None else _noted_places(bundle, entries, cache):
+    for folder in [source] if source is not None else _noted_folders(bundle, entries, cache):
         try:
-            return _checked_source(place, entries[0], bundle), place
+            return _checked_source(folder, entries[0], bundle), folder
         except VlatoolError as error:
             problem = problem or error
     raise problem or SourceError(
@@ -321,7 +323,7 @@ def _short_hash(digest: str | None) -> str:
     return f"sha256:{digest[:16]}" if digest else "no such file"
 
 
-def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> Iterator[str]:
+def _noted_folders(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> Iterator[str]:
     """Yield where the source may be: as the bundle or the cached source bundle notes.
 
     Raises:
@@ -341,14 +343,14 @@ def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> It
         except SourceError as error:
             refused = refused or error
             continue
-        yield str(folder / description)
+        yield from (str(folder / description), str(folder))
     if refused:
         raise SourceError(refused.message, f"name the policy: --source DIR; or {refused.fix}")
 
 
-def _finalized(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
+def _finalize(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
     """Seal a candidate as ``optimize`` does; what it measured and decided is taken from the record."""
-    bundle = source_of(bundle, FINALIZED)
+    bundle = source_of(bundle, OPTIMIZE)
     out.mkdir()
     manifest = replace(
         bundle.manifest,
@@ -356,7 +358,7 @@ def _finalized(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
         made_by={**bundle.manifest.made_by, **entry.get("options", {})},
         source={},
         files={graph.file: bundle.manifest.files[graph.file] for graph in bundle.manifest.graphs.values()},
-        **{name: entry[name] for name in DECIDED if name in entry},
+        **{name: entry[name] for name in FINALIZED_FIELDS if name in entry},
     )
     return reseal(bundle, out, manifest, ROBOT_FOLDERS)
 

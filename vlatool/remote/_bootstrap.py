@@ -24,7 +24,7 @@ import time
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, NoReturn, cast
 
-from vlatool.remote._place import BLOCK, Guard, Place, Refused, kill
+from vlatool.remote._run_directory import BLOCK, Guard, Refused, RunDirectory, kill
 
 QUIET_S = 60
 """Seconds without a sign of life, or without anybody who takes what is said, after which the run ends."""
@@ -77,7 +77,7 @@ class Line:
                 try:
                     message: dict[str, Any] = json.loads(line)
                 except ValueError as error:
-                    raise Refused("corrupt", "a line that is no message") from error
+                    raise Refused("corrupt", "a line that is not a message") from error
                 return message
 
     def listen(self) -> None:
@@ -111,7 +111,7 @@ def unpack(packed: bytes, root: Path) -> None:
                 shutil.copyfileobj(content or io.BytesIO(), stream)
 
 
-def receive(line: Line, place: Place) -> dict[str, Any]:
+def receive(line: Line, directory: RunDirectory) -> dict[str, Any]:
     """Receive files until the job comes, and return it."""
     while True:
         message = line.message()
@@ -120,23 +120,24 @@ def receive(line: Line, place: Place) -> dict[str, Any]:
         packed = line.take(int(message["bytes"]))
         if hashlib.sha256(packed).hexdigest() != message["sha256"]:
             raise Refused("corrupt", "the SHA-256 of a piece differs")
-        unpack(packed, place.path)
+        unpack(packed, directory.path)
 
 
-def run(line: Line, place: Place, guard: Guard, message: dict[str, Any]) -> dict[str, Any]:
+def run(line: Line, directory: RunDirectory, guard: Guard, message: dict[str, Any]) -> dict[str, Any]:
     """Run the agent and tell its lines; return how it ended and the last that it logged."""
-    package = place.path / "package"
-    job = {**message["job"], "bundles": [str(place.path / name) for name in message["bundles"]]}
-    (place.path / "job.json").write_text(json.dumps(job) + "\n", encoding="utf-8")
-    folders = {"TMPDIR": place.path / "tmp", "XDG_CACHE_HOME": place.path / "cache"}
+    package = directory.path / "package"
+    job = {**message["job"], "bundles": [str(directory.path / name) for name in message["bundles"]]}
+    (directory.path / "job.json").write_text(json.dumps(job) + "\n", encoding="utf-8")
+    folders = {"TMPDIR": directory.path / "tmp", "XDG_CACHE_HOME": directory.path / "cache"}
     for folder in folders.values():
         folder.mkdir()
     paths = os.pathsep.join(filter(None, [str(package), os.environ.get("PYTHONPATH")]))
-    own = {"PYTHONPATH": paths, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "VLATOOL_CACHE": str(place.path / "cache")}
+    cache = str(directory.path / "cache")
+    own = {"PYTHONPATH": paths, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "VLATOOL_CACHE": cache}
     environment = {**os.environ, **{name: str(folder) for name, folder in folders.items()}, **own}
     environment.pop("PYTHONPYCACHEPREFIX", None)
     command = [sys.executable, "-m", message["module"]]
-    with (place.path / "job.json").open("rb") as stdin:
+    with (directory.path / "job.json").open("rb") as stdin:
         agent = subprocess.Popen(
             command, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=package, env=environment,
             start_new_session=True, bufsize=0,
@@ -189,19 +190,19 @@ def _stop(_number: int, _frame: Any) -> NoReturn:
 
 def serve(line: Line) -> None:
     """Receive, run and clean up; whatever happens, what was made is removed before the last message."""
-    place = Place()
+    directory = RunDirectory()
     guard: Guard | None = None
     last: dict[str, Any] = {}
     try:
         need = int(line.message()["need"]) + SLACK
-        place.make()
-        guard = Guard(place)
-        if (free := place.room()) < need:
-            raise Refused("no room", json.dumps({"free": free, "need": need, "path": str(place.path)}))
-        line.say(ready=str(place.path))
-        message = receive(line, place)
+        directory.make()
+        guard = Guard(directory)
+        if (free := directory.room()) < need:
+            raise Refused("no room", json.dumps({"free": free, "need": need, "path": str(directory.path)}))
+        line.say(ready=str(directory.path))
+        message = receive(line, directory)
         line.say(received=True)
-        last = {"ended": run(line, place, guard, message)}
+        last = {"ended": run(line, directory, guard, message)}
     except Refused as error:
         last = {"refused": error.word, "text": error.text}
     except OSError as error:
@@ -215,7 +216,7 @@ def serve(line: Line) -> None:
     finally:
         for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
             signal.signal(number, signal.SIG_IGN)
-        left = place.remove()
+        left = directory.remove()
         if guard:
             guard.dismiss()
     line.say(**last, left=left)

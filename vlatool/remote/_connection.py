@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from typing import IO, Any, cast
 
 from vlatool.errors import MissingExtra, TargetError
-from vlatool.files.limits import check, limit
+from vlatool.files.limits import check_limit, limit
 from vlatool.files.printable import one_line, printable
-from vlatool.remote._heard import parsed
+from vlatool.remote._validate_replies import parse
 
 ALIVE_S = 5
 """Seconds between signs of life to the target."""
@@ -27,11 +27,11 @@ STALLED_S = 60
 CLEANING_S = 20
 """Seconds that the target has to clean up before ssh is ended here; it goes on there."""
 BLOCK = 1 << 16
-NOISE = 1 << 20
-SAID = 1 << 16
+MAX_NOISE_BYTES = 1 << 20
+MAX_STDERR_BYTES = 1 << 16
 """Bytes of ssh's standard error that are kept, the last ones."""
 
-AGAIN = "run it again; the target removes what was sent when the connection ends"
+RUN_AGAIN = "run it again; the target removes what was sent when the connection ends"
 REFUSALS = (
     (
         r"Could not resolve hostname",
@@ -58,11 +58,7 @@ REFUSALS = (
         "nothing answers at that address and port",
         "check that sshd runs there, and on which port (Port in ~/.ssh/config)",
     ),
-    (
-        r"timed out|Timeout",
-        "it does not answer in time",
-        "check that it is on and in this network: ssh {target} true",
-    ),
+    (r"timed out|Timeout", "it does not answer in time", "check that it is on and in this network: ssh {target} true"),
     (
         r"No route to host|Network is unreachable",
         "there is no way to its network",
@@ -76,9 +72,9 @@ class Connection:
     """One ``ssh TARGET sh``: messages there as lines of JSON and bytes, messages back as marked lines of JSON.
 
     Args:
-        target: As ``ssh`` takes it.
-        options: Of ssh, before vlatool's own.
-        connect_timeout_s: For ssh to connect.
+        target: target, as ``ssh`` takes it.
+        options: options of ssh, before vlatool's own.
+        connect_timeout_s: seconds for ssh to connect.
 
     Raises:
         MissingExtra: when there is no ssh.
@@ -135,7 +131,7 @@ class Connection:
         while rest:
             ready = self._ready(STALLED_S * 1000, self._in)
             if self._out in ready and not self._take():
-                raise self.ended()
+                raise self.end_error()
             if self._messages:
                 return False
             if self._in in ready:
@@ -147,7 +143,7 @@ class Connection:
                 except BrokenPipeError:
                     return self._last_words()
             if time.monotonic() - moved > STALLED_S:
-                raise TargetError(f"{self._target} took nothing for {STALLED_S} s {self.doing}.", AGAIN)
+                raise TargetError(f"{self._target} took nothing for {STALLED_S} s {self.doing}.", RUN_AGAIN)
         return True
 
     def tell(self, message: dict[str, Any]) -> bool:
@@ -169,17 +165,17 @@ class Connection:
             if self._messages:
                 return self._messages.popleft()
             if self._out in self._ready(500) and not self._take():
-                raise self.ended()
+                raise self.end_error()
             if timeout_s is not None and time.monotonic() - start > timeout_s and not self._messages:
                 raise TargetError(f"{self._target} said nothing for {timeout_s:g} s {self.doing}.", self._try())
 
-    def ended(self) -> TargetError:
-        """Return the error for a connection that is no more: what ssh said, and what it means."""
+    def end_error(self) -> TargetError:
+        """Return the error of a connection that has ended: what ssh reported, and what that means."""
         code = self.close()
         text = printable(self._said.decode("utf-8", "replace"))
         last = one_line(next((line for line in reversed(text.splitlines()) if line.strip()), f"exit code {code}"))
         if self._answered:
-            return TargetError(f"The connection to {self._target} ended {self.doing}: {last}", AGAIN)
+            return TargetError(f"The connection to {self._target} ended {self.doing}: {last}", RUN_AGAIN)
         for pattern, meaning, fix in REFUSALS:
             if code == 255 and re.search(pattern, text):
                 return TargetError(f"Cannot reach {self._target}, {meaning}: {last}", fix.format(target=self._target))
@@ -200,7 +196,7 @@ class Connection:
         finally:
             if self._ssh.poll() is None:
                 self._ssh.kill()
-            self._hear()
+            self._read_errors()
         return self._ssh.wait()
 
     def dispose(self) -> None:
@@ -224,7 +220,7 @@ class Connection:
             poll.register(stream, select.POLLOUT)
         ready = {handle for handle, _ in poll.poll(milliseconds)}
         if not self._err.closed and self._err.fileno() in ready:
-            self._hear()
+            self._read_errors()
         if time.monotonic() > self._until:
             self._until = math.inf
             raise TargetError(
@@ -233,11 +229,11 @@ class Connection:
             )
         return [stream for stream in (self._out, *more) if stream.fileno() in ready]
 
-    def _hear(self) -> None:
+    def _read_errors(self) -> None:
         """Take what ssh and the target's standard error say; its end is kept."""
         with contextlib.suppress(BlockingIOError, ValueError):
             received = os.read(self._err.fileno(), BLOCK)
-            self._said = (self._said + received)[-SAID:]
+            self._said = (self._said + received)[-MAX_STDERR_BYTES:]
             self._count(len(received))
             if not received:
                 self._err.close()
@@ -247,7 +243,7 @@ class Connection:
         self._came += count
         self._flooded = self._came > limit("target_bytes")
         if not self._closing:
-            check("target_bytes", self._came, f"What {self._target} sends", TargetError)
+            check_limit("target_bytes", self._came, f"What {self._target} sends", TargetError)
 
     def _try(self) -> str:
         return f"see what happens with: ssh {self._target} sh -c true"
@@ -256,7 +252,7 @@ class Connection:
         """Read to the end what the target said before it hung up."""
         while not self._messages:
             if not self._take():
-                raise self.ended()
+                raise self.end_error()
         return False
 
     def _take(self) -> bool:
@@ -271,10 +267,10 @@ class Connection:
                 _, marked, rest = line.partition(mark)
                 if marked:
                     self._answered = True
-                    check("target_message_bytes", len(rest), f"A message of {self._target}", TargetError)
-                    self._messages.append(parsed(rest, self._target))
+                    check_limit("target_message_bytes", len(rest), f"A message of {self._target}", TargetError)
+                    self._messages.append(parse(rest, self._target))
         elif mark in self._buffer:
-            check("target_message_bytes", len(self._buffer), f"A message of {self._target}", TargetError)
-        elif len(self._buffer) > NOISE:
+            check_limit("target_message_bytes", len(self._buffer), f"A message of {self._target}", TargetError)
+        elif len(self._buffer) > MAX_NOISE_BYTES:
             self._buffer = self._buffer[-len(mark) :]
         return bool(received)

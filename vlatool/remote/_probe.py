@@ -1,4 +1,4 @@
-"""Which Python of the target can measure: asked through ``sh``, without a trace on the target."""
+"""Find a Python on the target that can measure, through ``sh``, without leaving files there."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from vlatool.errors import MissingExtra, TargetError, VlatoolError
-from vlatool.remote._heard import Python
+from vlatool.remote._validate_replies import Python
 from vlatool.runtime.engine import engine_class
 
 OLDEST = (3, 10)
@@ -89,9 +89,9 @@ def script(marker: str, python: str, packages: Sequence[str]) -> bytes:
 
 
 def program() -> str:
-    """Return the text of ``_place`` and ``_bootstrap`` as one program that imports nothing of vlatool."""
+    """Return the text of ``_run_directory`` and ``_bootstrap`` as one program that imports nothing of vlatool."""
     lines = ["from __future__ import annotations"]
-    for name in ("_place.py", "_bootstrap.py"):
+    for name in ("_run_directory.py", "_bootstrap.py"):
         lines += (Path(__file__).with_name(name)).read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines[1:] if not line.startswith(("from __future__ ", "from vlatool"))]
     return "\n".join([lines[0], *kept]) + "\n"
@@ -102,7 +102,7 @@ def _word(python: str) -> str:
     return '"$HOME"/' + shlex.quote(python[2:]) if python.startswith("~/") else shlex.quote(python)
 
 
-def dotted(version: Iterable[int]) -> str:
+def version_text(version: Iterable[int]) -> str:
     """Return ``3.11.2``."""
     return ".".join(map(str, version))
 
@@ -113,19 +113,19 @@ def refusal(
     """Return the error for a target none of whose Pythons can measure.
 
     Args:
-        target: As ``ssh`` takes it.
-        python: The one that the user named, or empty.
-        pythons: Those that answered.
-        codes: With what those ended that broke.
-        packages: What must be importable.
+        target: target, as ``ssh`` takes it.
+        python: the one that the user named, or empty.
+        pythons: Pythons that answered.
+        codes: exit codes of those that failed.
+        packages: what must be importable.
     """
     new = [other for other in pythons if other.version[:2] >= OLDEST]
     if new:
         return _lacking(target, min(new, key=lambda other: len(other.errors)))
-    fix = f"install Python {dotted(OLDEST)} or later there, or name one: --remote-python /path/to/venv/bin/python"
+    fix = f"install Python {version_text(OLDEST)} or later there, or name one: --remote-python /path/to/venv/bin/python"
     if pythons:
-        versions = ", ".join(f"{other.command} is {dotted(other.version)}" for other in pythons)
-        return TargetError(f"The Python of {target} is too old: {versions}; {dotted(OLDEST)} or later is needed.", fix)
+        versions = ", ".join(f"{other.command} is {version_text(other.version)}" for other in pythons)
+        return TargetError(f"The Python of {target} is too old: {versions}; {version_text(OLDEST)} is needed.", fix)
     if codes:
         which = python or "python3"
         names = " and ".join(packages)
@@ -150,7 +150,7 @@ def _lacking(target: str, python: Python) -> MissingExtra:
         fix += f"then --remote-python '~/{venv}'"
     else:
         fix += "; or name a Python that has them: --remote-python /path/to/venv/bin/python"
-    version = dotted(python.version)
+    version = version_text(python.version)
     return MissingExtra(
         f"{command} on {target} (Python {version}) cannot import {' and '.join(errors)}: {reasons}.", fix
     )

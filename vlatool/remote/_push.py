@@ -1,4 +1,4 @@
-"""What goes to the target: vlatool's own files and what the manifests name, as a stream of small tars."""
+"""Upload to the target: vlatool's own files and those of the manifests, as a stream of small tar archives."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Item:
     """One file to push.
 
     Args:
-        name: Relative path on the target.
-        size: In bytes.
-        path: The local file; None when ``content`` is it.
-        content: The content of a file that is not read from ``path``.
-        sha256: What the content must hash to; not checked when empty.
+        name: relative path on the target.
+        size: size in bytes.
+        path: the local file; None when ``content`` is it.
+        content: the content of a file that is not read from ``path``.
+        sha256: what the content must hash to; not checked when empty.
     """
 
     name: str
@@ -62,12 +62,12 @@ class Item:
 
 
 @dataclass(frozen=True)
-class Load:
+class Payload:
     """All that is pushed for one run.
 
     Args:
-        items: The files.
-        bundles: For each bundle in order, its directory on the target.
+        items: the files.
+        bundles: directory of each bundle on the target, in order.
     """
 
     items: tuple[Item, ...]
@@ -83,7 +83,7 @@ class Load:
         """Bytes that the files take on a disk, in whole blocks."""
         return sum(-(-item.size // BLOCK) * BLOCK + BLOCK for item in self.items)
 
-    def packed(self) -> Iterator[tuple[bytes, int]]:
+    def archives(self) -> Iterator[tuple[bytes, int]]:
         """Yield tars and how many bytes of content each has; the same files give the same bytes."""
         pieces: list[tuple[str, bytes]] = []
         size = 0
@@ -97,7 +97,7 @@ class Load:
         yield _tar(pieces), size
 
 
-def load_of(bundles: Sequence[Bundle], package: Path, further: Iterable[Path] = ()) -> Load:
+def payload_of(bundles: Sequence[Bundle], package: Path, further: Iterable[Path] = ()) -> Payload:
     """Return what to push: each bundle once, by its content hash, after the package and further single modules."""
     items = {item.name: item for item in _package(package)}
     items |= {f"package/{path.name}": Item(f"package/{path.name}", path.stat().st_size, path) for path in further}
@@ -107,7 +107,7 @@ def load_of(bundles: Sequence[Bundle], package: Path, further: Iterable[Path] = 
             name = re.sub(r"[^\w.-]", "_", bundle.path.resolve().name, flags=re.ASCII).lstrip(".")[:80] or "bundle"
             folders[bundle.hash] = f"bundles/{bundle.hash.partition(':')[2][:16]}/{name}"
             items |= {item.name: item for item in _bundle(bundle, folders[bundle.hash])}
-    return Load(tuple(items.values()), tuple(folders[bundle.hash] for bundle in bundles))
+    return Payload(tuple(items.values()), tuple(folders[bundle.hash] for bundle in bundles))
 
 
 def header(packed: bytes) -> dict[str, int | str]:

@@ -19,28 +19,28 @@ from vlatool.errors import OutputError, TargetError, UsageError, VlatoolError
 from vlatool.files.printable import one_line
 from vlatool.measurement.child import CRASHES, Progress, Raised, Result, error_of, read_line, signal_name
 from vlatool.remote import _probe, _push
-from vlatool.remote._connection import AGAIN, Connection
-from vlatool.remote._heard import Ended, NoRoom, Python, nonsense, parsed, python_of, sane, told
-from vlatool.stage.base import Tell
+from vlatool.remote._connection import RUN_AGAIN, Connection
+from vlatool.remote._validate_replies import AgentExit, DiskFull, Python, invalid_reply, parse, python_of, read, sane
+from vlatool.stage.base import OnProgress
 
 AGENT = "vlatool.measurement.agent"
 PACKAGE = Path(vlatool.__file__).parent
-FURTHER: tuple[Path, ...] = ()
+FURTHER_MODULES: tuple[Path, ...] = ()
 """Single modules that are pushed beside the package."""
 SHELL_S = 30
 """Seconds from a connection to an answer of ``sh``."""
 PROBE_S = 120
 """Seconds for a Python to import numpy and an engine."""
-PLACE_S = 60
+DIRECTORY_S = 60
 LOG_CHARACTERS = 300
-MOST_PYTHONS = 64
+MAX_PYTHONS = 64
 
 
 def measure_on(
     target: str,
     job: Mapping[str, Any],
     bundles: Sequence[Path],
-    tell: Tell,
+    tell: OnProgress,
     *,
     python: str = "",
     ssh_options: Sequence[str] = (),
@@ -50,13 +50,13 @@ def measure_on(
 
     Args:
         target: ``user@host`` or a Host of ``~/.ssh/config``, as ``ssh`` takes it.
-        job: What the agent does, as JSON values; its ``bundles`` are replaced by those on the target.
+        job: what the agent does, as JSON values; its ``bundles`` are replaced by those on the target.
         bundles: Bundle directories, in the order of the job.
-        tell: Called with what is being done and the share that is done (0-1, or None when it is not known).
+        tell: function called with what is being done and the share that is done (0-1, or None when it is not known).
         python: Python to use on the target; ``~/`` is the home directory there. When empty, the first of python3 and
             python3.13 to python3.10 that is new enough and imports numpy and the engine.
-        ssh_options: For ssh, before vlatool's own.
-        connect_timeout_s: For ssh to connect.
+        ssh_options: options of ssh, before vlatool's own.
+        connect_timeout_s: seconds for ssh to connect.
 
     Returns:
         The agent's result, ``target``: python, architecture, kernel and packages there; no host, user or address; and
@@ -72,7 +72,7 @@ def measure_on(
     opened = [Bundle.open(path, verify=False) for path in bundles]
     engine = str(job.get("engine") or "")
     packages = _probe.packages_of([engine] if engine else [bundle.manifest.engine for bundle in opened] or [""])
-    load = _push.load_of(opened, PACKAGE, FURTHER)
+    load = _push.payload_of(opened, PACKAGE, FURTHER_MODULES)
     tell(f"connecting to {target}", None)
     connection = Connection(target, ssh_options, connect_timeout_s)
     connection.allow(float(job.get("duration") or 0))
@@ -80,23 +80,22 @@ def measure_on(
         connection.send(_probe.script(connection.marker, python, packages))
         there = _find_python(connection, target, python, packages, connect_timeout_s)
         tell(_about(target, there), None)
-        place = _send(connection, target, load, tell)
+        directory = _send(connection, target, load, tell)
         connection.doing = "while it measured"
-        paths = {f"{place}/{name}": str(path) for name, path in zip(load.bundles, bundles, strict=True)}
+        paths = {f"{directory}/{name}": str(path) for name, path in zip(load.bundles, bundles, strict=True)}
         connection.tell({"module": AGENT, "job": {**job, "bundles": []}, "bundles": load.bundles})
         result = _follow(connection, target, paths, tell)
     finally:
         connection.dispose()
     known = {name: getattr(there, name) for name in ("architecture", "kernel", "packages")}
-    return {**result, "target": {"python": _probe.dotted(there.version), **known}}
+    return {**result, "target": {"python": _probe.version_text(there.version), **known}}
 
 
 def _check(target: str, python: str) -> None:
     """Refuse what ssh would take for an option, or a shell for more than a name."""
     if not target or target.startswith("-") or any(letter.isspace() or not letter.isprintable() for letter in target):
         raise UsageError(
-            f"The target {target!r} is not a machine that ssh can reach.",
-            "give user@host, or a Host of ~/.ssh/config",
+            f"The target {target!r} is not a machine that ssh can reach.", "give user@host, or a Host of ~/.ssh/config"
         )
     if python.startswith("-") or not python.isprintable():
         raise UsageError(
@@ -113,7 +112,7 @@ def _find_python(
     connection.doing = "while it looked for a Python"
     pythons: list[Python] = []
     codes: list[int] = []
-    for _ in range(MOST_PYTHONS):
+    for _ in range(MAX_PYTHONS):
         heard = connection.receive(PROBE_S)
         if "none" in heard:
             raise _probe.refusal(target, python, pythons, codes, packages)
@@ -122,38 +121,38 @@ def _find_python(
             if set(packages) == set(pythons[-1].packages):
                 return pythons[-1]
         elif "broken" in heard:
-            codes.append(told(int, heard["broken"], target, "broken"))
-    raise nonsense(target, f"it has more than {MOST_PYTHONS} Pythons")
+            codes.append(read(int, heard["broken"], target, "broken"))
+    raise invalid_reply(target, f"it has more than {MAX_PYTHONS} Pythons")
 
 
 def _about(target: str, python: Python) -> str:
     """Say what the target is."""
     packages = [f"{name} {version}" for name, version in python.packages.items()]
     room = [] if python.free is None else [f"{python.free / 1e9:.1f} GB free"]
-    version = f"Python {_probe.dotted(python.version)}"
+    version = f"Python {_probe.version_text(python.version)}"
     return f"{target}: " + ", ".join([version, python.architecture, *packages, *room])
 
 
-def _send(connection: Connection, target: str, load: _push.Load, tell: Tell) -> str:
+def _send(connection: Connection, target: str, load: _push.Payload, tell: OnProgress) -> str:
     """Send all files, and return the directory that they are in on the target."""
     connection.doing = "before the first file was sent"
     connection.tell({"need": load.room})
-    answer = connection.receive(PLACE_S)
+    answer = connection.receive(DIRECTORY_S)
     if "ready" not in answer:
-        raise _refused(target, answer)
-    place = told(str, answer["ready"], target, "ready")
+        raise _target_error(target, answer)
+    directory = read(str, answer["ready"], target, "ready")
     sent = 0
-    for packed, size in load.packed():
+    for packed, size in load.archives():
         connection.doing = f"while files were sent ({sent / 1e6:.1f} of {load.size / 1e6:.1f} MB)"
         tell(f"sending the bundles to {target}: {sent / 1e6:.1f} of {load.size / 1e6:.1f} MB", sent / load.size)
         if not connection.tell(_push.header(packed)) or not connection.send(packed):
-            raise _refused(target, connection.receive())
+            raise _target_error(target, connection.receive())
         sent += size
     tell(f"sent {load.size / 1e6:.1f} MB to {target}", 1.0)
-    return place
+    return directory
 
 
-def _refused(target: str, answer: Mapping[str, Any]) -> VlatoolError:
+def _target_error(target: str, answer: Mapping[str, Any]) -> VlatoolError:
     """Return the error for what the target could not do."""
     word, text = answer.get("refused", ""), one_line(str(answer.get("text", "")))
     if word == "no place":
@@ -161,7 +160,7 @@ def _refused(target: str, answer: Mapping[str, Any]) -> VlatoolError:
             f"{target} has no directory to write to: {text}.", "set TMPDIR or XDG_CACHE_HOME there to one that has room"
         )
     if word == "no room":
-        disk = told(NoRoom, parsed(str(answer["text"]), target), target, "room")
+        disk = read(DiskFull, parse(str(answer["text"]), target), target, "room")
         numbers = f"{disk.need / 1e6:.1f} MB are needed, {disk.free / 1e6:.1f} MB are free"
         return OutputError(
             f"The disk of {target} is too full: {numbers} below {one_line(disk.path)}.", "free some space there"
@@ -170,22 +169,22 @@ def _refused(target: str, answer: Mapping[str, Any]) -> VlatoolError:
         return OutputError(f"The disk of {target} became full: {text}.", "free some space there")
     if word == "corrupt":
         return TargetError(f"What was sent to {target} did not arrive whole: {text}.", "run it again")
-    return TargetError(f"{target} could not run the benchmark: {text or one_line(str(answer))}.", AGAIN)
+    return TargetError(f"{target} could not run the benchmark: {text or one_line(str(answer))}.", RUN_AGAIN)
 
 
-def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell: Tell) -> dict[str, Any]:
+def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell: OnProgress) -> dict[str, Any]:
     """Pass on what the agent tells until it has ended, and return its result.
 
     Args:
-        connection, target: To whom.
-        paths: Directory there -> the bundle's directory here, which messages name in its place.
-        tell: For progress.
+        connection, target: connection, and name of the target.
+        paths: directory there -> the bundle's directory here, which messages name in its place.
+        tell: callback for progress.
     """
     answer: Result | Raised | None = None
     while True:
         heard = connection.receive(alive=True)
         if "agent" in heard:
-            line = told(str, heard["agent"], target, "agent")
+            line = read(str, heard["agent"], target, "agent")
             for there, here in paths.items():
                 line = line.replace(json.dumps(there)[1:-1], json.dumps(here)[1:-1])
             match read_line(line, lambda values: sane(values, target)):
@@ -197,11 +196,11 @@ def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell:
             if heard.get("left"):
                 tell(f"{target} could not remove {one_line(str(heard['left']))}", None)
             if "refused" in heard:
-                raise _refused(target, heard)
-            return _result(target, answer, told(Ended, heard["ended"], target, "ended"))
+                raise _target_error(target, heard)
+            return _result(target, answer, read(AgentExit, heard["ended"], target, "ended"))
 
 
-def _result(target: str, answer: Result | Raised | None, ended: Ended) -> dict[str, Any]:
+def _result(target: str, answer: Result | Raised | None, ended: AgentExit) -> dict[str, Any]:
     """Return the agent's result, or raise what it raised or why there is none."""
     if isinstance(answer, Raised):
         raise error_of(answer, otherwise=TargetError)

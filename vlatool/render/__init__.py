@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from vlatool import registry
-from vlatool.files.edited import whole_file
+from vlatool.files.user_files import atomic_file
 from vlatool.report import Report
 
 FILES = {"json": "report.json", "html": "report.html", "markdown": "report.md"}
@@ -54,6 +54,6 @@ def write_reports(report: Report, directory: Path) -> list[Path]:
     texts = {directory / name: render(report, format) for format, name in FILES.items()}
     directory.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
-        with whole_file(path) as draft:
+        with atomic_file(path) as draft:
             draft.write_text(text, encoding="utf-8")
     return list(texts)

@@ -300,7 +300,7 @@ def _sections(builder: Builder, report: Report) -> list[Section]:
     try:
         return list(builder.build(report))
     except Exception as error:  # the seam: another package's code raises what it likes
-        package = registry.owner(type(builder).__module__)
+        package = registry.plugin_of(type(builder).__module__)
         if not package or isinstance(error, PluginError):
             raise
         entry, why = registry.entry_of(type(builder)), f"{type(error).__name__}: {error}"

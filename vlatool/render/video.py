@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool import registry
-from vlatool.errors import OutputError, UsageError, nearest
-from vlatool.files.edited import refuse_file, whole_file
+from vlatool.errors import OutputError, UsageError, suggest
 from vlatool.files.outputs import output_errors
-from vlatool.files.written import note_file
+from vlatool.files.ownership import add_to_ledger
+from vlatool.files.user_files import atomic_file, refuse_file
 
 Picture = NDArray[np.uint8]
 ROOM = 1 << 24
@@ -58,7 +58,7 @@ class Format(Protocol):
         ...
 
     def write(self, video: Video, draft: Path) -> str:
-        """Write a video into a new file, ending in a stamp (``vlatool.files.edited.stamp_of``); return what it lacks.
+        """Write a video into a new file, ending in a stamp (``files.user_files.stamp_of``); return what it lacks.
 
         What it lacks is said in a few words (``one in 2 pictures``), and nothing when it lacks nothing.
         """
@@ -75,7 +75,7 @@ def format_of(path: Path) -> Format:
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in known:
         said = (
-            f"'{suffix}' is none; {nearest(suffix, known)}" if suffix else f"there is none; known: {', '.join(known)}"
+            f"'{suffix}' is none; {suggest(suffix, known)}" if suffix else f"there is none; known: {', '.join(known)}"
         )
         raise UsageError(
             f"{path}: the suffix says what kind of video is written, and {said}.",
@@ -126,8 +126,8 @@ def write_video(video: Video, path: Path, *, force: bool = False) -> str:
     """
     written = format_of(path)
     with output_errors(path):
-        with whole_file(path) as draft:
+        with atomic_file(path) as draft:
             lacks = written.write(video, draft)
             refuse_file(path, force=force)
-        note_file(path)
+        add_to_ledger(path)
     return lacks

@@ -69,7 +69,7 @@ def load(
 
     refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
-    bundle = Bundle.described(path)
+    bundle = Bundle.open_lazily(path)
     refuse_findings(bundle, accept)
     bundle.verify("data/")
     if probe:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from vlatool.bundle.bundle import ASSETS, Bundle
 from vlatool.errors import SpecError
-from vlatool.files.limits import check
-from vlatool.files.sealed import open_regular, read_all
-from vlatool.files.typed import outside, shown
+from vlatool.files.limits import check_limit
+from vlatool.files.validate import path_problem, short_repr
+from vlatool.files.verified_read import open_regular, read_all
 
 Assets = Path | Bundle
 """A folder, or a bundle, which stands for its ``assets/``."""
@@ -30,11 +30,11 @@ def read_asset(assets: Assets, name: str, allowed: str) -> bytes:
     """
     if isinstance(assets, Bundle):
         return assets.asset(name, allowed)
-    if reason := outside(name):
-        raise SpecError(f"The spec names the file {shown(name)}: {reason}.")
+    if reason := path_problem(name):
+        raise SpecError(f"The spec names the file {short_repr(name)}: {reason}.")
     with open_regular(assets, name) as handle:
         size = os.fstat(handle).st_size
-        check(allowed, size, str(assets / name), SpecError)
+        check_limit(allowed, size, str(assets / name), SpecError)
         return read_all(handle, size)
 
 

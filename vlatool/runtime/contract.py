@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.errors import GraphError, SpecError, nearest
+from vlatool.errors import GraphError, SpecError, suggest
 from vlatool.runtime.observation import all_finite
 
 Array = NDArray[Any]
@@ -179,7 +179,7 @@ def _check_names(step: ProgramStep, takes: Mapping[str, Port], gives: Mapping[st
     for words, named, known in (("takes", step.feeds, takes), ("gives", step.gives, gives)):
         for name in named:
             if name not in known:
-                raise GraphError(f"The graph '{step.graph}' {words} no '{name}'; {nearest(name, known)}.", AGAIN)
+                raise GraphError(f"The graph '{step.graph}' {words} no '{name}'; {suggest(name, known)}.", AGAIN)
     for name in takes:
         if name not in step.feeds:
             raise GraphError(f"The graph '{step.graph}' takes '{name}', which the program does not feed.", AGAIN)

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from vlatool import registry
-from vlatool.errors import GraphError, PluginError, require
+from vlatool.errors import GraphError, MissingExtra, PluginError, pip_install, require
+
+if TYPE_CHECKING:
+    from vlatool.machine.target import Target
 
 DEFAULT_ENGINE = "ort_cpu"
 """Runs a bundle that names no engine, and computes for stages that need float32 answers."""
@@ -74,7 +77,7 @@ class Engine:
     package: ClassVar[str] = ""
     """What is imported; also the name of the distribution."""
     extra: ClassVar[str] = ""
-    """The extra of vlatool that installs it."""
+    """The extra of vlatool that installs it; empty where another package does."""
     substitutes: ClassVar[tuple[str, ...]] = ()
     """Distributions of other names that bring the same package."""
     advice: ClassVar[str] = ""
@@ -101,7 +104,24 @@ class Engine:
         Raises:
             MissingExtra: when it is not installed.
         """
+        if not cls.extra and importlib.util.find_spec(cls.package) is None:
+            raise MissingExtra(f"This needs the package '{cls.package}'.", cls.installation())
         return require(cls.package, cls.extra)
+
+    @classmethod
+    def distributions(cls) -> tuple[str, ...]:
+        """Return the distributions that bring the library, any of which will do; the usual one first."""
+        return (cls.package, *cls.substitutes)
+
+    @classmethod
+    def installation(cls) -> str:
+        """Return the command that installs the library."""
+        return pip_install(cls.extra) if cls.extra else f"pip install {(*cls.substitutes, cls.package)[0]}"
+
+    @classmethod
+    def is_installed(cls) -> bool:
+        """Return whether the library is installed, without importing it."""
+        return importlib.util.find_spec(cls.package) is not None
 
     @classmethod
     def version(cls) -> str:
@@ -133,11 +153,20 @@ class Engine:
         return None
 
     @classmethod
-    def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
+    def identity(cls) -> str:
+        """Return what its answers depend on, part of cache keys and records: provider, device, driver, and versions.
+
+        It is empty for an engine on the processor: keys and records have the instruction set that oneDNN computes in
+        (``machine.instruction_sets.openvino_set``) and the versions of packages anyway.
+        """
+        return ""
+
+    @classmethod
+    def variants(cls, target: Target, calibrated: bool) -> dict[str, Stages]:
         """Return the plans that a search begins with: name -> stages.
 
         Args:
-            has: Whether the processor has one of some features, as ``/proc/cpuinfo`` names them.
+            target: The board, or this host.
             calibrated: Whether there is calibration data.
         """
         return {}
@@ -228,7 +257,13 @@ def computing(dtype: str) -> str:
     )
 
 
-def installed(name: str) -> bool:
+def is_installed(name: str) -> bool:
     """Return whether the library of an engine is installed; not, where another package's engine cannot be imported."""
     library = usable_engines().get(name)
-    return library is not None and importlib.util.find_spec(library.package) is not None
+    return library is not None and library.is_installed()
+
+
+def identities() -> dict[str, str]:
+    """Return what each installed engine that does not run on the processor alone depends on: name -> ``identity``."""
+    found = {name: library.identity() for name, library in usable_engines().items() if library.is_installed()}
+    return {name: identity for name, identity in found.items() if identity}

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from vlatool.errors import GraphError
-from vlatool.files.limits import check, limit
+from vlatool.files.limits import check_limit, limit
 
 DAMAGED = "copy the graph again from where it was made, or make it again"
 
@@ -122,8 +122,8 @@ def messages(model: bytes | OpenFile, may_hold: MayHold) -> Iterator[tuple[str, 
             yield inner, start, end
             if inner in MESSAGES and may_hold(model, start, end):
                 levels.append((inner, parts(model, start, end)))
-                check("graph_depth", len(levels), "The graph", GraphError)
-    check("graph_fields", seen, "The graph", GraphError)
+                check_limit("graph_depth", len(levels), "The graph", GraphError)
+    check_limit("graph_fields", seen, "The graph", GraphError)
 
 
 def _may_name(model: bytes | OpenFile, start: int, end: int) -> bool:

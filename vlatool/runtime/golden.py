@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
-from vlatool.errors import DataError, nearest
-from vlatool.files.limits import check
+from vlatool.errors import DataError, suggest
+from vlatool.files.limits import check_limit
 from vlatool.files.npz import open_npz
 
 AGAIN = "copy the bundle again from where it was made, or make it again"
@@ -66,14 +66,14 @@ def golden_steps(bundle: Bundle, stored: Mapping[str, Array]) -> list[Golden]:
     needed = [*(f"in.{tensor.name}" for tensor in spec.inputs), *noise, action]
     for key in needed:
         if key not in stored:
-            raise DataError(f"{where} cannot be read: it has no '{key}'; {nearest(key, stored)}.", AGAIN)
+            raise DataError(f"{where} cannot be read: it has no '{key}'; {suggest(key, stored)}.", AGAIN)
         numbers = stored[key].dtype.kind in "fiu" or (key not in noise and key != action)
         if not stored[key].ndim or not len(stored[key]) or not numbers:
             raise DataError(f"{where} cannot be read: '{key}' has no steps, or no numbers.", AGAIN)
     counts = {len(stored[key]) for key in needed}
     if len(counts) > 1:
         raise DataError(f"{where} cannot be read: its arrays have {sorted(counts)} steps.", AGAIN)
-    check("golden_steps", max(counts), where, DataError)
+    check_limit("golden_steps", max(counts), where, DataError)
     return [
         (
             {tensor.name: stored[f"in.{tensor.name}"][step] for tensor in spec.inputs},

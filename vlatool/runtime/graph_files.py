@@ -10,9 +10,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.errors import BundleError
 from vlatool.files.limits import MIB
-from vlatool.files.sealed import open_inside
-from vlatool.files.typed import outside, shown
-from vlatool.machine.risky import risky
+from vlatool.files.validate import path_problem, short_repr
+from vlatool.files.verified_read import open_inside
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.external_data import OpenFile, external_files
 
 WHOLE = 4 * MIB
@@ -36,7 +36,7 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
             file that the manifest does not record.
         GraphError: when the engine refuses the graph.
     """
-    with risky(engine, f"opened the graph '{graph.file.rpartition('/')[2].removesuffix('.onnx')}'"):
+    with engine_call(engine, f"opened the graph '{graph.file.rpartition('/')[2].removesuffix('.onnx')}'"):
         return _opened(bundle, graph, engine, threads)
 
 
@@ -50,11 +50,11 @@ def _opened(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: i
             return engine(path, threads, graph.compute, content)
         del content
     with contextlib.ExitStack() as stack:
-        place = stack.enter_context(bundle.held(folder, [graph.file]))
+        place = stack.enter_context(bundle.verified_folder(folder, [graph.file]))
         with open_inside(place, name) as handle:
             locations = external_files(OpenFile(handle))
         if beside := recorded(bundle, graph.file, locations):
-            stack.enter_context(bundle.held(folder, beside))
+            stack.enter_context(bundle.verified_folder(folder, beside))
         return engine(path, threads, graph.compute, place / name)
 
 
@@ -68,10 +68,10 @@ def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
     files = []
     for location in sorted(locations):
         name = f"{folder}/{location}" if folder else location
-        reason = outside(location) or ("" if name in bundle.manifest.files else "the manifest does not record it")
+        reason = path_problem(location) or ("" if name in bundle.manifest.files else "the manifest does not record it")
         if reason:
             raise BundleError(
-                f"The graph {file} of {bundle.path} keeps weights in {shown(location)}: {reason}.",
+                f"The graph {file} of {bundle.path} keeps weights in {short_repr(location)}: {reason}.",
                 "export the policy again",
             )
         files.append(name)

@@ -10,12 +10,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
+from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.spec import PolicySpec
-from vlatool.bundle.unexported import no_graph
 from vlatool.errors import BundleError, GraphError, UsageError
 from vlatool.files.printable import printable
 from vlatool.runtime.arguments import check_whole
@@ -25,7 +24,7 @@ from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
 from vlatool.runtime.golden import GOLDEN_STEPS, golden_arrays, golden_chunks, golden_steps
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.interface import Action
+from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import Program, Session
 
@@ -33,7 +32,6 @@ FLOAT_ROUNDING = 1e-3
 """Relative difference of a golden action in float32 that sums in another order explain; seen up to 6e-7."""
 FIRST_RUN_S = 60.0
 """How long an inference of the warm-up may take before it is stopped: far more than a policy that a robot could use."""
-Array = NDArray[Any]
 
 
 class BundlePolicy:
@@ -78,7 +76,7 @@ class BundlePolicy:
         """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``."""
         manifest = bundle.manifest
         if not manifest.graphs:
-            raise no_graph(bundle, "run")
+            raise no_graph_error(bundle, "run")
         check_chunk(manifest.spec)
         limit_mb = allowed_mb(manifest, memory_mb)
         check_sizes(manifest, limit_mb)

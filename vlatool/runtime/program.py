@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import DataError, GraphError, VlatoolError, instead, nearest
+from vlatool.errors import DataError, GraphError, VlatoolError, fix_for, suggest
 from vlatool.runtime.contract import not_finite
 from vlatool.runtime.observation import all_finite
 
@@ -23,9 +23,10 @@ class Session(Protocol):
     """One open graph on one engine."""
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run the graph: input name -> array, output name -> array.
+        """Run the graph: input name -> array, output name -> array, both of NumPy and in the memory of the host.
 
-        A session with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
+        In whose memory they are meanwhile is the session's affair; later runs do not change what it gave. A session
+        with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
         """
 
 
@@ -154,7 +155,7 @@ class Program:
         for name, value in noise.items():
             if name not in known:
                 raise DataError(
-                    f"The program draws no noise '{name}'; {nearest(str(name), known)}.", instead(str(name), known)
+                    f"The program draws no noise '{name}'; {suggest(str(name), known)}.", fix_for(str(name), known)
                 )
             array, shape = np.asarray(value), tuple(known[name]["shape"])
             if array.dtype.kind != "f":

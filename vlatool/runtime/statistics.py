@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.spec import STATISTICS_OF, TensorSpec
-from vlatool.errors import SpecError, nearest
+from vlatool.errors import SpecError, suggest
 from vlatool.files.json import read_json
 from vlatool.runtime.assets import Assets, asset_path, read_asset
 
@@ -96,7 +96,7 @@ def _row(tensor: TensorSpec, assets: Assets, key: str) -> Array:
     table = read_json(content, f"The file {path} with the statistics of '{tensor.name}'", SpecError, fix)
     if not isinstance(table, dict) or entry not in table:
         known = table if isinstance(table, dict) else ()
-        raise SpecError(f"{path} has no statistics '{entry}' for '{tensor.name}'; {nearest(entry, known)}.", fix)
+        raise SpecError(f"{path} has no statistics '{entry}' for '{tensor.name}'; {suggest(entry, known)}.", fix)
     if not isinstance(table[entry], dict) or key not in table[entry]:
         raise SpecError(f"The statistics '{entry}' in {path} lack '{key}', which {tensor.normalisation} needs.", fix)
     return _checked(table[entry][key], tensor, f"'{key}' of '{entry}' in {path}")

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from vlatool.errors import SpecError
-from vlatool.files.limits import check, limit
+from vlatool.files.limits import check_limit, limit
 
 STEPS = {
     "BertNormalizer": 24, "Lowercase": 2, "NFC": 3, "NFD": 4, "NFKC": 18, "NFKD": 18, "Nmt": 1, "Strip": 1,
@@ -49,7 +49,7 @@ def growth(data: Mapping[str, Any], where: str) -> int:
         factor, more = factor * times, more * times + added
         _checked(factor + more, where)
     times_longer = int(_checked(factor + more, where))
-    check(
+    check_limit(
         "text_characters",
         _added_tokens(data) * times_longer,
         f"{where}: its added tokens, as it may lengthen them,",
@@ -60,7 +60,7 @@ def growth(data: Mapping[str, Any], where: str) -> int:
 
 def _checked(factor: float, where: str) -> float:
     if factor > limit("tokenizer_growth"):
-        check("tokenizer_growth", int(factor) + 1, f"{where}: what it makes of a character", SpecError)
+        check_limit("tokenizer_growth", int(factor) + 1, f"{where}: what it makes of a character", SpecError)
     return factor
 
 
@@ -72,7 +72,7 @@ def _steps(step: Any, where: str) -> Iterator[Mapping[str, Any]]:
         if step is None:
             continue
         seen += 1
-        check("steps", seen, where, SpecError)
+        check_limit("steps", seen, where, SpecError)
         if not isinstance(step, dict):
             raise SpecError(
                 f"{where} is not a file of the tokenizers library: one of its steps is not a mapping.",

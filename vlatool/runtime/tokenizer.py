@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import DataError, SpecError, VlatoolError, require
 from vlatool.files.json import read_json
-from vlatool.files.limits import check
+from vlatool.files.limits import check_limit
 from vlatool.runtime.assets import read_asset
 from vlatool.runtime.token_growth import growth
 
@@ -69,7 +69,7 @@ class Tokenizer:
         return known
 
     def _padded(self, text: str) -> NDArray[np.int64]:
-        check(
+        check_limit(
             "text_characters",
             len(text) * self._growth,
             f"The {self.name}, as its tokenizer may lengthen it,",

@@ -35,10 +35,10 @@ def sensitivities_in_child(
         VlatoolError: errors of ``sensitivities``; GraphError when the engine crashes the child.
     """
     job = {
-        "bundle": str(bundle.path.absolute()), "options": stage.given(), "recorded": recorded, "samples": samples,
-        "seconds": seconds,
+        "bundle": str(bundle.path.absolute()), "options": stage.explicit_options(), "recorded": recorded,
+        "samples": samples, "seconds": seconds,
     }  # fmt: skip
-    reply = children.call(f"{__name__}:run", job, context.tell, "measuring the layers", PRELOAD, own=True)
+    reply = children.call(f"{__name__}:run", job, context.progress, "measuring the layers", PRELOAD, own=True)
     return [LayerError(**layer) for layer in json.loads(reply)]
 
 

@@ -21,7 +21,7 @@ from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import foreign_errors, save
 from vlatool.graph.layers import Layer
 from vlatool.graph.qdq import Range
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.engines import of_branches
@@ -143,7 +143,7 @@ class _SwitchableSession:
         if not tape.changed:
             tape.position += 1
             return tape.recorded[tape.position - 1]
-        with risky(type(self._session), "ran a graph with switches"):
+        with engine_call(type(self._session), "ran a graph with switches"):
             outputs: Mapping[str, Any] = self._session.run({**feeds, **self._set})
         if tape.recording:
             tape.recorded.append(outputs)
@@ -184,7 +184,7 @@ class Switchboard:
                     self.shares.update({(name, layer): share for layer, share in _shares(path, layers[name]).items()})
                     path = folder / f"{name}.onnx"
                     save(model, path)
-            with risky(of_branches(), f"opened the graph '{name}' with switches"):
+            with engine_call(of_branches(), f"opened the graph '{name}' with switches"):
                 self._sessions[name] = _SwitchableSession(of_branches()(path, threads), flags, self._tape)
         self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), DEFAULT_ENGINE)
 
@@ -217,7 +217,7 @@ class Switchboard:
         if not (self.policy.program.keeps and isinstance(observations, Observations)):
             yield from observations
             return
-        for moment in observations.along():
+        for moment in observations.with_history():
             self._state = {} if moment.begins else self._state
             if moment.counts:
                 yield moment.observation
@@ -253,7 +253,7 @@ class Switchboard:
             reference = self.reference(observation)
             for index, group in enumerate(groups):
                 done = (number * len(groups) + index) / (len(observations) * len(groups))
-                context.tell(f"int8 in layer {index + 1} of {len(groups)}, all else in float32", done)
+                context.progress(f"int8 in layer {index + 1} of {len(groups)}, all else in float32", done)
                 rows[index].append(_compare(spec, self.run(group, observation), reference))
         layers = [self._error(group, row) for group, row in zip(groups, rows, strict=True)]
         return sorted(layers, key=lambda layer: -layer.error) if ordered else layers

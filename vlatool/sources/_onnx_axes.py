@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vlatool.errors import SourceError, instead, nearest, require
+from vlatool.errors import SourceError, fix_for, require, suggest
 
 Shapes = Mapping[str, tuple[int | str, ...]]
 INFERRED_BYTES = 1_500_000_000
@@ -39,24 +39,24 @@ def fix_axes(model: Any, shapes: Shapes, described: bool, file: str = "FILE.onnx
     for value in inputs:
         _put_rank(value, shapes.get(value.name))
         declared = dict(enumerate(shapes.get(value.name, ())))
-        for place, axis in enumerate(_axes(value)):
-            length = declared.get(place, 1 if place == 0 and not described else 0)
+        for index, axis in enumerate(_axes(value)):
+            length = declared.get(index, 1 if index == 0 and not described else 0)
             if isinstance(length, str):
-                if _is_free(axis, place):
+                if _is_free(axis, index):
                     axis.dim_param = length
                 continue
-            if not _is_free(axis, place) or length < 1:
+            if not _is_free(axis, index) or length < 1:
                 continue
             if axis.dim_param:
                 named.setdefault(axis.dim_param, length)
-            axis.dim_value = fixed.setdefault(value.name, {})[place] = length
+            axis.dim_value = fixed.setdefault(value.name, {})[index] = length
     for value in (*inputs, *model.graph.value_info, *model.graph.output):
-        for place, axis in enumerate(_axes(value)):
+        for index, axis in enumerate(_axes(value)):
             if axis.dim_param in named:
                 axis.dim_value = named[axis.dim_param]
                 if value.name in names:
-                    fixed.setdefault(value.name, {})[place] = axis.dim_value
-            elif _is_free(axis, place) and not axis.dim_param:  # -1 is no length
+                    fixed.setdefault(value.name, {})[index] = axis.dim_value
+            elif _is_free(axis, index) and not axis.dim_param:  # -1 is not a length
                 axis.Clear()
     if not described:
         _refuse_free(inputs, shapes, file)
@@ -84,8 +84,8 @@ def shapes_from(texts: Iterable[str]) -> dict[str, tuple[int | str, ...]]:
         right = all(axis.isidentifier() or (axis.isdecimal() and int(axis)) for axis in axes)
         if not equals or not name or not right:
             raise SourceError(
-                f"--shape {text!r} is no shape of an input; wanted NAME=1,3,224,224: each axis a whole number from 1, "
-                "or a name for one that stays free.",
+                f"--shape {text!r} is not a shape of an input; wanted NAME=1,3,224,224: each axis a whole number from "
+                "1, or a name for one that stays free.",
                 "write it like --shape image=1,3,224,224",
             )
         shapes[name] = tuple(int(axis) if axis.isdecimal() else axis for axis in axes)
@@ -94,7 +94,7 @@ def shapes_from(texts: Iterable[str]) -> dict[str, tuple[int | str, ...]]:
 
 def axes_text(fixed: Mapping[str, Mapping[int, int]]) -> str:
     """Return which axes were fixed, in words; empty for none."""
-    lengths = [f"{name} axis {place} = {length}" for name, axes in fixed.items() for place, length in axes.items()]
+    lengths = [f"{name} axis {index} = {length}" for name, axes in fixed.items() for index, length in axes.items()]
     return f"free axes get a length: {', '.join(lengths)}" if lengths else ""
 
 
@@ -132,9 +132,9 @@ def _axes(value: Any) -> Any:
     return value.type.tensor_type.shape.dim
 
 
-def _is_free(axis: Any, place: int) -> bool:
+def _is_free(axis: Any, index: int) -> bool:
     """Return whether an axis has no length: some exporters write -1, and 0 for the batch."""
-    return not axis.HasField("dim_value") or axis.dim_value < (1 if place == 0 else 0)
+    return not axis.HasField("dim_value") or axis.dim_value < (1 if index == 0 else 0)
 
 
 def _is_known(value: Any) -> bool:
@@ -155,9 +155,10 @@ def _check_given(inputs: list[Any], shapes: Shapes) -> None:
     for name, given in shapes.items():
         if name not in known:
             raise SourceError(
-                f"--shape names '{name}', which is no input of the file; {nearest(name, known)}.", instead(name, known)
+                f"--shape names '{name}', which is not an input of the file; {suggest(name, known)}.",
+                fix_for(name, known),
             )
-        own = [_length(axis, place) for place, axis in enumerate(_axes(known[name]))]
+        own = [_length(axis, index) for index, axis in enumerate(_axes(known[name]))]
         fits = len(own) == len(given) and all(
             isinstance(axis, str) or axis == length for axis, length in zip(own, given, strict=True)
         )
@@ -173,8 +174,8 @@ def _refuse_free(inputs: list[Any], shapes: Shapes, file: str) -> None:
     """Refuse inputs whose shape nobody knows: a length that is made up decides what is checked, counted and timed."""
     found, options = [], []
     for value in inputs:
-        own = [_length(axis, place) for place, axis in enumerate(_axes(value))]
-        free = [axis for place, axis in enumerate(own) if isinstance(axis, str) and place and value.name not in shapes]
+        own = [_length(axis, index) for index, axis in enumerate(_axes(value))]
+        free = [axis for index, axis in enumerate(own) if isinstance(axis, str) and index and value.name not in shapes]
         if not _is_known(value):
             found.append(f"'{value.name}' has a shape that the file does not say")
             options.append(_option(value.name, "1,AXIS,AXIS"))
@@ -189,9 +190,9 @@ def _refuse_free(inputs: list[Any], shapes: Shapes, file: str) -> None:
         )
 
 
-def _length(axis: Any, place: int) -> int | str:
-    """Return the length of an axis, or its name; one that has neither is named by its place."""
-    return (axis.dim_param or f"n{place}") if _is_free(axis, place) else int(axis.dim_value)
+def _length(axis: Any, index: int) -> int | str:
+    """Return the length of an axis, or its name; one that has neither is named by its index."""
+    return (axis.dim_param or f"n{index}") if _is_free(axis, index) else int(axis.dim_value)
 
 
 def _option(name: str, axes: str) -> str:

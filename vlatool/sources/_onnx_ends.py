@@ -12,7 +12,7 @@ from vlatool.data import random_observations
 from vlatool.errors import SourceError
 from vlatool.graph.files import save
 from vlatool.graph.onnx_graph import type_name
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
 
@@ -23,9 +23,9 @@ ZIPMAP = "a classifier of skl2onnx is converted with options={'zipmap': False}"
 
 
 def refuse_types(model: Any, described: bool) -> None:
-    """Refuse what is no tensor, or of a type that numpy lacks; bfloat16 is none of them.
+    """Refuse what is not a tensor, or of a type that numpy lacks; bfloat16 is not refused.
 
-    An output that is no tensor, and not the first, is left out where there is a description, which cannot name it.
+    An output that is not a tensor, and not the first, is left out where there is a description, which cannot name it.
 
     Raises:
         SourceError: naming the value, its type, and what helps.
@@ -68,7 +68,7 @@ def complete_outputs(model: Any, path: Path, inputs: Sequence[TensorSpec]) -> No
     if not unknown:
         return
     save(model, path)
-    with risky(engine_class(), f"ran {path.name}"):
+    with engine_call(engine_class(), f"ran {path.name}"):
         session = engine_class()(path, threads=1)
         runs = [session.run(_drawn(inputs, length)) for length in LENGTHS]
     for value in unknown:

@@ -1,4 +1,4 @@
-"""What other tools write, as the stages read it: constants as initializers, which are no inputs, in one graph."""
+"""What other tools write, as the stages read it: constants as initializers that are not inputs, in one graph."""
 
 from __future__ import annotations
 
@@ -88,11 +88,11 @@ def _with_plain_gemms(model: Any) -> Any:
 
 
 def _drop_unread(graph: Any) -> None:
-    """Remove the weights that no node reads and that are no output: what was moved would be stored twice."""
+    """Remove the weights that no node reads and that are not outputs: what was moved would be stored twice."""
     read = read_names(graph.node) | {value.name for value in graph.output}
-    for place in reversed(range(len(graph.initializer))):
-        if graph.initializer[place].name not in read:
-            del graph.initializer[place]
+    for index in reversed(range(len(graph.initializer))):
+        if graph.initializer[index].name not in read:
+            del graph.initializer[index]
 
 
 def _made(model: Any, node: Any, stored: dict[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -13,17 +13,18 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Graph, Manifest
-from vlatool.bundle.program import single_graph
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, InputError, SourceError, nearest, require
+from vlatool.errors import GraphError, InputError, SourceError, require, suggest
 from vlatool.graph.files import save
 from vlatool.graph.float32_conversion import ROUNDING, as_float32, describe_conversion
 from vlatool.graph.layers import MIN_OPSET
 from vlatool.graph.onnx_graph import type_name
 from vlatool.graph.random_ops import refuse_random_file
-from vlatool.machine.risky import REMEDY, risky
-from vlatool.module.description import FILE, Description, copy_assets, description_file, read_description
+from vlatool.machine.engine_calls import REMEDY, engine_call
+from vlatool.module.description import FILE, Description, copy_assets, read_description
+from vlatool.module.source import Source
+from vlatool.registry import Claim
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
@@ -31,11 +32,11 @@ from vlatool.runtime.program import Program
 from vlatool.sources._onnx_axes import axes_text, fix_axes, opset_of, shapes_from, with_opset
 from vlatool.sources._onnx_batch import add_batch_axes
 from vlatool.sources._onnx_ends import complete_outputs, refuse_types
+from vlatool.sources._onnx_files import refuse_bare
 from vlatool.sources._onnx_plain import plain
-from vlatool.sources._source import Source
 from vlatool.stage.base import Context
-from vlatool.stage.counted import counted_shares
 from vlatool.stage.finish import SEED, finish
+from vlatool.stage.precision_shares import count_shares
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -54,8 +55,8 @@ class OnnxFile(Source):
     """A policy that is one ONNX file; the spec comes from a description, or from the file's inputs and outputs."""
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
-    has_graphs: ClassVar[bool] = True
     runs_graphs: ClassVar[bool] = True
+    needs: ClassVar[str] = "a .onnx file"
 
     model: Path = Field(description="the ONNX file; external data is found beside it")
     policy: Path | None = Field(
@@ -66,15 +67,25 @@ class OnnxFile(Source):
     control_hz: float = Field(10.0, gt=0, description="rate of the control loop when there is no policy.yaml, in Hz")
 
     @classmethod
-    def accepting(cls, typed: str) -> Self | None:
-        """Take a .onnx file; point out the file where a directory holds one and names no factory."""
+    def claims(cls, typed: str) -> Claim:
+        """Claim a .onnx file; perhaps a directory that holds one and describes nothing."""
+        path = Path(typed)
+        if not path.is_dir():
+            return Claim.CERTAIN if path.suffix == ".onnx" else Claim.NONE
+        return Claim.MAYBE if any(path.glob("*.onnx")) and not (path / FILE).is_file() else Claim.NONE
+
+    @classmethod
+    def of(cls, typed: str) -> Self:
+        """Return the stage for a .onnx file; point out the file where a directory holds one."""
         path = Path(typed)
         if path.is_dir():
-            _refuse_bare(path)
-        if path.suffix != ".onnx" or path.is_dir():
-            return None
+            refuse_bare(path)
         beside = path.parent / FILE
         return cls(model=path, policy=beside if beside.is_file() else None)
+
+    def describe(self) -> Description | None:
+        """Read the ``policy.yaml`` beside the file, if there is one."""
+        return replace(read_description(self.policy), graphs={"main": self.model}) if self.policy else None
 
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Convert to the opset of the record and take its shapes, where it has them."""
@@ -91,16 +102,16 @@ class OnnxFile(Source):
     def inputs(self) -> tuple[Path, ...]:
         """The model, its external data and what the description names."""
         beside = sorted(self.model.parent.glob(self.model.name + "*"))
-        if self.policy is None:
+        if (described := self.describe()) is None:
             return tuple(beside)
-        described = read_description(self.policy)
-        return (*beside, *described.recordings().values(), description_file(self.policy), *described.assets())
+        return (*beside, *described.recordings().values(), *described.read_from, *described.assets())
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Load the file, store it, and run it once."""
         self.check(None, None)
         model = plain(_load(self.model))
-        description = _description(self.policy) if self.policy else None
+        if (description := self.describe()) is not None:
+            _check_program(description)
         changes = self._prepare(model, description, context)
         (out / "graphs").mkdir()
         file = out / "graphs/main.onnx"
@@ -111,14 +122,14 @@ class OnnxFile(Source):
         _check_names(model, described.spec)
         refuse_random_file(model, self.model)
         copy_assets(described, out)
-        manifest = described.manifest(program=described.program or single_graph(described.spec))
+        manifest = described.manifest()
         options = {"opset": self.opset, "shape": list(self.shape)}
         given = {name: value for name, value in options.items() if value}
         made_by = {**self.made_by(), "options": {"model": self.model.name, **given}}
         with _named_after(self.model, file):
             opset = self._store(model, out, manifest, changes, context)
             observations = observations_for(Bundle(out, manifest), 2)
-            graphs = {"main": Graph("graphs/main.onnx", counted_shares(file, context), opset)}
+            graphs = {"main": Graph("graphs/main.onnx", count_shares(file, context), opset)}
             return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
 
     def _prepare(self, model: Any, description: Description | None, context: Context) -> _Changes:
@@ -130,7 +141,7 @@ class OnnxFile(Source):
                 "leave --shape out, or change them there",
             )
         if gone := as_float32(model):
-            context.said.append(describe_conversion(gone))
+            context.messages.append(describe_conversion(gone))
         declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
         fixed = axes_text(fix_axes(model, declared or shapes_from(self.shape), declared is not None, str(self.model)))
         further = [] if description else add_batch_axes(model, opset_of(model))
@@ -138,7 +149,7 @@ class OnnxFile(Source):
             axes = f"{', '.join(further)} of the file have no batch axis: one of 1 is put in front"
             fixed = f"{fixed}; {axes}" if fixed else axes
         if fixed:
-            context.tell(fixed, None)
+            context.progress(fixed, None)
         return _Changes(further, max(TOLERANCE, *(ROUNDING.get(kind, 0) for kind in gone), 0))
 
     def _store(self, model: Any, out: Path, manifest: Manifest, changes: _Changes, context: Context) -> int:
@@ -156,13 +167,13 @@ class OnnxFile(Source):
             try:
                 save(with_opset(model, wanted), file)
                 self._compare(before, unbatched, out, manifest, changes.tolerance)
-                context.said.append(f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations")
+                context.messages.append(f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations")
                 return wanted
             except InputError as error:
                 if self.opset:
                     raise
                 words = f"opset {opset} stays, in which nothing can be quantized to int8 ({MIN_OPSET} or later): "
-                context.said.append(f"{words}{error.message}")
+                context.messages.append(f"{words}{error.message}")
                 save(model, file)
         self._compare(before, unbatched, out, manifest, changes.tolerance)
         return opset
@@ -171,7 +182,7 @@ class OnnxFile(Source):
         """Open the file itself, or where ONNX Runtime refuses it what is written of it; and what has no batch axis."""
         for path, unbatched in ((self.model, further), (file, [])):
             try:
-                with risky(engine_class(), f"opened {path.name}"):
+                with engine_call(engine_class(), f"opened {path.name}"):
                     return engine_class()(path, threads=1), unbatched
             except GraphError:
                 if path == file:
@@ -190,7 +201,7 @@ class OnnxFile(Source):
         Raises:
             SourceError: when ONNX Runtime computes something else.
         """
-        with risky(engine_class(), "opened main.onnx"):
+        with engine_call(engine_class(), "opened main.onnx"):
             after = engine_class()(out / "graphs/main.onnx", threads=1)
         programs = [Program(manifest.program, {"main": session}, SEED) for session in (before, after)]
         encode = ObservationEncoder(manifest.spec, out / "assets")
@@ -223,17 +234,15 @@ class _Changes:
     tolerance: float = TOLERANCE
 
 
-def _description(path: Path) -> Description:
-    """Read a description whose program runs the one graph that an ONNX file is."""
-    described = read_description(path)
+def _check_program(described: Description) -> None:
+    """Refuse a program that runs another graph than the one that an ONNX file is."""
     further = next((step.graph for step in described.program if step.graph != "main"), None)
     if further is not None:
         raise SourceError(
-            f"The program in {path} runs the graph '{further}'; a policy that is one ONNX file only has the graph "
-            "'main'.",
+            f"The program in {described.read_from[0]} runs the graph '{further}'; a policy that is one ONNX file only "
+            "has the graph 'main'.",
             "write graph: main in each step, or leave the program out",
         )
-    return described
 
 
 def _load(path: Path) -> Any:
@@ -271,7 +280,7 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
         for tensor in tensors:
             if tensor.name not in names:
                 raise SourceError(
-                    f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}.",
+                    f"The ONNX file has no '{tensor.name}', which the spec names; {suggest(tensor.name, names)}.",
                     "name inputs and outputs in policy.yaml as the file does",
                 )
 
@@ -286,22 +295,3 @@ def _named_after(model: Path, copy: Path) -> Iterator[None]:
         if error.fix == REMEDY.format(package=engine_class().package):  # it was not made by vlatool
             error.fix = WHERE_MADE
         raise
-
-
-def _refuse_bare(folder: Path) -> None:
-    """Refuse a directory that holds ONNX files and names no factory: the file itself is the source.
-
-    Raises:
-        SourceError: naming the file, or all of them.
-    """
-    files = sorted(folder.glob("*.onnx"))
-    described = (folder / FILE).is_file()
-    if not files or (described and read_description(folder).factory):
-        return
-    names = ", ".join(str(file) for file in files[:4])
-    lacks = f"a {FILE} without a 'source'" if described else f"no {FILE}"
-    beside = "" if described else f"; a {FILE} beside it may describe inputs and outputs"
-    raise SourceError(
-        f"{folder} holds ONNX files ({', '.join(file.name for file in files[:4])}) and {lacks}.",
-        f"name the file: {names if len(files) == 1 else f'one of {names}'}{beside}",
-    )

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle, hash_file, seal
 from vlatool.errors import SourceError
-from vlatool.module.description import Description, copy_assets, description_file, read_description, write_location
+from vlatool.module.description import FILE, Description, copy_assets, read_description, write_location
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.module.imports import imported_files
-from vlatool.sources._source import Source
+from vlatool.module.source import Source
+from vlatool.registry import Claim
+from vlatool.sources._onnx_files import refuse_bare
 from vlatool.stage.base import Context
 from vlatool.user_code import trust
 from vlatool.weights.shards import fingerprint, sampled_hash, shard_files
@@ -34,21 +36,33 @@ class TorchModule(Source):
     by hash, so that nothing large is copied.
     """
 
+    needs: ClassVar[str] = f"a directory with a {FILE}, or path/to/policy.py:make beside one"
+
     policy: Path = Field(description="policy.yaml, or the directory that holds it")
     factory: str = Field("", description="path.py:make or package.module:make; the one in policy.yaml when empty")
 
     @classmethod
-    def accepting(cls, typed: str) -> Self | None:
-        """Take a directory or YAML file that describes a policy, or ``path.py:make`` beside one."""
+    def claims(cls, typed: str) -> Claim:
+        """Claim what holds or is a ``policy.yaml``, and ``path.py:make``; perhaps other YAML files."""
         path = Path(typed)
-        if path.is_dir() or path.suffix in (".yaml", ".yml"):
-            return cls(policy=path).named()
+        function = typed.rpartition(":")
+        if path.name == FILE or (path / FILE).is_file() or (function[0].endswith(".py") and function[2]):
+            return Claim.CERTAIN
+        return Claim.MAYBE if path.suffix in (".yaml", ".yml") else Claim.NONE
+
+    @classmethod
+    def of(cls, typed: str) -> Self:
+        """Return the stage for a directory or YAML file that describes a policy, or ``path.py:make`` beside one."""
         where, _, function = typed.rpartition(":")
-        if not where.endswith(".py") or not function:
-            return None
+        if not where.endswith(".py"):
+            return cls(policy=Path(typed))
         if not Path(where).is_file():
             raise SourceError(f"No such file: {where} (from '{typed}').", "check the path")
-        return cls(policy=Path(where).parent, factory=f"{Path(where).name}:{function}").named()
+        return cls(policy=Path(where).parent, factory=f"{Path(where).name}:{function}")
+
+    def describe(self) -> Description:
+        """Read ``policy.yaml``."""
+        return read_description(self.policy)
 
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Take the factory of the record: a function in the policy's own files, or what its description names."""
@@ -58,7 +72,7 @@ class TorchModule(Source):
                 f"{self.policy} names the factory {self.factory}; {bundle.path} was made by {factory}.",
                 f"name the policy alone, or path.py:make of {factory}",
             )
-        described = read_description(self.policy)
+        described = self.describe()
         file = factory_file(factory, described.folder)
         if factory != described.factory and (file is None or not file.is_relative_to(described.folder.resolve())):
             raise SourceError(
@@ -69,23 +83,23 @@ class TorchModule(Source):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The description is readable and names a factory that exists."""
-        self._factory(read_description(self.policy))
+        self._factory(self.describe())
 
     def inputs(self) -> tuple[Path, ...]:
         """Everything that the policy is made of."""
-        described = read_description(self.policy)
+        described = self.describe()
         named = (*described.assets(), *described.recordings().values())
-        return (description_file(self.policy), *named, *self._code(described))
+        return (*described.read_from, *named, *self._code(described))
 
     def key(self, source_hash: str) -> str:
         """The bundle notes where the code is, so the place belongs to the key."""
-        described = read_description(self.policy)
+        described = self.describe()
         return super().key(f"{described.folder.resolve()} {_shards(described)}")
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the spec, the assets and the recorded data."""
-        described = read_description(self.policy)
-        self.named()
+        described = self.describe()
+        self.trust_code()
         copy_assets(described, out)
         factory = self._factory(described)
         root = self._root(described)
@@ -95,14 +109,16 @@ class TorchModule(Source):
         made_by = {**self.made_by(), "options": {}}
         return seal(out, described.manifest(made_by=made_by, source=source_record))
 
-    def named(self) -> Self:
+    def trust_code(self) -> Self:
         """Allow the policy's code to run in this process: the user named its folder."""
-        trust.name(read_description(self.policy).folder, None if self.policy.is_dir() else self.policy, self.factory)
+        folder = self.describe().folder
+        trust.allow(folder, None if self.policy.resolve() == folder.resolve() else self.policy, self.factory)
         return self
 
     def _factory(self, described: Description) -> str:
         factory = self.factory or described.factory
         if not factory:
+            refuse_bare(described.folder)
             raise SourceError(
                 f"{described.folder} names no factory.",
                 "add 'source: policy.py:make' to policy.yaml, or pass --factory",

@@ -19,26 +19,28 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import PluginError, RecipeError
 from vlatool.files.numbers import Numeric
-from vlatool.files.work import Store
-from vlatool.machine.instruction_sets import computed_in
+from vlatool.files.resumable_work import Store
+from vlatool.files.tree import hash_directory
+from vlatool.machine.instruction_sets import openvino_set
 from vlatool.machine.version import VERSION
 from vlatool.report import Report
+from vlatool.runtime.engine import identities
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
     from vlatool.hardware.profile import Profile
 
-Tell = Callable[[str, float | None], None]
+OnProgress = Callable[[str, float | None], None]
 BEFORE_ENGINES = ("sources", "export")
-"""Kinds of stages whose output is the same whatever OpenVINO computes in."""
-UNFINISHED = "define it; docs/guides/add-a-method.md shows a complete stage"
-RECORD = 2
+"""Kinds of stages whose output is the same whatever an engine computes in."""
+DEFINE_RUN = "define it; docs/guides/add-a-method.md shows a complete stage"
+RECORD_VERSION = 2
 """Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
 
 
 def _silent(_what: str, _share: float | None) -> None:
-    """Report nothing."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
@@ -46,38 +48,38 @@ class Context:
     """What a stage may use while it runs, none of which changes its result.
 
     Args:
-        tell: Called with what is being done and the share that is done (0-1, or None when it is not known).
-        workers: Processes that a stage may start; 0 for as many as the launcher has place for.
-        command: The command line, for reports.
-        elsewhere: Measures on another machine: a job, the bundles that it names, and ``tell`` -> what was found there.
-            Here when None.
-        events: Folder into which a training writes events that TensorBoard reads; none when empty.
-        video: File into which an evaluation writes a video of an episode; none when empty.
-        force: Whether a video that vlatool wrote there may be replaced.
-        launcher: Who starts the workers that play episodes: an entry of the kind ``workers``.
-        unfinished: Gets the folders of what is kept until the result is written (``files.work.Store``): whoever writes
-            it forgets them. Nothing is kept when None.
-        kept: What is kept of this run, once a stage has opened it.
-        notes: Gets sentences on how it was computed that belong into the report.
-        said: Gets sentences on what a stage that makes a bundle did, which the command line prints.
+        progress: callback: what is being done, and the share that is done (0-1, None when unknown).
+        workers: number of processes that a stage may start; 0 for as many as the launcher has room for.
+        command: command line, for reports.
+        measure_remotely: function that measures on another machine: job, bundles that it names, ``progress`` -> result;
+            None to measure on this machine.
+        events: folder for the TensorBoard events of a training; none when empty.
+        video: file for the video of an episode of an evaluation; none when empty.
+        force: whether a video that vlatool wrote there may be replaced.
+        launcher: what starts the workers that play episodes: an entry of the kind ``workers``.
+        unfinished: list that receives the folders of unfinished work (``files.resumable_work.Store``), to be removed
+            once the result is written; None to store none.
+        store: results stored during this run, once a stage has opened it.
+        notes: list that receives sentences for the report on how it was computed.
+        messages: list that receives sentences on what a stage did, which the command line prints.
     """
 
-    tell: Tell = field(default=_silent)
+    progress: OnProgress = field(default=_silent)
     workers: int = 1
     command: str = ""
-    elsewhere: Callable[[Mapping[str, Any], Sequence[Path], Tell], dict[str, Any]] | None = None
+    measure_remotely: Callable[[Mapping[str, Any], Sequence[Path], OnProgress], dict[str, Any]] | None = None
     events: str = ""
     video: str = ""
     force: bool = False
     launcher: str = "processes"
     unfinished: list[Path] | None = None
-    kept: Store | None = None
+    store: Store | None = None
     notes: list[str] = field(default_factory=list)
-    said: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
 
     def about(self, whose: str) -> Context:
-        """Return the context with what is told beginning with whose it is, where that is not empty."""
-        return replace(self, tell=lambda what, share: self.tell(f"{whose}: {what}", share)) if whose else self
+        """Return the context with a prefix for its progress, unless that is empty."""
+        return replace(self, progress=lambda what, share: self.progress(f"{whose}: {what}", share)) if whose else self
 
 
 class SampleSet:
@@ -143,19 +145,19 @@ class Stage(Numeric):
         """Return the options that differ from their defaults, as JSON values."""
         return self.model_dump(mode="json", exclude_defaults=True)
 
-    def given(self) -> dict[str, Any]:
+    def explicit_options(self) -> dict[str, Any]:
         """Return the options that were given, as JSON values: the same stage is built of them, which knows it too."""
         return self.model_dump(mode="json", exclude_unset=True)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Raise a user error when this stage cannot run on that source; cheap."""
+        """Raise a user error when this stage cannot run on that source; a cheap check."""
 
-    def named(self) -> Self:
-        """Allow the code of policies that the options name to run: the user typed them. Not of a file's options."""
+    def trust_code(self) -> Self:
+        """Allow the code of policies that the options name to run: the user typed them (not for options in a file)."""
         return self
 
     def inputs(self) -> tuple[Path, ...]:
-        """Files outside the source whose content changes the result; part of the cache key."""
+        """Files and directories outside the source whose content changes the result; part of the cache key."""
         return ()
 
     def used_packages(self) -> tuple[str, ...]:
@@ -165,13 +167,13 @@ class Stage(Numeric):
     def key(self, source_hash: str) -> str:
         """Return the cache key of this stage's output: 16 hex digits.
 
-        What OpenVINO answers and how fast it is depends on the instruction set that it computes in, and a bundle
-        records how far its engine is from its graphs.
+        What OpenVINO answers and how fast it is depends on the instruction set that it computes in, what other engines
+        answer depends on what they say themselves, and a bundle records how far its engine is from its graphs.
         """
         versions = {package: installed_version(package) for package in self.used_packages()}
-        files = [_content(path) for path in self.inputs()]
-        content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, VERSION, RECORD]
-        content += [] if self.name().partition(".")[0] in BEFORE_ENGINES else [computed_in()]
+        files = [content_hash(path) for path in self.inputs()]
+        content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, VERSION, RECORD_VERSION]
+        content += [] if self.kind() in BEFORE_ENGINES else [openvino_set(), *identities().items()]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -213,24 +215,24 @@ class Transform(Stage):
         """
         return (self,)
 
-    def then(self) -> tuple[tuple[str, dict[str, Any]], ...]:
+    def following_stages(self) -> tuple[tuple[str, dict[str, Any]], ...]:
         """Return the stages that the command line runs after this one, each with its options; a recipe names them."""
         return ()
 
-    def told(self, bundle: Bundle) -> tuple[str, ...]:
-        """Return what is worth telling of the new bundle even where other stages follow at once."""
+    def summary(self, bundle: Bundle) -> tuple[str, ...]:
+        """Return a summary of the new bundle, which is printed even where other stages follow."""
         return ()
 
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Return what else a person wants to know about the new bundle, a sentence for each line."""
+        """Return further sentences on the new bundle, one for each line."""
         return ()
 
     def accept(self, bundle: Bundle) -> None:
-        """Raise when what was made is not what was asked for: its output does not appear then."""
+        """Raise when the result does not meet the request; its output is then discarded."""
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the new bundle into the empty directory ``out`` and return it."""
-        raise PluginError(f"The stage {self.name()} has no method run().", UNFINISHED)
+        raise PluginError(f"The stage {self.name()} has no method run().", DEFINE_RUN)
 
     def _recorded_options(self) -> dict[str, Any]:
         """Return the options with files named by name and content: paths are not recorded."""
@@ -238,15 +240,17 @@ class Transform(Stage):
         for name in options:
             value = getattr(self, name)
             if isinstance(value, Path):
-                options[name] = f"{value.name} sha256:{_content(value)[:16]}"
+                whole = value in self.inputs() or not value.is_dir()  # of a policy only some files count
+                digest = content_hash(value) if whole else f"absent:{value.name}"
+                options[name] = f"{value.name} sha256:{digest[:16]}"
         return options
 
     def made_by(self, seed: int | None = None, calibration: SampleSet | None = None) -> dict[str, Any]:
         """Return the ``made_by`` entry of the manifest.
 
         Args:
-            seed: Seed of what the stage draws itself; ``finish`` notes the seed of noise and golden inputs otherwise.
-            calibration: The samples that the stage calibrated on, after the last one was used.
+            seed: seed of what the stage draws itself; ``finish`` notes the seed of noise and golden inputs otherwise.
+            calibration: the samples that the stage calibrated on, after the last one was used.
 
         Returns:
             ``vlatool``, ``stage``, ``options`` that differ from their defaults, ``versions``, and where there are any
@@ -262,10 +266,10 @@ class Transform(Stage):
         return entry | ({} if calibration is None else {"calibration": calibration.record()})
 
     def input_hashes(self) -> dict[str, str]:
-        """Return name -> SHA-256 of the files outside the source; a second file of the same name is ``NAME (2)``."""
+        """Return name -> SHA-256 of the inputs outside the source; a second one of the same name is ``NAME (2)``."""
         hashes: dict[str, str] = {}
-        for path in (path for path in self.inputs() if path.is_file()):
-            digest, name, number = hash_file(path), path.name, 1
+        for path in (path for path in self.inputs() if path.is_file() or path.is_dir()):
+            digest, name, number = content_hash(path), path.name, 1
             while hashes.get(name, digest) != digest:
                 number += 1
                 name = f"{path.name} ({number})"
@@ -277,7 +281,7 @@ class Measure(Stage):
     """A stage that makes a report."""
 
     remotely: ClassVar[bool] = False
-    """Whether it can measure on another machine (``Context.elsewhere``)."""
+    """Whether it can measure on another machine (``Context.measure_remotely``)."""
     runs_graphs: ClassVar[bool] = False
     """Whether it opens graphs itself, not in processes that it starts: then it runs in a child, as above."""
     films: ClassVar[bool] = False
@@ -289,7 +293,7 @@ class Measure(Stage):
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Measure and return the report; the caller writes it."""
-        raise PluginError(f"The stage {self.name()} has no method run().", UNFINISHED)
+        raise PluginError(f"The stage {self.name()} has no method run().", DEFINE_RUN)
 
 
 def source_of(source: Bundle | None, stage: str) -> Bundle:
@@ -316,5 +320,12 @@ def installed_version(package: str) -> str | None:
         return None
 
 
-def _content(path: Path) -> str:
-    return hash_file(path) if path.is_file() else f"absent:{path.name}"
+def content_hash(path: Path) -> str:
+    """Return the SHA-256 of a file as hex, or that of a directory with all files below it; ``absent:NAME`` of neither.
+
+    Raises:
+        DataError: for a directory that holds something else than files.
+    """
+    if path.is_file():
+        return hash_file(path)
+    return hash_directory(path) if path.is_dir() else f"absent:{path.name}"

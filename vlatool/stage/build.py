@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from vlatool import registry
-from vlatool.errors import RecipeError, instead, nearest
+from vlatool.errors import RecipeError, fix_for, suggest
 from vlatool.stage.base import Stage
 
 AnyStage = TypeVar("AnyStage", bound=Stage)
@@ -25,7 +25,7 @@ def stage_class(name: str) -> type[Stage]:
     kind, _, entry = name.partition(".")
     known = [f"{folder}.{method}" for folder in stage_kinds() for method in registry.names(folder)]
     if name.replace("-", "_") not in known:
-        raise RecipeError(f"Unknown stage '{name}'; {nearest(name, known)}.", instead(name, known))
+        raise RecipeError(f"Unknown stage '{name}'; {suggest(name, known)}.", fix_for(name, known))
     stage: type[Stage] = registry.load(kind, entry)
     return stage
 
@@ -41,25 +41,24 @@ def build_stage(name: str, options: Mapping[str, Any]) -> Stage:
     Raises:
         RecipeError: listing each option that is unknown or has an impossible value.
     """
-    return validated(stage_class(name), options, f"stage {name}")
+    return stage_from(stage_class(name), options, f"stage {name}")
 
 
-def validated(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> AnyStage:
+def stage_from(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> AnyStage:
     """Build ``kind`` from options, with a sentence for each problem."""
     try:
         return kind.model_validate(dict(options))
     except ValidationError as error:
         problems = [_problem(item, kind) for item in error.errors()]
         raise RecipeError(
-            f"{where}: " + "; ".join(problems) + ".",
-            "correct what is named; docs/reference/stages.md has every option",
+            f"{where}: " + "; ".join(problems) + ".", "correct what is named; docs/reference/stages.md has every option"
         ) from error
 
 
 def _problem(item: Mapping[str, Any], kind: type[Stage]) -> str:
     field_name = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
-        return f"unknown option '{field_name}'; {nearest(field_name, list(kind.model_fields))}"
+        return f"unknown option '{field_name}'; {suggest(field_name, list(kind.model_fields))}"
     problem = f"{field_name} = {item['input']!r}: {str(item['msg'])[:1].lower()}{str(item['msg'])[1:]}"
     ends = _ends(kind, field_name) if set(item.get("ctx", {})) & set(ENDS) else []
     return f"{problem}; allowed: {', '.join(ends)}" if len(ends) > 1 else problem

@@ -1,4 +1,4 @@
-"""What the cache holds, how large it is, and how it is made smaller.
+"""The content and size of the cache, and how it is pruned.
 
 Only what is recognisably vlatool's own is counted as an entry and ever removed: a finished stage by its name and the
 list of its files, so what another machine sent, unfinished work by its lock, a count by its content, a shared
@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from vlatool.files.edited import DRAFT_NAME, sweep_drafts
-from vlatool.files.kept import DIGEST, FILES, SHIPPED, STAGES, TAG
-from vlatool.files.locks import alone
-from vlatool.files.work import LOCK
-from vlatool.files.writing import sweep
-from vlatool.files.written import LEDGER, hash_once, read_listing
+from vlatool.files.blob_store import DIGEST, FILES, STAGES, TAG, TRANSFERS
+from vlatool.files.locks import exclusive_lock
+from vlatool.files.ownership import LEDGER, cached_hash, read_listing
+from vlatool.files.resumable_work import LOCK
+from vlatool.files.user_files import DRAFT_NAME, remove_stale_drafts
 from vlatool.graph.workload_file import is_workload
 
 STREAMS, WORKLOADS = "streams", "workloads"
@@ -32,7 +31,7 @@ NAMES = {
     STAGES: re.compile(r"(?P<what>[a-z]+\.[a-z0-9_]+)-[0-9a-f]{16}"),
     STREAMS: re.compile(r"[\w.-]+"),
     WORKLOADS: re.compile(r"[0-9a-f]{32}\.json"),
-    SHIPPED: DIGEST,
+    TRANSFERS: DIGEST,
 }
 STREAM_FILES = re.compile(
     r"lock|data|journal|answer-[0-9a-f]{32}\.json|checkpoint\.safetensors|meeting|round-\d{3}\.json"
@@ -41,10 +40,10 @@ STREAM_FILES = re.compile(
 """What unfinished work is made of: a file that is written part by part, training, or the trials of ``optimize``."""
 DRAFT = re.compile(r"\.(?P<final>.+)\.tmp-\d+-[0-9a-f]{8}")
 PART = re.compile(r"\.[0-9a-f]{64}\.(?P<process>\d+)-[0-9a-f]{8}\.part")
-NEW_S = 60.0
+MIN_AGE_S = 60.0
 """Seconds in which what was just made counts as in use: its maker has not locked it yet."""
 IN_USE = "is in use"
-RECENT = f"was made or used in the last {NEW_S:.0f} s"
+RECENT = f"was made or used in the last {MIN_AGE_S:.0f} s"
 
 Inode = tuple[int, int]
 
@@ -54,11 +53,11 @@ class Entry:
     """One thing that the cache keeps.
 
     Args:
-        name: Below the cache.
-        what: The stage's name; ``unfinished work``, ``count of a policy`` or ``files of another machine`` where it is
+        name: below the cache.
+        what: the stage's name; ``unfinished work``, ``count of a policy`` or ``files of another machine`` where it is
             not a stage.
-        used: When it was last made or used, in seconds since 1970.
-        files: Relative name -> inode and bytes of the files that vlatool wrote.
+        used: when it was last made or used, in seconds since 1970.
+        files: relative name -> inode and bytes of the files that vlatool wrote.
     """
 
     name: str
@@ -72,10 +71,10 @@ class Contents:
     """What a cache holds.
 
     Args:
-        cache: Where it is.
-        entries: The least recently used one first.
-        kept: Shared files: name below the cache -> inode and bytes.
-        unknown: Names below the cache of what vlatool did not write, as far as it is beside entries.
+        cache: where it is.
+        entries: the least recently used one first.
+        kept: shared files: name below the cache -> inode and bytes.
+        unknown: names below the cache of what vlatool did not write, as far as it is beside entries.
     """
 
     cache: Path
@@ -110,9 +109,9 @@ class Removed:
     stays: dict[str, str]
 
 
-def is_cache(place: Path) -> bool:
+def looks_like_cache(directory: Path) -> bool:
     """Return whether a directory is empty, or holds one of the folders of a cache."""
-    return not any(place.iterdir()) or any((place / name).exists() for name in (*NAMES, FILES, TAG))
+    return not any(directory.iterdir()) or any((directory / name).exists() for name in (*NAMES, FILES, TAG))
 
 
 def contents(cache: Path) -> Contents:
@@ -123,7 +122,7 @@ def contents(cache: Path) -> Contents:
     """
     entries, unknown = [], []
     for folder in NAMES:
-        for path in _below(cache / folder):
+        for path in _children(cache / folder):
             try:
                 entry = _entry(cache, folder, path)
             except FileNotFoundError:  # another process removed it since the folder was read
@@ -132,10 +131,10 @@ def contents(cache: Path) -> Contents:
                 entries.append(entry)
             elif not DRAFT.fullmatch(path.name) and not _draft_of(folder, path.name):
                 unknown.append(path.relative_to(cache).as_posix())
-    kept, others = _kept(cache)
+    kept, others = _shared_files(cache)
     unknown += others
     known = (*NAMES, FILES, TAG)
-    unknown += [path.name for path in _below(cache) if path.name not in known]
+    unknown += [path.name for path in _children(cache) if path.name not in known]
     return Contents(cache, tuple(sorted(entries, key=lambda entry: entry.used)), kept, tuple(sorted(unknown)))
 
 
@@ -145,10 +144,10 @@ def _draft_of(folder: str, name: str) -> str:
     return draft["final"] if draft and NAMES[folder].fullmatch(draft["final"]) else ""
 
 
-def _kept(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
+def _shared_files(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
     """Return the shared files by their names below the cache, and the names of what else is there."""
     kept, unknown = {}, []
-    for path in _below(cache / FILES):
+    for path in _children(cache / FILES):
         name = path.relative_to(cache).as_posix()
         with contextlib.suppress(FileNotFoundError):
             status = path.lstat()
@@ -165,10 +164,10 @@ def prune(
     """Remove entries, the least recently used first, and then the recordings that no entry holds any more.
 
     Args:
-        cache: The cache.
-        older_than_s: Remove what was not used for this many seconds; 0 for everything.
-        most_bytes: Remove until no more than that is left.
-        dry_run: Only say what would be removed.
+        cache: the cache.
+        older_than_s: age in seconds, since the last use, from which entries are removed; 0 for everything.
+        most_bytes: size that the rest may have.
+        dry_run: whether only to report what would be removed.
     """
     held = contents(cache)
     uses = Counter(held.uses)
@@ -189,7 +188,7 @@ def prune(
             uses.subtract(files.keys())
             left -= sum(size for inode, size in files.items() if not uses[inode])
     if not dry_run:
-        stays |= _sweep(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
+        stays |= _remove_unused(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
     return Removed(tuple(removed), held.bytes - left, stays)
 
 
@@ -198,7 +197,7 @@ def _now() -> float:
     return time.time_ns() / 1e9
 
 
-def _below(folder: Path) -> list[Path]:
+def _children(folder: Path) -> list[Path]:
     if folder.is_symlink() or not folder.is_dir():
         return []
     return sorted(folder.iterdir())
@@ -215,7 +214,7 @@ def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
     if named is None or stat.S_ISLNK(status.st_mode):
         return None
     name = path.relative_to(cache).as_posix()
-    if folder in (STAGES, SHIPPED):
+    if folder in (STAGES, TRANSFERS):
         what = named["what"] if folder == STAGES else "files of another machine"
         files = _stage_files(path)
         return Entry(name, what, status.st_mtime, files) if files else None
@@ -255,10 +254,10 @@ def _own_files(path: Path, is_own: Callable[[str], object]) -> dict[str, tuple[I
 def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
     """Remove the files of an entry, file by file; return why something of it stays."""
     path = cache / entry.name
-    if _now() - entry.used < NEW_S:
+    if _now() - entry.used < MIN_AGE_S:
         return RECENT
     lock = path / LOCK if entry.what == "unfinished work" else path
-    with alone(lock) as mine:
+    with exclusive_lock(lock) as mine:
         if not mine:
             return f"{IN_USE} by a running process"
         if dry_run:
@@ -277,14 +276,14 @@ def _remove_folders(path: Path) -> None:
             os.rmdir(folder)
 
 
-def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
+def _remove_unused(cache: Path, unused: Iterable[str]) -> dict[str, str]:
     """Remove shared files without links, and what killed writers left; return why something stays."""
     stays = {}
     for name in unused:
         with contextlib.suppress(FileNotFoundError):
             if (cache / name).lstat().st_nlink > 1:
                 continue
-            if hash_once(cache / name) != Path(name).name:
+            if cached_hash(cache / name) != Path(name).name:
                 stays[name] = "is not what its name says"
             else:
                 (cache / name).unlink()
@@ -295,20 +294,20 @@ def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
 
 def _drafts(cache: Path) -> Iterator[Path]:
     """Remove drafts of stages whose writers are gone; yield unfinished shared files of such writers."""
-    for path in _below(cache / WORKLOADS):
+    for path in _children(cache / WORKLOADS):
         if final := _draft_of(WORKLOADS, path.name):
-            sweep_drafts(path.with_name(final))
-    for folder in (STAGES, SHIPPED):
-        for final in {match["final"] for path in _below(cache / folder) if (match := DRAFT.fullmatch(path.name))}:
-            sweep(cache / folder / final)
-    for path in _below(cache / FILES):
+            remove_stale_drafts(path.with_name(final))
+    for folder in (STAGES, TRANSFERS):
+        for final in {match["final"] for path in _children(cache / folder) if (match := DRAFT.fullmatch(path.name))}:
+            remove_stale_drafts(cache / folder / final)
+    for path in _children(cache / FILES):
         match = PART.fullmatch(path.name)
         with contextlib.suppress(FileNotFoundError):
-            if match and _abandoned(path.lstat(), match["process"]):
+            if match and _is_stale(path.lstat(), match["process"]):
                 yield path
 
 
-def _abandoned(status: os.stat_result, process: str) -> bool:
+def _is_stale(status: os.stat_result, process: str) -> bool:
     """Whether a draft's writer is gone; one in another container has no number here, so a draft must be old too."""
-    old = _now() - status.st_mtime >= NEW_S
+    old = _now() - status.st_mtime >= MIN_AGE_S
     return old and stat.S_ISREG(status.st_mode) and not Path(f"/proc/{process}").exists()

@@ -19,13 +19,13 @@ def controls(bundle: Bundle) -> tuple[str, ...]:
     )
 
 
-PRUNED = "pruned"
+PRUNED_KEY = "pruned"
 """Key of what a stage that removes parts of a policy records: the shares of the work ``asked`` for and ``reached``."""
 
 
 def removed_by(bundle: Bundle) -> tuple[str, ...]:
     """Return a sentence for each stage of a bundle's build record that was to remove a share of the work."""
-    recorded = ((entry["stage"], entry[PRUNED]) for entry in history(bundle) if PRUNED in entry)
+    recorded = ((entry["stage"], entry[PRUNED_KEY]) for entry in history(bundle) if PRUNED_KEY in entry)
     return tuple(
         f"{stage}: asked for {work['asked']:.1%} less work, reached {work['reached']:.1%}" for stage, work in recorded
     )

@@ -1,4 +1,4 @@
-"""The last steps of every stage that makes a bundle: carry over what stays, golden inputs and outputs, hashes."""
+"""The last steps of every stage that writes a bundle: copied folders, golden inputs and outputs, hashes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.bundle.bundle import REPORTS, Bundle, restate, seal
+from vlatool.bundle.bundle import REPORTS, Bundle, replace_manifest, seal
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
-from vlatool.files.kept import carry
-from vlatool.machine.risky import risky
+from vlatool.files.blob_store import link_or_copy
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machine
 from vlatool.runtime.contract import OF_NOT_FINITE, OF_THE_GRAPHS, OF_THE_POLICY, off_the_robot
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, identities
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.interface import Action
@@ -31,23 +31,23 @@ GOLDEN = "golden/golden.npz"
 GOLDEN_COUNT = 2
 ENGINE_DIFFERENCE = "engine-difference"
 INEXACT = "inexact-reference"
-ROUNDING = 0.045
+MAX_ROUNDING = 0.045
 """Relative L2 difference of an engine from what the graph says, up to which it is rounding that falls the other way. On
 right engines and processors it was seen to be at most 0.035, on wrong ones at least 0.09, and where int8 products
 saturate from 0.045 on."""
-FARTHER = 1.2
-"""How many times as far from the source as the graphs an engine may be that rounds differently, as root mean square of
-``HELD`` observations: it draws an error of the same size again. A loop over int8 layers carries a rounding that falls
-the other way into all that follow: in ten steps of a denoising UNet the engine was as far from the graphs (up to 0.09)
-as either was from float32. Of its observations 99 in 100 choices of 8 give at most 1.18; a fault of the engine's own
-beside the rounding, at least as large as it, gives 1.41."""
-HELD = 32
+MAX_DISTANCE_RATIO = 1.2
+"""Largest ratio of the distance of an engine that rounds differently to that of the graphs, both from the source: root
+mean square of ``MAX_COMPARED`` observations: the engine draws an error of the same size again. A loop over int8 layers
+carries a rounding that falls the other way into all that follow: in ten steps of a denoising UNet the engine was as far
+from the graphs (up to 0.09) as either was from float32. Of its observations 99 in 100 choices of 8 give at most 1.18; a
+fault of the engine beside the rounding, at least as large as it, gives 1.41."""
+MAX_COMPARED = 32
 """Observations on which a new bundle is held against the one that it was made from, and how many a stage should give
 ``finish``: what an engine does wrong, products that saturate for instance, may show in one of ten."""
-FEWEST = 8
+MIN_COMPARED = 8
 """How many times observations are looked at where fewer are given, each with other noise."""
 DIFFERENCE = f"{REPORTS}/difference.json"
-REDRAWN = 1.5
+REDRAWN_FACTOR = 1.5
 """How many times that difference is allowed on other machines, where it is drawn again: of 18 observations, the largest
 was up to 1.44 times what two of them showed, but for one choice of two in twenty."""
 LEAST_TOLERANCE = 0.01
@@ -61,10 +61,10 @@ int8 as the graphs say where a bundle is made need not do so elsewhere: ten step
 the kernels of AVX and of AVX2."""
 SEED = 0
 """Seed of the noise that golden inputs and calibration runs draw."""
-CARRIED = ("assets", "data")
-FINALIZED = "optimize"
+CARRIED_FOLDERS = ("assets", "data")
+OPTIMIZE = "optimize"
 """In a build record, the entry of the step in which ``optimize`` finalizes a candidate."""
-DECIDED = ("accuracy", "engine")
+FINALIZED_FIELDS = ("accuracy", "engine")
 """Fields of a manifest that ``optimize`` sets when it finalizes a candidate."""
 
 
@@ -73,10 +73,10 @@ class Golden:
     """What the golden file was written from.
 
     Args:
-        samples: Observations with the noise of each.
-        expected: What the graphs say.
-        difference: Largest relative L2 difference of the engine's actions from those of the graphs, as they give them.
-        of_chunk: The same of the chunks in physical units.
+        samples: observations with the noise of each.
+        expected: what the graphs say.
+        difference: largest relative L2 difference of the engine's actions from those of the graphs, as they give them.
+        of_chunk: the same of the chunks in physical units.
     """
 
     samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]
@@ -90,9 +90,9 @@ class Difference:
     """How far the actions that an engine gives are from those of the graphs that a bundle was made from.
 
     Args:
-        mean, worst: Of the relative L2 differences of an output; the share of actions that are others, if discrete.
-        samples: Observations.
-        recorded: Whether they were recorded.
+        mean, worst: mean and maximum of the relative L2 differences of an output; the share of others if discrete.
+        samples: observations.
+        recorded: whether they were recorded.
     """
 
     mean: float
@@ -101,7 +101,7 @@ class Difference:
     recorded: bool
 
 
-def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> None:
+def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED_FOLDERS) -> None:
     """Copy the folders that a derived bundle keeps; large files are shared among the stages of a cache."""
     known = source.manifest.files
     for folder in folders:
@@ -110,7 +110,7 @@ def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> N
                 target = out / file.relative_to(source.path)
                 name = file.relative_to(source.path).as_posix()
                 target.parent.mkdir(parents=True, exist_ok=True)
-                carry(file, target, known[name].sha256 if name in known else "")
+                link_or_copy(file, target, known[name].sha256 if name in known else "")
 
 
 def finish(
@@ -126,62 +126,68 @@ def finish(
     """Write golden file and manifest of a bundle whose graphs and carried folders are in ``out`` already.
 
     Args:
-        source: What the bundle was made from.
-        made_by: Stage, options and versions.
-        graphs: Graph name -> graph.
-        observations: Raw observations; the first two become golden. On ``HELD`` of them the bundle is held against the
-            source, where that has graphs.
-        changes: Other fields of the manifest that the stage changes, such as program and engine.
-        recorded: Whether the observations were recorded.
+        source: what the bundle was made from.
+        made_by: stage, options and versions.
+        graphs: graph name -> graph.
+        observations: raw observations; the first two become golden. On ``MAX_COMPARED`` of them the bundle is compared
+            with the source, where that has graphs.
+        changes: other fields of the manifest that the stage changes, such as program and engine.
+        recorded: whether the observations were recorded.
 
     Raises:
         GraphError: when the engine refuses a graph or gives an action that is not finite.
     """
-    changed: dict[str, Any] = {"parent": source.hash, "made_by": dict(made_by), "graphs": dict(graphs), "accuracy": {}}
-    changed.update(changes or {})
+    changed: dict[str, Any] = {"parent": source.hash, "graphs": dict(graphs), "accuracy": {}, **(changes or {})}
+    changed["made_by"] = _with_engine(made_by, changed.get("engine", source.manifest.engine))
     origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
     unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
     draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
     golden = write_golden(draft, observations, out)
     build = (*history(source), _step(source, draft.manifest))
     bundle = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
-    held = _Held(source, bundle, observations) if source.manifest.graphs else None
+    held = _EngineCheck(source, bundle, observations) if source.manifest.graphs else None
     if held is not None:
         held.write(out / DIFFERENCE, recorded)
-    difference, limit, redrawn = _judged(bundle, golden, held)
+    difference, limit, redrawn = _judge_engine(bundle, golden, held)
     new = [] if difference <= limit or redrawn else [_engine_difference(bundle, difference, limit)]
     if is_int8(bundle.manifest) and reference().arithmetic() == SATURATING:
         new.append(_inexact_reference(bundle))
     kept = [finding for finding in source.manifest.findings if finding["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
     discrete = bundle.manifest.spec.action.kind == "discrete"
-    return restate(bundle, replace(
+    return replace_manifest(bundle, replace(
         bundle.manifest, findings=(*kept, *new), golden_tolerance=_tolerance(golden.difference, bundle, redrawn),
         golden_chunk_tolerance=0.0 if discrete else _tolerance(golden.of_chunk, bundle, redrawn),
     ))  # fmt: skip
 
 
+def _with_engine(made_by: Mapping[str, Any], engine: str) -> dict[str, Any]:
+    """Return ``made_by`` with the identity of the bundle's engine among the versions, where it has one."""
+    built = identities().get(engine)
+    return {**made_by, "versions": {**made_by.get("versions", {}), engine: built}} if built else dict(made_by)
+
+
 def _tolerance(seen: float, bundle: Bundle, redrawn: bool) -> float:
     """Return what a machine may differ where the engine was seen to differ so much, in three decimals; at most 1.
 
-    What differs in rounding here may do so twice as much elsewhere; a larger difference is no rounding, or one that is
+    What differs in rounding here may do so twice as much elsewhere; a larger difference is not rounding, or one that is
     drawn again on each machine.
     """
     computed = {name for graph in bundle.manifest.graphs.values() for name in graph.precision}
     least = max([LEAST_TOLERANCE, *(COARSE_TOLERANCE[name] for name in computed & set(COARSE_TOLERANCE))])
-    tolerance = max(least, (REDRAWN if redrawn else 1.2) * seen, min(2 * seen, ROUNDING))
+    tolerance = max(least, (REDRAWN_FACTOR if redrawn else 1.2) * seen, min(2 * seen, MAX_ROUNDING))
     return math.ceil(tolerance * 1000) / 1000 if math.isfinite(tolerance) else 1.0
 
 
-class _Held:
+class _EngineCheck:
     """What the engine of a bundle gives for observations, beside what the graphs say that it was made from.
 
     Args:
-        source, bundle: Both with graphs.
-        observations: Raw ones, at least one.
+        source, bundle: both with graphs.
+        observations: raw ones, at least one.
     """
 
     def __init__(self, source: Bundle, bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> None:
-        count = max(FEWEST, min(HELD, len(observations)))
+        count = max(MIN_COMPARED, min(MAX_COMPARED, len(observations)))
         self._bundle, self._name = bundle, bundle.manifest.spec.action.name
         self._samples = _samples(bundle.manifest, observations, count)
         self._before = _outputs(reference_policy(source), self._samples)
@@ -213,7 +219,7 @@ def read_difference(bundle: Bundle) -> Difference | None:
     return Difference(**json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else None
 
 
-def _judged(bundle: Bundle, golden: Golden, held: _Held | None) -> tuple[float, float, bool]:
+def _judge_engine(bundle: Bundle, golden: Golden, held: _EngineCheck | None) -> tuple[float, float, bool]:
     """Return how far the engine is from what the graphs say, how far it may be, and whether it only rounds otherwise.
 
     It may be as far as the graphs are from those of the source. It rounds otherwise where it is as near to the source
@@ -222,11 +228,11 @@ def _judged(bundle: Bundle, golden: Golden, held: _Held | None) -> tuple[float, 
     """
     if any(graph.compute == "bfloat16" for graph in bundle.manifest.graphs.values()):
         return golden.difference, math.inf, False
-    if held is None or max(golden.difference, _worst(held.errors)) <= ROUNDING:
-        return golden.difference, ROUNDING, False
+    if held is None or max(golden.difference, _worst(held.errors)) <= MAX_ROUNDING:
+        return golden.difference, MAX_ROUNDING, False
     engine, graphs = held.against_graphs()
-    difference, limit = max(golden.difference, _worst(engine)), max(ROUNDING, _worst(graphs))
-    near = float(np.linalg.norm(held.errors)) <= FARTHER * float(np.linalg.norm(graphs)) < math.inf
+    difference, limit = max(golden.difference, _worst(engine)), max(MAX_ROUNDING, _worst(graphs))
+    near = float(np.linalg.norm(held.errors)) <= MAX_DISTANCE_RATIO * float(np.linalg.norm(graphs)) < math.inf
     return difference, limit, difference > limit and near
 
 
@@ -273,11 +279,11 @@ def history(bundle: Bundle) -> tuple[dict[str, Any], ...]:
     made_by, recorded = manifest.made_by, manifest.build
     if not recorded and str(made_by.get("stage", "")).startswith("sources."):
         recorded = ({**made_by, "factory": manifest.source.get("factory", "")},)
-    if "candidate" not in made_by or (recorded and recorded[-1]["stage"] == FINALIZED):
+    if "candidate" not in made_by or (recorded and recorded[-1]["stage"] == OPTIMIZE):
         return recorded
     options = {name: made_by[name] for name in ("candidate", "profile") if name in made_by}
-    handed = {"vlatool": made_by.get("vlatool", ""), "stage": FINALIZED, "options": options, "input": manifest.parent}
-    decided = {name: getattr(manifest, name) for name in DECIDED if getattr(manifest, name)}
+    handed = {"vlatool": made_by.get("vlatool", ""), "stage": OPTIMIZE, "options": options, "input": manifest.parent}
+    decided = {name: getattr(manifest, name) for name in FINALIZED_FIELDS if getattr(manifest, name)}
     return (*recorded, {**handed, **decided})
 
 
@@ -303,9 +309,9 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     second. The chunk is the action in physical units: it shows other statistics, too.
 
     Args:
-        draft: The bundle as written so far; its graphs are what runs.
-        observations: Raw observations without the batch axis.
-        out: The bundle's directory.
+        draft: the bundle as written so far; its graphs are what runs.
+        observations: raw observations without the batch axis.
+        out: the bundle's directory.
     """
     samples = _samples(draft.manifest, observations, GOLDEN_COUNT)
     name = draft.manifest.spec.action.name
@@ -337,7 +343,8 @@ def _outputs(
     actions = []
     fix = OF_THE_GRAPHS if policy.bundle.manifest.parent else OF_THE_POLICY
     for number, (observation, noise) in enumerate(samples):
-        doing = risky(engine, f"ran {named(policy.bundle.manifest)}") if engine else contextlib.nullcontext()
+        deed = f"ran {graph_names(policy.bundle.manifest)}"
+        doing = engine_call(engine, deed) if engine else contextlib.nullcontext()
         held = not_finite_text(policy.spec, observation)
         remedy = OF_NOT_FINITE if held and not policy.bundle.manifest.parent else fix
         with doing, off_the_robot(f"observation {number}{f', which holds {held}' if held else ''}", remedy):
@@ -345,7 +352,7 @@ def _outputs(
     return actions
 
 
-def named(manifest: Manifest) -> str:
+def graph_names(manifest: Manifest) -> str:
     """Return the graphs of a bundle in words."""
     names = " and ".join(f"'{name}'" for name in manifest.graphs)
     return f"the graph{'s' if len(manifest.graphs) > 1 else ''} {names}"

@@ -1,4 +1,4 @@
-"""Run one stage somewhere: input directory, stage, output directory."""
+"""Run a stage: input directory, stage, output directory."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Any
 
 from vlatool.bundle.bundle import REPORTS, Bundle
 from vlatool.errors import BundleError, DataError, VlatoolError
-from vlatool.files.kept import tag
-from vlatool.files.locks import hold
+from vlatool.files.blob_store import mark_cache
+from vlatool.files.directory_writer import write_directory
+from vlatool.files.locks import acquire
 from vlatool.files.outputs import BUNDLE, refuse_replacing
-from vlatool.files.work import forget_all
-from vlatool.files.writing import writing
+from vlatool.files.resumable_work import remove_all_unused
 from vlatool.machine.host import cache_directory as cache_directory
 from vlatool.report import REPORT, Report, read_report
-from vlatool.stage import tried
-from vlatool.stage._inside import measured_with as measured_with
-from vlatool.stage._inside import needed, run_apart
+from vlatool.stage import first_run
+from vlatool.stage._child import child_imports, run_in_child
+from vlatool.stage._child import measure_in_child as measure_in_child
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.user_code import children
 
@@ -41,13 +41,13 @@ def run_transform(
     A stage that runs a user's code, or a graph that nobody has run yet, does so in a child process.
 
     Args:
-        stage: What runs.
-        source: Its input; None for a stage that starts a chain.
-        out: The new bundle.
-        context: For progress.
-        force: Replace a directory that vlatool wrote.
-        damaged: See ``vlatool.files.writing.writing``.
-        reports: Directory of reports of a stage before it, which come along where this one writes none.
+        stage: what runs.
+        source: its input; None for a stage that starts a chain.
+        out: the new bundle.
+        context: context of the run, for progress.
+        force: whether to replace a directory that vlatool wrote.
+        damaged: see ``vlatool.files.directory_writer.write_directory``.
+        reports: directory of reports of a stage before it, which come along where this one writes none.
 
     Raises:
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.
@@ -56,17 +56,17 @@ def run_transform(
         refuse_replacing(out, force=force, kind=BUNDLE)
     apart = stage.runs_graphs or bool(stage.runs(source))
     if apart and not stage.runs(source):
-        children.prepare(needed(stage))  # while this process checks
+        children.prepare(child_imports(stage))  # while this process checks
     stage.check(source, None)
-    with writing(out, force=force, damaged=damaged) as draft:
-        stage.accept(run_apart(stage, source, draft, context) if apart else stage.run(source, draft, context))
+    with write_directory(out, force=force, damaged=damaged) as draft:
+        stage.accept(run_in_child(stage, source, draft, context) if apart else stage.run(source, draft, context))
         for report in reports.iterdir() if reports is not None and reports.is_dir() else ():
             (draft / REPORTS).mkdir(exist_ok=True)
             if report.is_file() and not (draft / REPORTS / report.name).exists():
                 shutil.copy2(report, draft / REPORTS)
     made = Bundle.open(out, verify=False)
     if apart:
-        tried.note(made)
+        first_run.remember_run(made)
     return made
 
 
@@ -78,14 +78,14 @@ def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:
 def cached_transform(stage: Transform, source: Bundle | None, cache: Path, context: Context) -> Bundle:
     """Return the stage's bundle from the cache, or run the stage into the cache."""
     path = cached_path(stage, source.hash if source else "", cache)
-    if hold(path):
+    if acquire(path):
         try:
             return Bundle.open(path)
         except BundleError:
-            context.tell(f"the cached {stage.name()} is damaged; making it again", None)
-    tag(cache)
+            context.progress(f"the cached {stage.name()} is damaged; making it again", None)
+    mark_cache(cache)
     bundle = run_transform(stage, source, path, context, damaged=True)
-    hold(path)
+    acquire(path)
     return bundle
 
 
@@ -107,13 +107,13 @@ def first_steps(
         try:
             source = cached_transform(step, source, cache, context)
         except VlatoolError as error:
-            raise type(error)(error.message, "; ".join(filter(None, (error.fix, _alone(step, stage))))) from error
+            raise type(error)(error.message, "; ".join(filter(None, (error.fix, _failed_step(step, stage))))) from error
     return last, source
 
 
-def _alone(step: Transform, stage: Transform) -> str:
+def _failed_step(step: Transform, stage: Transform) -> str:
     """Return in words which stage of several failed, and how to give it other options."""
-    options = ", ".join(f"{name} {_words(value)}" for name, value in step.given().items())
+    options = ", ".join(f"{name} {_words(value)}" for name, value in step.explicit_options().items())
     command = f"vlatool {step.name().replace('.', ' ').replace('_', '-')}"
     return f"{stage.name()} starts with {step.name()} ({options}); to give it other options, run it first: {command}"
 
@@ -122,9 +122,9 @@ def _words(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def measured(stage: Measure, source: Bundle, context: Context) -> Report:
+def report_of(stage: Measure, source: Bundle, context: Context) -> Report:
     """Run a stage that measures; in a child process where it opens graphs itself."""
-    return measured_with({}, stage, source, context) if stage.runs_graphs else stage.run(source, context)
+    return measure_in_child({}, stage, source, context) if stage.runs_graphs else stage.run(source, context)
 
 
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:
@@ -137,12 +137,12 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
                 os.utime(path)
             return report
         except DataError:
-            context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
+            context.progress(f"the cached {stage.name()} is damaged; measuring again", None)
     own = replace(context, unfinished=[], notes=[])
-    report = replace(measured(stage, source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
-    tag(cache)
-    with writing(path, damaged=True) as draft:
+    report = replace(report_of(stage, source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    mark_cache(cache)
+    with write_directory(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
     context.notes.extend(own.notes)
-    forget_all(own.unfinished or ())
+    remove_all_unused(own.unfinished or ())
     return report

@@ -1,4 +1,4 @@
-"""Which rows a step learns from, and which of them this process takes."""
+"""The batches of a training step, and the share of this process."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Batches:
     """Draws the rows of a step: the same batch, however many processes share it and in however many parts.
 
     Args:
-        loss: Rows, name -> (B, ...) -> the mean of their losses.
-        frames: All rows.
-        size: Rows of a batch.
-        accumulate: Parts that a process computes one after the other.
-        group: Which process this is.
+        loss: rows, name -> (B, ...) -> the mean of their losses.
+        frames: all rows.
+        size: rows of a batch.
+        accumulate: parts that a process computes one after the other.
+        group: group of processes, and this one's rank.
     """
 
     def __init__(
@@ -44,9 +44,9 @@ class Batches:
 
     def __call__(self, random: np.random.Generator) -> Iterator[Part]:
         """Yield this process's parts of the batch that the random numbers choose."""
-        places = self._frames.draw(random, self._size)
-        for part in np.array_split(places, self._parts)[self._own]:
-            yield self._frames.weigh(part) / self._frames.weigh(places), partial(self._loss, part)
+        indices = self._frames.draw(random, self._size)
+        for part in np.array_split(indices, self._parts)[self._own]:
+            yield self._frames.row_count(part) / self._frames.row_count(indices), partial(self._loss, part)
 
     def of(self, loss: Loss, frames: Frames) -> Batches:
         """Return batches of other rows, with another loss, in the same parts."""
@@ -54,24 +54,24 @@ class Batches:
         other._of_rows, other._frames = loss, frames
         return other
 
-    def _loss(self, places: NDArray[Any]) -> Tensor:
-        return self._of_rows(self._frames.batch(places))
+    def _loss(self, indices: NDArray[Any]) -> Tensor:
+        return self._of_rows(self._frames.batch(indices))
 
 
-def mean_loss(frames: Frames, places: NDArray[Any], loss: Loss, rows: int, device: Device) -> float:
+def mean_loss(frames: Frames, indices: NDArray[Any], loss: Loss, rows: int, device: Device) -> float:
     """Return the mean loss of rows, without gradients.
 
     Args:
-        frames: Where they are.
-        places: Of them, as ``Frames.sample`` gives.
-        loss: Of a batch.
-        rows: At a time.
-        device: As in training.
+        frames: where they are.
+        indices: indices of them, as ``Frames.sample`` gives.
+        loss: loss of a batch.
+        rows: number of rows at a time.
+        device: device of the training.
     """
-    total, count = 0.0, frames.weigh(places)
+    total, count = 0.0, frames.row_count(indices)
     with require("torch", "build").no_grad(), device.computing(), device.casting():
-        for part in np.array_split(places, min(len(places), -(-count // rows))):
-            total += float(loss(frames.batch(part))) * frames.weigh(part)
+        for part in np.array_split(indices, min(len(indices), -(-count // rows))):
+            total += float(loss(frames.batch(part))) * frames.row_count(part)
     return total / count
 
 
@@ -79,10 +79,10 @@ def draw_of(taught: Batches, alpha: float, loss: Loss | None, shown: Frames) -> 
     """Return what draws the batches of a training; the teacher's are the same whether there is an expert or not.
 
     Args:
-        taught: Of what the teacher labelled.
-        alpha: Share of the teacher in the loss.
-        loss: Against an expert's actions; None where no expert is asked.
-        shown: Rows with what the expert did.
+        taught: taught of what the teacher labelled.
+        alpha: share of the teacher in the loss.
+        loss: loss against an expert's actions; None without an expert.
+        shown: rows with what the expert did.
     """
     if loss is None:
         return taught

@@ -1,4 +1,4 @@
-"""The best weights of a training, by the accuracy that decides, and when it has stopped getting better."""
+"""The best weights of a training by its score, and early stopping."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Best:
-    """How well the averaged weights did whenever they were looked at, and those that did best.
+    """The scores of the averaged weights over time, and the best weights.
 
     Of weights that do equally well the later are kept: they were trained longer.
     """
@@ -39,7 +39,7 @@ class Best:
             self.weights = {name: value.detach().clone() for name, value in weights.items()}
         self.scores.append(score)
 
-    def unimproved(self, number: int) -> int:
+    def rounds_without_improvement(self, number: int) -> int:
         """Return how many of the first scores follow the last one that was better than all before it."""
         scores = self.scores[:number]
         return number - 1 - scores.index(max(scores))

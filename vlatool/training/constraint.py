@@ -1,4 +1,4 @@
-"""What holds of weights after every step of a training, whatever the optimizer does."""
+"""Constraints on the weights after every step of a training."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Constraint:
-    """Nothing holds; others say what does.
+    """No constraint; base of the others.
 
     A run that is killed goes on from the weights alone: what is done in a step may depend on them and its number only.
     """
@@ -23,7 +23,7 @@ class Constraint:
         """Surround an update of the weights.
 
         Args:
-            number: Of the step, from 1 on.
+            number: number of the step, from 1 on.
         """
         yield
 
@@ -32,12 +32,12 @@ class Constraint:
 
 
 class KeptZeros(Constraint):
-    """What is zero stays zero.
+    """Zeros stay zero.
 
     Zeros are their own mask: what is exactly zero before an update is zero after it.
 
     Args:
-        weights: That are sparse, (outputs, ...).
+        weights: weights that are sparse, (outputs, ...).
     """
 
     def __init__(self, weights: Sequence[Tensor]) -> None:
@@ -60,12 +60,12 @@ class KeptZeros(Constraint):
 
 
 class GrowingZeros(KeptZeros):
-    """What is zero stays zero, and from step to step more of the smallest weights become zero.
+    """Zeros stay zero, and step by step more of the smallest weights become zero.
 
     Args:
-        weights: That become sparse, (outputs, ...).
-        goes: Sizes of the elements of a weight (outputs, inputs), and a share -> which of them are to be zero.
-        shares: Number of a step -> the share of the elements that are zero after it; steps in which none are added are
+        weights: weights that become sparse, (outputs, ...).
+        goes: sizes of the elements of a weight (outputs, inputs), and a share -> which of them are to be zero.
+        shares: number of a step -> the share of the elements that are zero after it; steps in which none are added are
             left out.
     """
 

@@ -1,4 +1,4 @@
-"""A control of a training: labels that look like a teacher's, and say nothing of what they stand beside."""
+"""A control experiment: labels that are distributed like a teacher's, but belong to other observations."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError
-from vlatool.training.frames import BLOCK, Array, new_array
+from vlatool.training.frames import BLOCK_ROWS, Array, new_array
 from vlatool.training.rounds import LABEL
 
 
@@ -19,9 +19,9 @@ def exchange_labels(frames: Path, labels: Sequence[str], seed: Sequence[int]) ->
     Inputs and noise stay where they are, and the labels have the distribution that they had.
 
     Args:
-        frames: Folder of the round, labelled.
-        labels: Names of what the teacher said.
-        seed: Of the exchange.
+        frames: folder of the round, labelled.
+        labels: names of what the teacher said.
+        seed: seed of the exchange.
 
     Raises:
         DataError: when there is no other row.
@@ -32,8 +32,8 @@ def exchange_labels(frames: Path, labels: Sequence[str], seed: Sequence[int]) ->
         said: Array = np.load(file, mmap_mode="r")
         draft = file.with_name(f"exchanged-{file.name}")
         exchanged = new_array(draft, said.dtype, said.shape)
-        for start in range(0, len(said), BLOCK):
-            exchanged[start : start + BLOCK] = said[others[start : start + BLOCK]]
+        for start in range(0, len(said), BLOCK_ROWS):
+            exchanged[start : start + BLOCK_ROWS] = said[others[start : start + BLOCK_ROWS]]
         draft.replace(file)
 
 

@@ -1,4 +1,4 @@
-"""What a training computes on: a processor, or a GPU where there is one."""
+"""The device of a training: the processor, or a GPU where there is one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlatool.machine import host
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-Asked = Literal["auto", "cpu", "cuda"]
+DeviceChoice = Literal["auto", "cpu", "cuda"]
 BFLOAT16 = ("amx_bf16", "avx512_bf16", "bf16")
 """Features of processors that multiply bfloat16 natively: twice as fast as float32 here."""
 WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
@@ -28,7 +28,7 @@ class Device:
 
     Args:
         name: ``cpu`` or ``cuda``.
-        bfloat16: Whether products are computed in bfloat16 (autocast); weights and their updates are float32.
+        bfloat16: whether products are computed in bfloat16 (autocast); weights and their updates are float32.
     """
 
     name: str = "cpu"
@@ -76,7 +76,7 @@ class Device:
         """Let a GPU be the one that this process computes on, where it computes on one.
 
         Args:
-            number: Of the process, of those on this machine.
+            number: number of the process, of those on this machine.
         """
         if self.name == "cuda":
             require("torch", "build").cuda.set_device(number)
@@ -96,14 +96,14 @@ CPU = Device()
 """A processor, in float32."""
 
 
-def device_of(asked: Asked, precision: str, processes: int = 1, here: int | None = None) -> Device:
+def device_of(asked: DeviceChoice, precision: str, processes: int = 1, here: int | None = None) -> Device:
     """Return what to compute on, and how.
 
     Args:
         asked: ``auto``: a GPU where torch has one; several processes share the processors unless ``cuda`` is asked for.
         precision: ``auto``: bfloat16 where the device multiplies it natively.
-        processes: That train together.
-        here: How many of them are on this machine, each with a GPU of its own; all when None.
+        processes: processes that train together.
+        here: how many of them are on this machine, each with a GPU of its own; all when None.
 
     Raises:
         RecipeError: when a GPU is asked for where there is none, or by more processes than there are.

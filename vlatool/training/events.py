@@ -13,8 +13,8 @@ class Events:
     """Writes scalars into a folder; does nothing without one.
 
     Args:
-        folder: Where the events are; empty for none.
-        step: From which on they are written; what an earlier run wrote of later steps does not count any more.
+        folder: where the events are; empty for none.
+        step: step from which events are written; what an earlier run wrote for later steps is discarded.
 
     Raises:
         MissingExtra: when tensorboard is not installed.
@@ -45,13 +45,13 @@ def check_events(folder: str) -> None:
     Raises:
         MissingExtra, OutputError: see ``Events``.
     """
-    place = Path(folder)
-    if place.exists() and not place.is_dir():
-        raise OutputError(f"{place} is a file; events are written into a directory.", "name another one: --events DIR")
+    path = Path(folder)
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path} is a file; events are written into a directory.", "name another one: --events DIR")
     require("torch.utils.tensorboard", "tensorboard")
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
-            f"{place} cannot be made: {error.strerror}.", "name another directory: --events DIR"
+            f"{path} cannot be made: {error.strerror}.", "name another directory: --events DIR"
         ) from error

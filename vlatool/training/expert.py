@@ -1,4 +1,4 @@
-"""What an expert did, where that was recorded: a second term of the loss, with rows of its own."""
+"""Recorded actions of an expert: a second term of the loss, with its own rows."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from vlatool.bundle.spec import TensorSpec
 from vlatool.data import Recording, calibration_recording
 from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError, require
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.runtime.statistics import load_normaliser
-from vlatool.training.frames import BLOCK, Array, Frames, new_array
-from vlatool.training.rounds import EXPERT, NOISE, Counted, next_round, write_recorded
-from vlatool.training.sequences import Sequences, answered, episode_begins, whole_episodes
+from vlatool.training.frames import BLOCK_ROWS, Array, Frames, new_array
+from vlatool.training.rounds import EXPERT, NOISE, Observations, next_round, write_observations
+from vlatool.training.sequences import Sequences, episode_begins, outputs_and_labels, select_episodes
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -32,17 +32,17 @@ class Expert:
     """Recorded observations with the expert's actions, encoded, in a folder of their own.
 
     Args:
-        place: Folder of the training, or of what it holds out.
-        frames: Folder -> the rounds in it, as the lesson takes them.
+        folder: folder of the training, or of what it holds out.
+        frames: folder -> the rounds in it, as the objective takes them.
     """
 
-    def __init__(self, place: Path, frames: Callable[[Path], Frames] = Frames) -> None:
-        self.frames = frames(place / FOLDER)
+    def __init__(self, folder: Path, frames: Callable[[Path], Frames] = Frames) -> None:
+        self.frames = frames(folder / FOLDER)
         self.counts: dict[str, int] = {}
 
     def prepare(
         self,
-        recording: Counted | None,
+        recording: Observations | None,
         source: Bundle,
         share: float,
         seed: int,
@@ -51,30 +51,30 @@ class Expert:
         """Choose observations, and write them with the expert's actions unless an earlier run did.
 
         Args:
-            recording: Recorded observations to choose from.
-            source: The student's bundle.
-            share: Of them, at least one.
-            seed: Of the choice; a smaller share is a part of a larger one.
-            encode: Observation -> what the policy takes.
+            recording: recorded observations to choose from.
+            source: the student's bundle.
+            share: share of them, at least one.
+            seed: seed of the choice; a smaller share is a part of a larger one.
+            encode: observation -> what the policy takes.
 
         Raises:
-            DataError: when there are no actions of an expert.
+            DataError: when an expert's actions are missing.
         """
         if not isinstance(recording, Recording) or recording.actions is None:
             where = recording.path if isinstance(recording, Recording) else source.path
             raise DataError(f"A loss against an expert's actions needs them, and {where} has none.", RECORD)
         order = np.random.default_rng((seed, CHOICE)).permutation
         if isinstance(self.frames, Sequences):
-            used = whole_episodes(episode_begins(recording), share, order)
+            used = select_episodes(episode_begins(recording), share, order)
         else:
             used = np.zeros(len(recording), np.bool_)
             used[order(len(recording))[: max(1, round(share * len(recording)))]] = True
-        chosen = recording.only(used)
+        chosen = recording.subset(used)
         self.counts = {"used": len(chosen), "recorded": len(recording)}
 
         def write(target: Path) -> None:
             action = source.manifest.spec.action
-            write_recorded(encode, chosen, target, chosen.begins())
+            write_observations(encode, chosen, target, chosen.begins())
             np.save(file_of(target, EXPERT + action.name), encoded_actions(action, source, chosen.actions))
             write_noise(source, len(chosen), (seed, CHOICE), target)
 
@@ -95,9 +95,9 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
     """Return so many recorded observations of a bundle, spread over its recording; None when it has none.
 
     Args:
-        source: The bundle.
-        most: Observations.
-        whole: Whether these are whole episodes.
+        source: the bundle.
+        most: observations.
+        whole: whether these are whole episodes.
 
     Raises:
         DataError: as ``episode_begins`` does, where they are.
@@ -107,10 +107,10 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
         return None
     if whole:
         order = np.random.default_rng(CHOICE).permutation
-        return recording.only(whole_episodes(episode_begins(recording), most / len(recording), order))
+        return recording.subset(select_episodes(episode_begins(recording), most / len(recording), order))
     used = np.zeros(len(recording), np.bool_)
     used[recording.spread(most)] = True
-    return recording.only(used)
+    return recording.subset(used)
 
 
 def encoded_actions(action: TensorSpec, source: Bundle, actions: Any) -> Array:
@@ -126,8 +126,8 @@ def write_noise(source: Bundle, rows: int, seed: Sequence[int], target: Path) ->
     """Write for so many rows what the program draws, if it draws anything."""
     wanted = {name: noise for step in source.manifest.program for name, noise in step.noise.items()}
     random, kept = np.random.default_rng(seed), dict[str, Array]()
-    for start in range(0, rows, BLOCK) if wanted else ():
-        for name, value in drawn(wanted, min(BLOCK, rows - start), random).items():
+    for start in range(0, rows, BLOCK_ROWS) if wanted else ():
+        for name, value in draw_noise(wanted, min(BLOCK_ROWS, rows - start), random).items():
             if name not in kept:
                 kept[name] = new_array(file_of(target, NOISE + name), value.numpy().dtype, (rows, *value.shape[1:]))
             kept[name][start : start + len(value)] = value.numpy()
@@ -142,15 +142,15 @@ def expert_loss(
     Continuous ones: ``distance``, over the leading steps that were recorded.
 
     Args:
-        modules: The student's.
-        source: Its bundle.
-        distance: Student's and expert's actions, (B, T, A) each -> the mean over them.
+        modules: the student's.
+        source: its bundle.
+        distance: student's and expert's actions, (B, T, A) each -> the mean over them.
     """
     action = source.manifest.spec.action
     student = BatchedProgram(source.manifest.program, modules)
 
     def loss(rows: Mapping[str, Any]) -> Tensor:
-        given, expert = answered(student, rows, action.name, EXPERT)
+        given, expert = outputs_and_labels(student, rows, action.name, EXPERT)
         given = given.float()
         given = given.reshape(len(given), -1, given.shape[-1])[:, : expert.shape[1]]
         if action.kind != "discrete":

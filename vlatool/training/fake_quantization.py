@@ -31,10 +31,10 @@ class Product:
     """How a function of torch takes the two values that it multiplies.
 
     Args:
-        first: Place of the first one; the second one follows it.
-        names: Of both.
-        outputs: Axis of the weight that has an output in each entry; -1 for matrices, which may be no weights.
-        blocks: Whether int4 rounds the weight.
+        first: place of the first one; the second one follows it.
+        names: names of both.
+        outputs: axis of the weight that has an output in each entry; -1 for matrices, which may be no weights.
+        blocks: whether int4 rounds the weight.
     """
 
     first: int
@@ -42,12 +42,12 @@ class Product:
     outputs: int
     blocks: bool = True
 
-    def rounded(
+    def quantize_arguments(
         self, arguments: tuple[Any, ...], named: Mapping[str, Any], weights: Weights
     ) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Return a call's arguments with both values on their grids."""
         given = dict(enumerate(arguments)) | dict(named)
-        keys = [place if place in given else name for place, name in enumerate(self.names, self.first)]
+        keys = [index if index in given else name for index, name in enumerate(self.names, self.first)]
         values, weight = (given[key] for key in keys)
         if self.outputs < 0 and not _is_matrix(weight):
             return arguments, dict(named)
@@ -55,7 +55,7 @@ class Product:
             given |= {keys[0]: per_tensor(values), keys[1]: per_channel(weight, self.outputs)}
         elif self.blocks and weight.dim() == 2:
             given[keys[1]] = in_blocks(weight) if self.outputs == 0 else in_blocks(weight.T).T
-        return tuple(given[place] for place in range(len(arguments))), {name: given[name] for name in named}
+        return tuple(given[index] for index in range(len(arguments))), {name: given[name] for name in named}
 
 
 PRODUCTS = {
@@ -87,7 +87,7 @@ def fake_quantization(weights: Weights) -> Any:
         ) -> Any:
             named, name = named or {}, getattr(function, "__name__", "").partition(".")[0]
             if name in PRODUCTS:
-                arguments, named = PRODUCTS[name].rounded(arguments, named, weights)
+                arguments, named = PRODUCTS[name].quantize_arguments(arguments, named, weights)
             elif name in STEPS:
                 return getattr(recurrent_steps, name)(_rounded_linear, *arguments, **named)
             elif getattr(function, "__module__", "") in PYTHON and isinstance(function, types.FunctionType):
@@ -96,7 +96,7 @@ def fake_quantization(weights: Weights) -> Any:
             return function(*arguments, **named)
 
     def _rounded_linear(*arguments: Any) -> Any:
-        return linear(*PRODUCTS["linear"].rounded(arguments, {}, weights)[0])
+        return linear(*PRODUCTS["linear"].quantize_arguments(arguments, {}, weights)[0])
 
     return FakeQuantization()
 
@@ -122,7 +122,7 @@ def per_channel(weight: Any, outputs: int = 0) -> Any:
         others = [axis for axis in range(weight.dim()) if axis != outputs % weight.dim()]
         step = weight.detach().float().abs().amax(others, keepdim=True).clamp_min(TINY) / INT8
         rounded = (weight.float() / step).round() * step
-    return _through(weight, rounded)
+    return _straight_through(weight, rounded)
 
 
 def per_tensor(values: Any) -> Any:
@@ -133,7 +133,7 @@ def per_tensor(values: Any) -> Any:
         step = ((high - low) / UINT8).clamp_min(TINY)
         zero = (-low / step).round()
         rounded = (((values.float() / step).round() + zero).clamp(0, UINT8) - zero) * step
-    return torch.where((high - low).isfinite(), _through(values, rounded), values)
+    return torch.where((high - low).isfinite(), _straight_through(values, rounded), values)
 
 
 def in_blocks(weight: Any) -> Any:
@@ -147,9 +147,9 @@ def in_blocks(weight: Any) -> Any:
         zero = (-low / step).round().clamp(0, INT4)
         rounded = (((blocks / step).round() + zero).clamp(0, INT4) - zero) * step
         rounded = rounded.reshape(len(weight), -1)[:, : weight.shape[1]]
-    return _through(weight, rounded)
+    return _straight_through(weight, rounded)
 
 
-def _through(values: Any, rounded: Any) -> Any:
+def _straight_through(values: Any, rounded: Any) -> Any:
     """Return rounded values whose gradient is that of the values."""
     return values + (rounded.to(values.dtype) - values).detach()

@@ -2,7 +2,7 @@
 
 A flow-matching head learns a velocity, and its loop adds velocities up. A student that is compared at the end of all
 turns gets its gradient through all of them; one that is compared turn by turn learns the teacher's velocity itself, for
-the cost of one turn (flow matching: Lipman et al., arXiv 2210.02747, with the teacher's velocity in the place of the
+the cost of one turn (flow matching: Lipman et al., arXiv 2210.02747, with the teacher's velocity instead of the
 data's).
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import RecipeError
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.training.device import on_device
 from vlatool.training.rounds import AFTER, BEFORE, LABEL, NOISE, NUMBER, tensors
 
@@ -35,9 +35,9 @@ def flow_loss(
     It is multiplied by the number of turns: as far as the end would be from the teacher's if all turns erred alike.
 
     Args:
-        student: With a loop like the teacher's (``check_loops``).
-        distance: Of the student's values (B, ...) from the teacher's, a mean over rows.
-        computed: Gives the context in which the student computes.
+        student: student with a loop like the teacher's (``check_loops``).
+        distance: distance of the student's values (B, ...) from the teacher's, a mean over rows.
+        computed: function that returns the context in which the student computes.
     """
     loop = student.loop
     if loop is None:
@@ -58,9 +58,9 @@ def check_loops(student: BatchedProgram, teacher: BatchedProgram, action: str, n
     """Refuse programs whose turns cannot be compared.
 
     Args:
-        student, teacher: Programs.
-        action: Name of the action.
-        name: Of the policy.
+        student, teacher: programs.
+        action: name of the action.
+        name: name of the policy.
 
     Raises:
         RecipeError: when there is no loop, both have other ones, or something else gives the action.

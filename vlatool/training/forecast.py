@@ -1,4 +1,4 @@
-"""How long a training will still take."""
+"""The remaining time of a training."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Forecast:
     """Tells from the steps and pauses of this run when it will end.
 
     Args:
-        steps: In all.
-        done: Before this run.
-        now: The clock, in seconds.
+        steps: number of steps in total.
+        done: number of steps before this run.
+        now: the clock, in seconds.
     """
 
     def __init__(self, steps: int, done: int, now: Callable[[], float] = time.monotonic) -> None:
@@ -33,7 +33,7 @@ class Forecast:
         finally:
             self._paused.append(self._now() - start)
 
-    def left(self, step: int) -> str:
+    def time_left(self, step: int) -> str:
         """Return in words how long it will take from a step on; nothing while that is not known."""
         if step <= self._first:
             self._start = self._now() - sum(self._paused)

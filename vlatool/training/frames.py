@@ -1,4 +1,4 @@
-"""What a student is trained on: encoded observations and what the teacher says of them, in rounds on the disk."""
+"""Training data: encoded observations and the teacher's labels, in rounds on the disk."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from vlatool.data import BEGINS
 from vlatool.errors import DataError
 
 Array = NDArray[Any]
-BLOCK = 256
-"""Rows that are copied at a time."""
+BLOCK_ROWS = 256
+"""Number of rows that are copied at a time."""
 
 
 class Frames:
     """Rounds of rows, each round a folder with ``NAME.npy`` of (N, ...) that stays on the disk.
 
     Args:
-        folder: Where the rounds are.
+        folder: where the rounds are.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -36,16 +36,16 @@ class Frames:
 
     @property
     def count(self) -> int:
-        """How many rounds are used."""
+        """Number of rounds in use."""
         return len(self._rounds)
 
     def has(self, number: int) -> bool:
-        """Say whether a round was written whole, by an earlier run too."""
-        return self._place(number).is_dir()
+        """Return whether a round was written completely, also by an earlier run."""
+        return self._round_folder(number).is_dir()
 
     def read(self, number: int) -> None:
         """Use a round that was written, after those before it."""
-        files = sorted({*self._place(number).glob("*.npy")} - {begins_file(self._place(number))})
+        files = sorted({*self._round_folder(number).glob("*.npy")} - {begins_file(self._round_folder(number))})
         self._rounds.append({unquote(file.stem): np.load(file, mmap_mode="r") for file in files})
 
     def draft(self, number: int) -> Path:
@@ -57,33 +57,33 @@ class Frames:
 
     def keep(self, number: int) -> None:
         """Make a draft a round."""
-        (self._folder / f"draft-{number:03d}").rename(self._place(number))
+        (self._folder / f"draft-{number:03d}").rename(self._round_folder(number))
 
-    def places(self, number: int) -> Array:
+    def row_indices(self, number: int) -> Array:
         """Return the numbers over all rounds of the rows of one."""
         sizes = [len(next(iter(arrays.values()))) for arrays in self._rounds]
         return np.arange(sizes[number]) + sum(sizes[:number])
 
     def draw(self, random: np.random.Generator, size: int) -> Array:
-        """Draw the places of a batch of so many rows."""
+        """Draw the indices of a batch of a number of rows."""
         return random.integers(len(self), size=size)
 
-    def weigh(self, places: Array) -> int:
-        """Return how many rows are at places."""
-        return len(places)
+    def row_count(self, indices: Array) -> int:
+        """Return the number of rows at indices."""
+        return len(indices)
 
     def sample(self, numbers: Sequence[int], most: int) -> Array:
-        """Return the places of so many rows of some rounds, or of all, evenly spaced."""
-        rows = np.concatenate([self.places(number) for number in numbers])
-        return rows[spread(len(rows), most)]
+        """Return the indices of a number of rows of some rounds, or of all their rows, evenly spaced."""
+        rows = np.concatenate([self.row_indices(number) for number in numbers])
+        return rows[evenly_spaced(len(rows), most)]
 
-    def batch(self, places: Array) -> Any:
-        """Return what a loss takes of places: name -> (B, ...)."""
-        return self.rows(places)
+    def batch(self, indices: Array) -> Any:
+        """Return the argument of a loss for indices: name -> (B, ...)."""
+        return self.rows(indices)
 
-    def kept(self, most: int) -> dict[str, Array]:
-        """Return so many rows, spread over all rounds: name -> (N, ...)."""
-        return self.rows(spread(len(self), most))
+    def sample_rows(self, most: int) -> dict[str, Array]:
+        """Return a number of rows, spread over all rounds: name -> (N, ...)."""
+        return self.rows(evenly_spaced(len(self), most))
 
     def rows(self, rows: Array) -> dict[str, Array]:
         """Return rows by their numbers over all rounds: name -> (B, ...)."""
@@ -97,10 +97,10 @@ class Frames:
 
     def begins(self, number: int) -> Array:
         """Return the numbers over all rounds of the rows of one with which episodes begin."""
-        places: Array = self.places(number)[np.load(begins_file(self._place(number)))]
-        return places
+        indices: Array = self.row_indices(number)[np.load(begins_file(self._round_folder(number)))]
+        return indices
 
-    def _place(self, number: int) -> Path:
+    def _round_folder(self, number: int) -> Path:
         return self._folder / f"round-{number:03d}"
 
 
@@ -109,13 +109,13 @@ def begins_file(folder: Path) -> Path:
     return folder / f"{BEGINS}.npy"
 
 
-def spread(count: int, most: int) -> Array:
-    """Return the places of ``most`` of so many rows, or of all, evenly spaced."""
+def evenly_spaced(count: int, most: int) -> Array:
+    """Return the indices of ``most`` of a number of rows, or of all, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
 
 
 def new_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> Array:
-    """Return an array in a new ``.npy`` file, whose place on the disk is taken: a full disk would kill a later write.
+    """Return an array in a new ``.npy`` file, whose space is allocated: on a full disk a later write would crash.
 
     Raises:
         OSError: when there is no room for it.
@@ -126,7 +126,7 @@ def new_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def joined(parts: Iterable[Path], target: Path) -> int:
+def concatenate(parts: Iterable[Path], target: Path) -> int:
     """Join the arrays of several folders, ``NAME.npy`` each; return the number of rows.
 
     Raises:
@@ -152,7 +152,7 @@ def joined(parts: Iterable[Path], target: Path) -> int:
 def _blocks(arrays: Iterable[Array]) -> Iterator[tuple[int, Array]]:
     at = 0
     for array in arrays:
-        for start in range(0, len(array), BLOCK):
-            block = array[start : start + BLOCK]
+        for start in range(0, len(array), BLOCK_ROWS):
+            block = array[start : start + BLOCK_ROWS]
             yield at, block
             at += len(block)

@@ -20,8 +20,8 @@ from vlatool.errors import SourceError, require
 if TYPE_CHECKING:
     from torch import Tensor
 
-LOST = "Another process of the training is gone."
-AGAIN = "run the same command again: it goes on from the last checkpoint"
+LOST_PROCESS = "Another process of the training is gone."
+RUN_AGAIN = "run the same command again: it goes on from the last checkpoint"
 INTERFACE = "GLOO_SOCKET_IFNAME"
 BACKENDS = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
 """Device -> what adds up: counts and losses on the processor in any case."""
@@ -32,14 +32,14 @@ class Group:
     """Which of the processes this one is.
 
     Args:
-        rank: Its number; the first one, 0, plays, labels and writes.
-        size: How many there are.
+        rank: its number; the first one, 0, plays, labels and writes.
+        size: how many there are.
     """
 
     rank: int = 0
     size: int = 1
 
-    def summed(self, loss: float, weights: Sequence[Tensor]) -> float:
+    def sum_gradients(self, loss: float, weights: Sequence[Tensor]) -> float:
         """Replace gradients by their sums over all processes; return the sum of the losses.
 
         A weight that got no gradient anywhere has none afterwards.
@@ -49,8 +49,8 @@ class Group:
         """
         if self.size == 1:
             return loss
-        with lost_told():
-            return _summed(loss, weights)
+        with map_lost_process():
+            return _sum_gradients(loss, weights)
 
     def total(self, number: float) -> float:
         """Return the sum of a number over all processes; the same bits in each.
@@ -58,19 +58,19 @@ class Group:
         Raises:
             SourceError: when another process is gone.
         """
-        return self.summed(number, ())
+        return self.sum_gradients(number, ())
 
 
 @contextlib.contextmanager
-def lost_told() -> Iterator[None]:
+def map_lost_process() -> Iterator[None]:
     """Say of what fails between processes that one of them is gone."""
     try:
         yield
     except RuntimeError as error:
-        raise SourceError(LOST, AGAIN) from error
+        raise SourceError(LOST_PROCESS, RUN_AGAIN) from error
 
 
-def _summed(loss: float, weights: Sequence[Tensor]) -> float:
+def _sum_gradients(loss: float, weights: Sequence[Tensor]) -> float:
     torch = require("torch", "build")
     has = [float(value.grad is not None) for value in weights]
     numbers = torch.tensor([loss, *has], dtype=torch.float64, device="cpu")
@@ -94,14 +94,14 @@ def _add_up(gradients: Sequence[Tensor]) -> None:
 
 
 @contextlib.contextmanager
-def joined_group(store: Callable[[], Any], group: Group, device: str = "cpu", *, here: bool = True) -> Iterator[None]:
+def join_group(store: Callable[[], Any], group: Group, device: str = "cpu", *, here: bool = True) -> Iterator[None]:
     """Be one of the processes of a group within the block; all of them must come.
 
     Args:
-        store: Opens a store of ``torch.distributed`` through which they find each other; a new one for each group.
-        group: Which one this is.
+        store: opens a store of ``torch.distributed`` through which they find each other; a new one for each group.
+        group: group, and this process's rank.
         device: ``cpu`` or ``cuda``, of what is added up.
-        here: Whether all of them are on this machine, so that no other one needs to reach them.
+        here: whether all of them are on this machine, so that no other one needs to reach them.
 
     Raises:
         SourceError: when they do not find each other.
@@ -110,7 +110,7 @@ def joined_group(store: Callable[[], Any], group: Group, device: str = "cpu", *,
         yield
         return
     distributed = require("torch.distributed", "build")
-    with _on_this_machine() if here else contextlib.nullcontext(), lost_told():
+    with _on_this_machine() if here else contextlib.nullcontext(), map_lost_process():
         distributed.init_process_group(BACKENDS[device], store=store(), rank=group.rank, world_size=group.size)
     try:
         yield

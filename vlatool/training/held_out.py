@@ -1,4 +1,4 @@
-"""Recorded observations that a training does not learn from: where nobody plays, their loss says when to stop."""
+"""Held-out recorded observations: without episodes, their loss decides when to stop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vlatool.training.batches import Loss, mean_loss
 from vlatool.training.device import Device
 from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
-from vlatool.training.rounds import Counted, next_round
+from vlatool.training.rounds import Observations, next_round
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,44 +32,44 @@ class HeldOut:
     """The recorded observations in two: one part to learn from, one to judge with.
 
     Args:
-        place: Folder of the training.
-        frames: Folder -> the rounds in it, as the lesson takes them.
+        folder: folder of the training.
+        frames: folder -> the rounds in it, as the objective takes them.
     """
 
-    def __init__(self, place: Path, frames: Callable[[Path], Frames] = Frames) -> None:
-        self._frames = frames(place / FOLDER)
-        self.expert = Expert(place / FOLDER, frames)
+    def __init__(self, folder: Path, frames: Callable[[Path], Frames] = Frames) -> None:
+        self._frames = frames(folder / FOLDER)
+        self.expert = Expert(folder / FOLDER, frames)
         self.recording: Recording | None = None
         """What is held out, after ``prepare``."""
-        self._others: Counted | None = None
+        self._training_part: Observations | None = None
 
     @property
-    def others(self) -> Counted:
+    def training_part(self) -> Observations:
         """Return the observations to learn from."""
-        if self._others is None:
+        if self._training_part is None:
             raise RuntimeError("prepare() comes first")
-        return self._others
+        return self._training_part
 
     def prepare(
-        self, recording: Recording | None, write: Callable[[Counted, Path], None], instead: Callable[[Path], bool]
+        self, recording: Recording | None, write: Callable[[Observations, Path], None], other: Callable[[Path], bool]
     ) -> None:
         """Split the recording, and write what is held out unless an earlier run did.
 
         Args:
-            recording: Of the student's bundle.
-            write: Called with observations and the folder for them.
-            instead: Called with the folder where there are not two observations to split; says whether it wrote others.
+            recording: recording of the student's bundle.
+            write: function called with observations and the folder for them.
+            other: called with the folder where there are not two observations to split; says whether it wrote others.
 
         Raises:
             DataError: when there are not two observations to split.
         """
         if recording is None or len(recording) < 2:
-            self._others = [] if recording is None else recording
-            next_round(self._frames, 0, partial(_required, instead, len(self._others)))
+            self._training_part = [] if recording is None else recording
+            next_round(self._frames, 0, partial(_write_required, other, len(self._training_part)))
             return
-        held = held_out(recording)
-        self._others = recording.only(~held)
-        self.recording = recording.only(held)
+        held = held_out_mask(recording)
+        self._training_part = recording.subset(~held)
+        self.recording = recording.subset(held)
         next_round(self._frames, 0, partial(write, self.recording))
 
     def read(self) -> None:
@@ -81,20 +81,20 @@ class HeldOut:
         """Return the mean loss of what is held out.
 
         Args:
-            loss: Of a batch.
-            rows: At a time.
-            device: As in training.
+            loss: loss of a batch.
+            rows: number of rows at a time.
+            device: device of the training.
         """
         return mean_loss(self._frames, self._frames.sample((0,), len(self._frames)), loss, rows, device)
 
-    def mixed(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, device: Device) -> float:
+    def mixture_loss(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, device: Device) -> float:
         """Return the same as a mixture of both terms.
 
         Args:
-            alpha: Share of the teacher.
-            loss: Of a batch, against the teacher.
-            expert: Of a batch, against the expert's actions; None where no expert is asked.
-            rows, device: As of ``loss``.
+            alpha: share of the teacher.
+            loss: loss of a batch, against the teacher.
+            expert: expert of a batch, against the expert's actions; None where no expert is asked.
+            rows, device: as in ``loss``.
         """
         total = alpha * self.loss(loss, rows, device) if alpha else 0.0
         if expert is None:
@@ -103,8 +103,8 @@ class HeldOut:
         return total + (1 - alpha) * mean_loss(shown, shown.sample((0,), len(shown)), expert, rows, device)
 
 
-def _required(instead: Callable[[Path], bool], recorded: int, target: Path) -> None:
-    if not instead(target):
+def _write_required(fallback: Callable[[Path], bool], recorded: int, target: Path) -> None:
+    if not fallback(target):
         raise DataError(
             f"--patience needs something to judge with: episodes of the student's, or two recorded observations; "
             f"there are {recorded}.",
@@ -113,7 +113,7 @@ def _required(instead: Callable[[Path], bool], recorded: int, target: Path) -> N
         )
 
 
-def held_out(recording: Recording) -> NDArray[np.bool_]:
+def held_out_mask(recording: Recording) -> NDArray[np.bool_]:
     """Say of each observation whether it is held out: whole episodes where there are two or more, else stretches."""
     size = len(recording)
     groups = recording.episodes
@@ -122,5 +122,5 @@ def held_out(recording: Recording) -> NDArray[np.bool_]:
     names, firsts = np.unique(groups, return_index=True)
     ordered = names[np.argsort(firsts)]
     count = max(1, round(len(ordered) * SHARE))
-    places = np.linspace(0, len(ordered) - 1, count + 2)[1:-1].round().astype(int) if len(ordered) > 2 else [1]
-    return np.isin(groups, ordered[places])
+    indices = np.linspace(0, len(ordered) - 1, count + 2)[1:-1].round().astype(int) if len(ordered) > 2 else [1]
+    return np.isin(groups, ordered[indices])

@@ -11,13 +11,13 @@ from pydantic import Field
 
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, instead, nearest
-from vlatool.module.batched import BatchedProgram
+from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.module.batched_program import BatchedProgram
+from vlatool.training.feature_distillation import with_hints
 from vlatool.training.flow import CHUNK, check_loops, flow_loss
-from vlatool.training.hinted import with_hints
-from vlatool.training.lesson import Lesson
+from vlatool.training.objective import Objective
 from vlatool.training.rounds import LABEL
-from vlatool.training.sequences import Unroll, answered
+from vlatool.training.sequences import Unroll, outputs_and_labels
 from vlatool.training.stage import TrainingStage
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ class ImitationStage(TrainingStage):
         known = registry.names("losses")
         if self.loss != "auto" and self.loss not in known:
             raise RecipeError(
-                f"Unknown loss '{self.loss}'; {nearest(self.loss, ['auto', *known])}.",
-                instead(self.loss, ["auto", *known]),
+                f"Unknown loss '{self.loss}'; {suggest(self.loss, ['auto', *known])}.",
+                fix_for(self.loss, ["auto", *known]),
             )
         super().check(source, profile)
         if source is not None and self.loss == "kl" and source.manifest.spec.action.kind != "discrete":
@@ -76,28 +76,29 @@ class ImitationStage(TrainingStage):
                 f"leave {asked[0]} out: the actions are compared, along whole episodes",
             )
 
-    def computed(self) -> contextlib.AbstractContextManager[Any]:
+    def compute_context(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the student computes."""
         return contextlib.nullcontext()
 
-    def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
+    def objective(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Objective:
         """The student does with each observation what the teacher did."""
         action = source.manifest.spec.action
         name = self.loss if self.loss != "auto" else "kl" if action.kind == "discrete" else "l1"
         student, distance = BatchedProgram(source.manifest.program, modules), self._distance(name)
 
         def loss(rows: Mapping[str, Any]) -> Tensor:
-            given, wanted = answered(student, rows, action.name, LABEL, self.computed)
+            given, wanted = outputs_and_labels(student, rows, action.name, LABEL, self.compute_context)
             far: Tensor = distance(given.float(), wanted)
             return far
 
         self._check_kept([*student.kept, *teacher.program.kept])
         if self.targets == "flow":
             check_loops(student, teacher.program, action.name, source.manifest.name)
-            turn = flow_loss(student, distance, self.computed)
-            return Lesson(f"flow {name}", modules, turn, judged=loss, turns=True)
+            turn = flow_loss(student, distance, self.compute_context)
+            return Objective(f"flow {name}", modules, turn, judged=loss, turns=True)
         unroll = Unroll(self.window, self.burn_in) if student.kept else None
-        return with_hints(Lesson(name, modules, loss, unroll=unroll), self.hints(), student, source, teacher, self.seed)
+        base = Objective(name, modules, loss, unroll=unroll)
+        return with_hints(base, self.hints(), student, source, teacher, self.seed)
 
     def hints(self) -> dict[str, float]:
         """Return the weight of each hint in the loss."""

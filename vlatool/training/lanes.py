@@ -36,9 +36,9 @@ class Lanes:
         """
         lead, length = int((self.starts - self.firsts).max()), int((self.ends - self.starts).max())
         for time in range(-lead, length):
-            place = self.starts + time
-            counts = (place >= self.starts) & (place < self.ends)
-            yield np.clip(place, self.firsts, self.ends - 1), place <= self.firsts, counts
+            rows = self.starts + time
+            counts = (rows >= self.starts) & (rows < self.ends)
+            yield np.clip(rows, self.firsts, self.ends - 1), rows <= self.firsts, counts
 
 
 def side_by_side(begins: Array, count: int) -> Iterator[Lanes]:
@@ -46,7 +46,7 @@ def side_by_side(begins: Array, count: int) -> Iterator[Lanes]:
 
     Args:
         begins: (N,) whether an episode begins with a row.
-        count: Of lanes.
+        count: count of lanes.
     """
     firsts = np.flatnonzero(begins)
     ends = np.array([*firsts[1:], len(begins)])

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vlatool.errors import DataError, require
-from vlatool.files.edited import whole_file
 from vlatool.files.printable import message_of
-from vlatool.module.batched import no_gradient
+from vlatool.files.user_files import atomic_file
+from vlatool.module.batched_program import no_gradient_error
 from vlatool.module.edits import save_tensors, stream_tensors
 from vlatool.training.best import Best
 from vlatool.training.constraint import Constraint
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 CHECKPOINT = "checkpoint.safetensors"
 CLIP = 1.0
 """Largest norm of the gradient."""
-LOOKS = (0.05, 0.5, 0.95)
+GRADIENT_SAMPLES = (0.05, 0.5, 0.95)
 """Shares of the steps after which the gradients of the terms of a loss are measured, where it has several."""
 WARMUP = 0.05
 """Share of the steps in which the learning rate rises."""
@@ -48,14 +48,14 @@ class Settings:
     """How long and how fast is trained.
 
     Args:
-        steps: Updates of the weights.
-        learning_rate: Its highest value.
-        weight_decay: Of weights with two axes or more, decoupled (AdamW).
-        average: Decay of the exponential moving average of the weights, which is the result.
-        seed: Of the batches.
-        device: On what, and in which precision.
-        checkpoint_s: Seconds between checkpoints.
-        shard: Whether each process holds a part of the weights alone.
+        steps: updates of the weights.
+        learning_rate: its highest value.
+        weight_decay: weight decay of weights with two axes or more, decoupled (AdamW).
+        average: decay of the exponential moving average of the weights, which is the result.
+        seed: seed of the batches.
+        device: device and precision.
+        checkpoint_s: seconds between checkpoints.
+        shard: whether each process holds a part of the weights alone.
     """
 
     steps: int
@@ -83,11 +83,11 @@ class Trainer:
     trained is what runs on the robot.
 
     Args:
-        modules: Graph name -> module.
-        settings: How long and how fast.
-        folder: For checkpoints.
-        group: The processes that train together; the first one writes checkpoints.
-        constraint: What holds of the weights after each step.
+        modules: graph name -> module.
+        settings: how long and how fast.
+        folder: folder for checkpoints.
+        group: the processes that train together; the first one writes checkpoints.
+        constraint: what holds of the weights after each step.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Trainer:
         self.best = Best()
         self.step = 0
         self.losses: list[float] = []
-        self.looks: list[list[float]] = []
+        self.gradient_norms: list[list[float]] = []
         """Number of a step, and the norm of the gradient of each term of its loss."""
         self._start = time.monotonic()
         self._resume()
@@ -122,13 +122,13 @@ class Trainer:
         """Wall-clock time since the training began, of all runs up to their last checkpoints."""
         return time.monotonic() - self._start
 
-    def train(self, until: int, draw: Draw, tell: Callable[[int, float], None]) -> None:
+    def train(self, until: int, draw: Draw, progress: Callable[[int, float], None]) -> None:
         """Take steps until so many are done.
 
         Args:
-            until: Number of the step to stop before.
-            draw: Gives the loss of a batch that the random numbers choose.
-            tell: Called with the number of steps and the mean of the last losses.
+            until: number of the step to stop before.
+            draw: function that returns the loss of a randomly drawn batch.
+            progress: function called with the number of steps and the mean of the last losses.
 
         Raises:
             DataError: when the loss is not finite.
@@ -138,12 +138,12 @@ class Trainer:
         while self.step < until:
             with self._settings.device.computing(), self._shards.computing():
                 self._take_step(draw)
-            tell(self.step, float(np.mean(self.losses[-20:])))
-            if self._due(saved):
+            progress(self.step, float(np.mean(self.losses[-20:])))
+            if self._checkpoint_due(saved):
                 self.save()
                 saved = time.monotonic()
 
-    def _due(self, saved: float) -> bool:
+    def _checkpoint_due(self, saved: float) -> bool:
         """Say whether it is time for a checkpoint, which all processes write together where each holds parts."""
         due = self._group.rank == 0 and time.monotonic() - saved > self._settings.checkpoint_s
         return self._group.total(float(due)) > 0 if self._shards.several else due
@@ -151,10 +151,10 @@ class Trainer:
     def _take_step(self, draw: Draw) -> None:
         self._optimizer.zero_grad()
         random = np.random.default_rng((self._settings.seed, self.step))
-        if isinstance(draw, Mixture) and self.step in {int(share * self._settings.steps) for share in LOOKS}:
-            loss = self._look(draw, random)
+        if isinstance(draw, Mixture) and self.step in {int(share * self._settings.steps) for share in GRADIENT_SAMPLES}:
+            loss = self._measure_gradients(draw, random)
         else:
-            loss = self._shards.summed(self._own_loss(draw(random)), self._group)
+            loss = self._shards.sum_gradients(self._own_loss(draw(random)), self._group)
         if not math.isfinite(loss):
             raise DataError(
                 f"The loss is {loss} in step {self.step + 1} of {self._settings.steps}.",
@@ -166,23 +166,23 @@ class Trainer:
         require("torch", "build").nn.utils.clip_grads_with_norm_(list(self._weights.values()), CLIP, norm)
         with self._constraint.step(self.step + 1):
             self._optimizer.step()
-        self._follow()
+        self._update_average()
         self.step += 1
         self.losses.append(loss)
 
-    def _look(self, mixture: Mixture, random: np.random.Generator) -> float:
+    def _measure_gradients(self, mixture: Mixture, random: np.random.Generator) -> float:
         """Add the gradients of all terms, and remember the norm of each; return the loss."""
         weights, total, norms = list(self._weights.values()), 0.0, []
         sums: list[Tensor | None] = [None] * len(weights)
         for term in mixture.terms:
             self._optimizer.zero_grad()
-            total += self._shards.summed(self._own_loss(term(random)), self._group)
+            total += self._shards.sum_gradients(self._own_loss(term(random)), self._group)
             norms.append(float(self._shards.norm(self._group)))
             sums = [value.grad if before is None else before if value.grad is None else before + value.grad
                     for before, value in zip(sums, weights, strict=True)]  # fmt: skip
         for value, gradient in zip(weights, sums, strict=True):
             value.grad = gradient
-        self.looks.append([self.step + 1, *norms])
+        self.gradient_norms.append([self.step + 1, *norms])
         return total
 
     def _own_loss(self, parts: Iterable[Part]) -> float:
@@ -192,7 +192,7 @@ class Trainer:
             with self._settings.device.casting():
                 loss = compute()
             if not loss.requires_grad:
-                raise no_gradient("let make() return the module that was trained, as it was trained")
+                raise no_gradient_error("let make() return the module that was trained, as it was trained")
             (loss * share).backward()  # type: ignore[no-untyped-call]
             total += share * float(loss.detach())
         return total
@@ -201,7 +201,7 @@ class Trainer:
         """Remember how well the averaged weights do, and the weights where none did better."""
         self.best.look(score, self.step, self._average)
 
-    def _follow(self) -> None:
+    def _update_average(self) -> None:
         """Let the average follow the weights, closely in the first steps."""
         decay = min(self._settings.average, (1 + self.step) / (10 + self.step))
         with require("torch", "build").no_grad():
@@ -218,7 +218,7 @@ class Trainer:
                 self._average[name].copy_(kept)
 
     @contextlib.contextmanager
-    def averaged(self) -> Iterator[None]:
+    def averaged_weights(self) -> Iterator[None]:
         """Let the averaged weights be the weights within the block."""
         self.swap()
         try:
@@ -234,11 +234,11 @@ class Trainer:
     def look(self, look: Callable[[], None]) -> None:
         """Let programs find out together whether their modules take batches, where processes hold parts of weights."""
         if self._shards.several:
-            with self._settings.device.computing(), self._shards.computing(), self._shards.looking():
+            with self._settings.device.computing(), self._shards.computing(), self._shards.probing_batches():
                 look()
 
     def finish(self) -> None:
-        """Put the average in the place of the weights, the best one where that is known; ask for no gradients more.
+        """Replace the weights by their average, the best one where that is known, and stop tracking gradients.
 
         The modules of the first process hold all of them from now on; all processes must come.
         """
@@ -257,14 +257,14 @@ class Trainer:
         Raises:
             OSError: when it cannot be written.
         """
-        shards, tensors = self._shards, sorted(self._kept(), key=lambda each: -each[2].dtype.itemsize)
+        shards, tensors = self._shards, sorted(self._checkpoint_tensors(), key=lambda each: -each[2].dtype.itemsize)
         if self._group.rank:
             for _, name, held in tensors if shards.several else ():
                 shards.whole(name, held)
             return
         about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text(),
-                 "looks": json.dumps(self.looks), "seconds": f"{self.seconds:.3f}"}  # fmt: skip
-        with whole_file(self._file) as draft:
+                 "looks": json.dumps(self.gradient_norms), "seconds": f"{self.seconds:.3f}"}  # fmt: skip
+        with atomic_file(self._file) as draft:
             if not shards.several:
                 save_tensors(
                     draft, {f"{kind}.{name}": held.detach().contiguous() for kind, name, held in tensors}, about
@@ -273,7 +273,7 @@ class Trainer:
             forms = {f"{kind}.{name}": (held.dtype, shards.size(name, held)) for kind, name, held in tensors}
             stream_tensors(draft, forms, (shards.whole(name, held) for _, name, held in tensors), about)
 
-    def _kept(self) -> Iterator[tuple[str, str, Tensor]]:
+    def _checkpoint_tensors(self) -> Iterator[tuple[str, str, Tensor]]:
         """Yield what a checkpoint holds: kind, name of the weight, and tensor, or this process's part of it."""
         for name, value in self._weights.items():
             yield "weight", name, value
@@ -294,17 +294,17 @@ class Trainer:
         safetensors, torch = require("safetensors", "build"), require("torch", "build")
         try:
             with safetensors.safe_open(str(self._file), "pt") as opened, torch.no_grad():
-                self._take(opened)
+                self._load(opened)
         except (safetensors.SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise DataError(
                 f"The checkpoint {self._file} is damaged: {message_of(error)}.",
                 f"remove {self._file.parent}: the training then begins anew",
             ) from error
 
-    def _take(self, opened: Any) -> None:
+    def _load(self, opened: Any) -> None:
         about, names = opened.metadata(), set(opened.keys())
         self.step, self.losses = int(about["step"]), json.loads(about["losses"])
-        self.looks = json.loads(about["looks"])
+        self.gradient_norms = json.loads(about["looks"])
         self._start -= float(about["seconds"])
 
         def part(kind: str, name: str) -> Tensor:

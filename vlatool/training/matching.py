@@ -1,4 +1,4 @@
-"""Which block of a teacher a student's block is compared with."""
+"""Matching of a student's blocks with a teacher's."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.module.blocks import block_names, stacks
 from vlatool.module.edits import BLOCKS, Edit, loses_units, read_edits
 from vlatool.module.torch_policy import unedited_modules
-from vlatool.training.taps import Place
+from vlatool.training.taps import BlockName
 from vlatool.training.teacher import Teacher
 
 if TYPE_CHECKING:
@@ -25,24 +25,24 @@ class Pair:
     """A block of the student, and the teacher's that it is compared with.
 
     Args:
-        stack: Of both.
-        numbers: Of the blocks in it, the student's and the teacher's.
-        ours, theirs: The blocks.
+        stack: stack of both.
+        numbers: numbers of the blocks in it, the student's and the teacher's.
+        ours, theirs: the blocks.
     """
 
     stack: Stack
     numbers: tuple[int, int]
-    ours: Place
-    theirs: Place
+    ours: BlockName
+    theirs: BlockName
 
 
 def pairs_of(modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> list[Pair]:
     """Return the pairs of all stacks that student and teacher have under the same name.
 
     Args:
-        modules: The student's, graph name -> module.
-        source: The student's bundle.
-        teacher: The teacher.
+        modules: the student's, graph name -> module.
+        source: the student's bundle.
+        teacher: the teacher.
     """
     edits, found = read_edits(source), list[Pair]()
     same_factory = teacher.bundle.manifest.source == source.manifest.source
@@ -64,9 +64,9 @@ def teacher_blocks(count: int, of: int, kept: Sequence[int] | None = None) -> li
     layers so: ``g(m) = m N / M``).
 
     Args:
-        count: Of the student's blocks.
-        of: Of the teacher's.
-        kept: Which of the teacher's blocks the student's are, where that is known.
+        count: count of the student's blocks.
+        of: number of the teacher's blocks.
+        kept: indices of the teacher's blocks that the student's are, if known.
 
     Example:
         >>> teacher_blocks(3, 6), teacher_blocks(3, 6, (0, 1, 4))

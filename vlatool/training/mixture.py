@@ -20,7 +20,7 @@ class Mixture:
     """Draws the parts of all terms, one term after the other.
 
     Args:
-        terms: Share of the loss, and what draws the batch of that term.
+        terms: share of the loss, and what draws the batch of that term.
     """
 
     def __init__(self, terms: Sequence[tuple[float, Draw]]) -> None:

@@ -18,10 +18,10 @@ def gru_cell(linear: Linear, given: Tensor, state: Tensor, *weights: Any) -> Ten
     """Return the state after a step of ``torch.nn.GRUCell``: (..., H).
 
     Args:
-        linear: Computes the products.
+        linear: computes the products.
         given: (..., I).
         state: (..., H).
-        weights: Of the input (3 H, I), of the state (3 H, H), and their biases (3 H), None or left out for none.
+        weights: those of the input (3 H, I), of the state (3 H, H), and their biases (3 H), None or left out for none.
     """
     read, write, new = _products(linear, given, weights, 0).chunk(3, -1)
     read_state, write_state, new_state = _products(linear, state, weights, 1).chunk(3, -1)

@@ -1,4 +1,4 @@
-"""How a training went, as a report beside the bundle: it holds times, and is no part of the bundle's identity."""
+"""The report of a training, beside the bundle: it has times, and is not part of the bundle's identity."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from vlatool.module.stage import TRAINING
 from vlatool.render import write_reports
 from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Report, Row
 from vlatool.training.forecast import duration
+from vlatool.training.generalization_gap import ADVICE_RATIO, LOSS_KEY, NEW_ROUND, PREVIOUS_ROUND
 from vlatool.training.supervision import teacher_lines, teacher_record
-from vlatool.training.unseen import APART, BEFORE, KEY, NEW
 
 Record = dict[str, Any]
 
@@ -23,9 +23,9 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
     """Write ``reports/`` of a bundle that was trained.
 
     Args:
-        made: With ``module/training.json``.
-        seconds: What the training took, on the wall clock.
-        command: The command line.
+        made: bundle with ``module/training.json``.
+        seconds: what the training took, on the wall clock.
+        command: the command line.
 
     Raises:
         OSError: when it cannot be written.
@@ -71,7 +71,7 @@ def _warning(training: Mapping[str, Any]) -> tuple[str, ...]:
     in_windows = sum(losses[-few:]) / few
     if about["after"] > about["before"]:
         worse = "it is further from its teacher than before the training"
-    elif about["after"] > APART * in_windows:
+    elif about["after"] > ADVICE_RATIO * in_windows:
         worse = f"it is {about['after'] / in_windows:.1f} times as far from its teacher as in its windows"
     else:
         return ()
@@ -86,10 +86,10 @@ def _round(about: Record) -> Record:
     episodes = about.get("episodes")
     success = f"{about['successes'] / episodes:.1%}" if episodes else None
     who = about["actor"] if episodes else "batches" if about.get("yielded") else "recordings"
-    losses = about.get(KEY, {})
+    losses = about.get(LOSS_KEY, {})
     return {"before step": about["step"] + 1, "who acted": who, "episodes": episodes, "success": success,
-            "observations": about["observations"], "loss, not trained on": _digits(losses.get(NEW)),
-            "of the round before": _digits(losses.get(BEFORE))}  # fmt: skip
+            "observations": about["observations"], "loss, not trained on": _digits(losses.get(NEW_ROUND)),
+            "of the round before": _digits(losses.get(PREVIOUS_ROUND))}  # fmt: skip
 
 
 def _digits(loss: float | None) -> float | None:

@@ -13,7 +13,7 @@ from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.frames import file_of
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, require
-from vlatool.module.batched import PATH, BatchedProgram, drawn
+from vlatool.module.batched_program import PATH, BatchedProgram, draw_noise
 from vlatool.module.origin import origin_of
 from vlatool.stage.base import Context
 from vlatool.training.device import on_device
@@ -42,7 +42,7 @@ def scene_of(source: Bundle) -> tuple[EpisodesJob, tuple[str, ...]] | None:
     return EpisodesJob(str(make), str(origin.folder), "", (), timeout_s=timeout), tuple(tasks)
 
 
-class Counted(Protocol):
+class Observations(Protocol):
     """Observations, each read when it is its turn."""
 
     def __len__(self) -> int: ...
@@ -50,15 +50,15 @@ class Counted(Protocol):
     def __iter__(self) -> Iterator[Any]: ...
 
 
-def write_recorded(
-    encode: Callable[[Any], Mapping[str, Array]], observations: Counted, target: Path, begins: Array | None = None
+def write_observations(
+    encode: Callable[[Any], Mapping[str, Array]], observations: Observations, target: Path, begins: Array | None = None
 ) -> None:
     """Write encoded observations as a part of a round, one after the other: they need not fit into the memory.
 
     Args:
-        encode: Observation -> what the policy takes.
-        observations: In the order of their episodes, where these matter.
-        target: Folder of the part.
+        encode: observation -> what the policy takes.
+        observations: observations in the order of their episodes, where these matter.
+        target: folder of the part.
         begins: (N,) whether an episode begins with an observation; None where that does not matter.
     """
     if begins is not None and len(begins):
@@ -73,20 +73,20 @@ def write_recorded(
             kept[name][row] = value[0]
 
 
-def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: BatchedProgram, seed: Sequence[int],
-          context: Context, *, turns: bool = False) -> list[str]:  # fmt: skip
+def write_labels(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: BatchedProgram,
+                 seed: Sequence[int], context: Context, *, turns: bool = False) -> list[str]:  # fmt: skip
     """Write what the teacher gives for every row of a round, and the noise that it drew, beside the inputs.
 
     A teacher that keeps values is run along the episodes.
 
     Args:
-        frames: Folder of the round.
-        names: Inputs of the policy.
-        outputs: Outputs of the policy.
-        teacher: Its program.
-        seed: Of the noise.
-        context: For progress.
-        turns: Also write one turn of the teacher's loop for each row, drawn at random.
+        frames: folder of the round.
+        names: inputs of the policy.
+        outputs: outputs of the policy.
+        teacher: its program.
+        seed: seed of the noise.
+        context: context of the run, for progress.
+        turns: whether to write also one random turn of the teacher's loop for each row.
 
     Returns:
         Names of the labels.
@@ -101,7 +101,7 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
     kept: dict[str, Any] = {}
     begins = np.load(begins_file(frames)) if teacher.kept else None
     with torch.no_grad():
-        for key, rows, own, values, noise in _shown(teacher, inputs, begins, seed, turns=turns):
+        for key, rows, own, values, noise in _teacher_batches(teacher, inputs, begins, seed, turns=turns):
             labels = {name: values[name] for name in outputs}
             labels |= _turns(teacher, values, np.random.default_rng((*key, 1))) if turns else {}
             given = {LABEL + name: value for name, value in labels.items()}
@@ -112,41 +112,41 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
                 if value.is_floating_point() and not bool(torch.isfinite(value).all()):
                     raise DataError("The teacher gives an action that is not finite.", "look at the recordings")
                 kept[name][rows[own]] = value.cpu().numpy()[own]
-            context.tell(f"the teacher labels {count} observations", (int(rows[0]) + 1) / count)
+            context.progress(f"the teacher labels {count} observations", (int(rows[0]) + 1) / count)
     return [name.removeprefix(LABEL) for name in kept if name.startswith(LABEL)]
 
 
-def _shown(
+def _teacher_batches(
     teacher: BatchedProgram, inputs: Mapping[str, Array], begins: Array | None, seed: Sequence[int], *, turns: bool
 ) -> Iterator[tuple[Sequence[int], Array, Array, dict[str, Tensor], dict[str, Tensor]]]:
     """Yield what the teacher was shown: seed, rows (B,), which of them to write, its values, and the noise.
 
     Args:
-        teacher: Its program.
-        inputs: Name -> (N, ...).
+        teacher: its program.
+        inputs: name -> (N, ...).
         begins: (N,) whether an episode begins with a row; None for a teacher that keeps nothing.
-        seed: Of the noise.
-        turns: Whether what a loop carries is among the values.
+        seed: seed of the noise.
+        turns: whether what a loop carries is among the values.
     """
     run = teacher.path if turns else teacher.run
     if begins is None:
         count = len(next(iter(inputs.values())))
         for start in range(0, count, ROWS):
             rows, key = np.arange(start, min(count, start + ROWS)), (*seed, start)
-            noise = drawn(teacher.noise, len(rows), np.random.default_rng(key))
-            yield key, rows, np.ones(len(rows), np.bool_), run(_at(inputs, rows), noise), noise
+            noise = draw_noise(teacher.noise, len(rows), np.random.default_rng(key))
+            yield key, rows, np.ones(len(rows), np.bool_), run(_rows_at(inputs, rows), noise), noise
         return
     for lanes in side_by_side(begins, ROWS):
         held: dict[str, Tensor] = {}
         for time, (rows, new, counts) in enumerate(lanes.steps()):
             key = (*seed, int(lanes.firsts[0]), time)
-            noise = drawn(teacher.noise, len(rows), np.random.default_rng(key))
-            values = run(_at(inputs, rows), {**noise, **reset(held, new)})
+            noise = draw_noise(teacher.noise, len(rows), np.random.default_rng(key))
+            values = run(_rows_at(inputs, rows), {**noise, **reset(held, new)})
             held = teacher.kept_of(values)
             yield key, rows, counts, values, noise
 
 
-def _at(inputs: Mapping[str, Array], rows: Array) -> dict[str, Tensor]:
+def _rows_at(inputs: Mapping[str, Array], rows: Array) -> dict[str, Tensor]:
     return {name: on_device(np.array(values[rows])) for name, values in inputs.items()}
 
 
@@ -176,9 +176,9 @@ def next_round(frames: Frames, number: int, fill: Any) -> None:
     """Use a round; write it first when no earlier run did.
 
     Args:
-        frames: All rounds.
-        number: Of the round.
-        fill: Called with the folder to write into.
+        frames: all rounds.
+        number: number of the round.
+        fill: function called with the folder to write into.
     """
     if not frames.has(number):
         draft = frames.draft(number)

@@ -12,7 +12,7 @@ import numpy as np
 
 from vlatool.data import BEGINS, Recording
 from vlatool.errors import DataError, require
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.training.device import on_device
 from vlatool.training.frames import Array, Frames
 from vlatool.training.lanes import Lanes, reset
@@ -21,7 +21,7 @@ from vlatool.training.rounds import NOISE, tensors
 if TYPE_CHECKING:
     from torch import Tensor
 
-BORDERS = "record 'episode': a whole number for each observation, another one where the policy is reset"
+RECORD_EPISODES = "record 'episode': a whole number for each observation, another one where the policy is reset"
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Unroll:
     """How far a training goes back in time.
 
     Args:
-        window: Consecutive observations that gradients pass through (truncated back-propagation through time: Williams
+        window: consecutive observations that gradients pass through (truncated back-propagation through time: Williams
             and Peng, 1990).
-        burn_in: Observations before a window that only bring what is kept up to date (Kapturowski et al., R2D2, ICLR
+        burn_in: observations before a window that only bring what is kept up to date (Kapturowski et al., R2D2, ICLR
             2019); all since the beginning of the episode when None.
     """
 
@@ -40,12 +40,12 @@ class Unroll:
 
 
 @dataclass(frozen=True)
-class Stretches:
-    """What a loss takes in the place of rows: where they are, and which ones.
+class EpisodeWindows:
+    """What a loss takes instead of rows: the rows, and the windows in them.
 
     Args:
-        frames: All rows.
-        lanes: Those that are run.
+        frames: all rows.
+        lanes: lanes that are run.
     """
 
     frames: Frames
@@ -58,8 +58,8 @@ class Sequences(Frames):
     Places are (N, 3): first row, first one that counts, and the one after the last.
 
     Args:
-        folder: Where the rounds are.
-        unroll: Length of what is drawn.
+        folder: where the rounds are.
+        unroll: length of what is drawn.
     """
 
     def __init__(self, folder: Path, unroll: Unroll) -> None:
@@ -78,9 +78,9 @@ class Sequences(Frames):
         firsts = begin if burn_in is None else np.maximum(begin, starts - burn_in)
         return np.stack([firsts, starts, stops], 1)
 
-    def weigh(self, places: Array) -> int:
+    def row_count(self, windows: Array) -> int:
         """Return how many rows count."""
-        return int((places[:, 2] - places[:, 1]).sum())
+        return int((windows[:, 2] - windows[:, 1]).sum())
 
     def sample(self, numbers: Sequence[int], most: int) -> Array:
         """Return whole episodes, spread over those of some rounds, until there are so many rows."""
@@ -90,28 +90,28 @@ class Sequences(Frames):
         chosen = episodes[np.unique(np.linspace(0, len(episodes) - 1, count).astype(int))]
         return np.stack([chosen[:, 0], chosen[:, 0], chosen[:, 1]], 1)
 
-    def batch(self, places: Array) -> Stretches:
+    def batch(self, windows: Array) -> EpisodeWindows:
         """Return what a loss takes of drawn places."""
-        return Stretches(self, Lanes(*places.T))
+        return EpisodeWindows(self, Lanes(*windows.T))
 
-    def kept(self, most: int) -> dict[str, Array]:
+    def sample_rows(self, most: int) -> dict[str, Array]:
         """Return rows of whole episodes, the last one cut short, and which of them begin one."""
-        places = self.sample(range(self.count), most)
-        rows = np.concatenate([np.arange(first, end) for first, _, end in places])[:most]
-        return {**self.rows(rows), BEGINS: np.isin(rows, places[:, 0])}
+        episodes = self.sample(range(self.count), most)
+        rows = np.concatenate([np.arange(first, end) for first, _, end in episodes])[:most]
+        return {**self.rows(rows), BEGINS: np.isin(rows, episodes[:, 0])}
 
     def _episodes(self, numbers: Sequence[int]) -> Array:
         """Return the first row of each episode of some rounds, and the one after its last: (E, 2)."""
         found = []
         for number in numbers:
             firsts = self.begins(number)
-            found.append(np.stack([firsts, [*firsts[1:], self.places(number)[-1] + 1]], 1))
+            found.append(np.stack([firsts, [*firsts[1:], self.row_indices(number)[-1] + 1]], 1))
         return np.concatenate(found)
 
 
-def answered(
+def outputs_and_labels(
     program: BatchedProgram,
-    rows: Mapping[str, Any] | Stretches,
+    rows: Mapping[str, Any] | EpisodeWindows,
     name: str,
     label: str,
     computed: Callable[[], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
@@ -119,14 +119,14 @@ def answered(
     """Run a student; return an output for each row that counts, and what was said of it.
 
     Args:
-        program: The student.
-        rows: Of a batch, name -> (B, ...); or stretches of episodes, along which it keeps its values.
-        name: Of the output.
-        label: Prefix of who said so.
-        computed: Gives the context in which the student computes.
+        program: the student.
+        rows: rows of a batch, name -> (B, ...); or stretches of episodes, along which it keeps its values.
+        name: name of the output.
+        label: prefix of who said so.
+        computed: function that returns the context in which the student computes.
     """
-    if isinstance(rows, Stretches):
-        return _answered_along(program, rows, name, label, computed)
+    if isinstance(rows, EpisodeWindows):
+        return _outputs_along_episodes(program, rows, name, label, computed)
     inputs, noise = tensors(rows), tensors(rows, NOISE)
     program.look(inputs, noise)
     with computed():
@@ -134,9 +134,9 @@ def answered(
     return values[name], tensors(rows, label)[name]
 
 
-def _answered_along(
+def _outputs_along_episodes(
     program: BatchedProgram,
-    stretches: Stretches,
+    stretches: EpisodeWindows,
     name: str,
     label: str,
     computed: Callable[[], contextlib.AbstractContextManager[Any]],
@@ -162,14 +162,14 @@ def episode_begins(recording: Recording) -> Array:
     """Say of each observation whether an episode begins with it: (N,).
 
     Raises:
-        DataError: when that is not recorded, or the observations are no whole episodes.
+        DataError: when that is not recorded, or the observations are not complete episodes.
     """
     whole = recording.whole or recording
     if recording.episodes is None:
         raise DataError(
             f"{recording.path} does not say where episodes begin, which the training of a policy that keeps values "
             "from step to step must know.",
-            BORDERS,
+            RECORD_EPISODES,
         )
     begins = recording.begins()
     torn = np.flatnonzero(begins & ~whole.begins()[_places(recording)])
@@ -184,16 +184,16 @@ def episode_begins(recording: Recording) -> Array:
 
 
 def _places(recording: Recording) -> Array:
-    return np.arange(len(recording)) if recording.places is None else recording.places
+    return np.arange(len(recording)) if recording.indices is None else recording.indices
 
 
-def whole_episodes(begins: Array, share: float, order: Callable[[int], Array]) -> Array:
+def select_episodes(begins: Array, share: float, order: Callable[[int], Array]) -> Array:
     """Say of each row whether it is used: whole episodes, at least one, of about a share of all rows; (N,).
 
     Args:
         begins: (N,) whether an episode begins with a row.
-        share: Of the rows.
-        order: Number of episodes -> in which order they are taken.
+        share: share of the rows.
+        order: number of episodes -> in which order they are taken.
     """
     episodes = np.cumsum(begins) - 1
     sizes = np.bincount(episodes)

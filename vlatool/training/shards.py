@@ -16,13 +16,13 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import RecipeError, SourceError, require
-from vlatool.training.group import AGAIN, LOST, Group, lost_told
+from vlatool.training.group import LOST_PROCESS, RUN_AGAIN, Group, map_lost_process
 from vlatool.training.units import cut_units, owners_of
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-BETWEEN = ("/gloo/", "NCCL", "ncclUnhandled", "Connection closed by peer", "Connection reset by peer")
+COMMUNICATION_ERRORS = ("/gloo/", "NCCL", "ncclUnhandled", "Connection closed by peer", "Connection reset by peer")
 """Parts of messages of torch.distributed."""
 LEAVE = "leave --shard out: every process then holds all weights"
 
@@ -31,7 +31,7 @@ class Shards:
     """What a process holds of each weight: all of it here.
 
     Args:
-        parameters: Name -> weight, as the modules have it.
+        parameters: name -> weight, as the modules have it.
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter]) -> None:
@@ -43,9 +43,9 @@ class Shards:
         """Whether processes hold parts."""
         return False
 
-    def summed(self, loss: float, group: Group) -> float:
+    def sum_gradients(self, loss: float, group: Group) -> float:
         """Add gradients up after ``backward``, so that each held tensor has its own; return the sum of the losses."""
-        return group.summed(loss, list(self.held.values()))
+        return group.sum_gradients(loss, list(self.held.values()))
 
     def norm(self, group: Group) -> Tensor:
         """Return the norm of the gradient over all weights."""
@@ -70,7 +70,7 @@ class Shards:
         """Let modules hold whole weights; all processes must come.
 
         Args:
-            keep: Whether they do in this process; else it gives its parts alone.
+            keep: whether they do in this process; else it gives its parts alone.
         """
 
     @contextlib.contextmanager
@@ -79,7 +79,7 @@ class Shards:
         yield
 
     @contextlib.contextmanager
-    def looking(self) -> Iterator[None]:
+    def probing_batches(self) -> Iterator[None]:
         """Let programs find out whether their modules take batches, with the same rows in every process."""
         yield
 
@@ -93,8 +93,8 @@ class Parts(Shards):
     """What a process holds of each weight: its part.
 
     Args:
-        modules: Graph name -> module, which is changed in place.
-        group: The processes.
+        modules: graph name -> module, which is changed in place.
+        group: the processes.
 
     Raises:
         RecipeError: when no weight can be cut.
@@ -103,11 +103,11 @@ class Parts(Shards):
     def __init__(self, modules: Mapping[str, nn.Module], group: Group) -> None:
         torch = require("torch", "build")
         self._tensor = require("torch.distributed.tensor", "build").DTensor
-        trained_in(modules)
-        with lost_told():
+        trainable_weights(modules)
+        with map_lost_process():
             self._root = cut_units(modules, group)
-        _give_back()
-        weights = trained_in(modules)
+        _release_memory()
+        weights = trainable_weights(modules)
         self._cut: dict[str, Any] = {name: value for name, value in weights.items() if isinstance(value, self._tensor)}
         if not self._cut:
             raise RecipeError(
@@ -124,14 +124,14 @@ class Parts(Shards):
         """Whether processes hold parts."""
         return True
 
-    def summed(self, loss: float, group: Group) -> float:
+    def sum_gradients(self, loss: float, group: Group) -> float:
         """Add up the gradients of weights that are whole, and take those of parts, which are added up already."""
         with require("torch", "build").no_grad():
             for name, value in self._cut.items():
                 gradient: Any = value.grad
                 if gradient is not None:
                     self.held[name].grad, value.grad = gradient.to_local(), None
-        return group.summed(loss, [value for name, value in self.held.items() if name not in self._cut])
+        return group.sum_gradients(loss, [value for name, value in self.held.items() if name not in self._cut])
 
     def norm(self, group: Group) -> Tensor:
         """Return the norm of the gradient over all parts of all weights."""
@@ -157,7 +157,7 @@ class Parts(Shards):
         if name not in self._cut or not part.dim():
             return part
         value: Any = self._cut[name]
-        with lost_told(), require("torch", "build").no_grad():
+        with map_lost_process(), require("torch", "build").no_grad():
             rows = self._tensor.from_local(
                 part.detach(), value.device_mesh, value.placements, run_check=False, shape=value.shape,
                 stride=value.stride(),
@@ -170,9 +170,9 @@ class Parts(Shards):
         return list(self._cut[name].shape if name in self._cut and part.dim() else part.shape)
 
     def gather(self, *, keep: bool) -> None:
-        """Gather one weight after the other; what is gathered is no part of the training."""
+        """Gather one weight after the other; gathered weights are not part of the training."""
         parameter = require("torch", "build").nn.Parameter
-        _give_back()
+        _release_memory()
         for name, value in self._cut.items():
             whole = self.whole(name, self.held[name])
             if keep:
@@ -202,12 +202,12 @@ class Parts(Shards):
         try:
             yield
         except (RuntimeError, SourceError) as error:
-            if _is_between(error):
-                raise SourceError(LOST, AGAIN) from error
+            if _is_communication_error(error):
+                raise SourceError(LOST_PROCESS, RUN_AGAIN) from error
             raise
 
     @contextlib.contextmanager
-    def looking(self) -> Iterator[None]:
+    def probing_batches(self) -> Iterator[None]:
         """Begin anew afterwards: a module that takes no batches may fail while its weights are whole.
 
         Raises:
@@ -223,26 +223,26 @@ class Parts(Shards):
         self._root.reset_iter_state()
 
 
-def _give_back() -> None:
+def _release_memory() -> None:
     """Let the system have the memory of what was freed, such as what was loaded whole; glibc would keep it."""
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _is_between(error: Exception) -> bool:
+def _is_communication_error(error: Exception) -> bool:
     """Say whether an error is of what connects processes: the modules of a user run in the midst of it."""
-    return any(name in str(error) for name in BETWEEN)
+    return any(name in str(error) for name in COMMUNICATION_ERRORS)
 
 
 def shards_of(modules: Mapping[str, nn.Module], group: Group, *, cut: bool) -> Shards:
     """Return what this process holds of the weights of modules, all of which ask for gradients from now on."""
     if cut:
         return Parts(modules, group)
-    return Shards(trained_in(modules))
+    return Shards(trainable_weights(modules))
 
 
-def trained_in(modules: Mapping[str, nn.Module]) -> dict[str, nn.Parameter]:
+def trainable_weights(modules: Mapping[str, nn.Module]) -> dict[str, nn.Parameter]:
     """Return name -> weight of all that is trained; one that several graphs share comes once."""
     found: dict[int, tuple[str, nn.Parameter]] = {}
     for graph, module in modules.items():

@@ -15,29 +15,28 @@ from vlatool.bundle.bundle import MANIFEST, REPORTS, Bundle
 from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import OutputError, RecipeError, require
 from vlatool.files.printable import file_of
-from vlatool.files.work import forget, work_directory
+from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.machine import host
-from vlatool.module.description import description_file
 from vlatool.module.edits import is_changed
-from vlatool.module.stage import TRAINING, Changed, ModuleStage
+from vlatool.module.source import claimed_source
+from vlatool.module.stage import TRAINING, ModuleChanges, ModuleStage
 from vlatool.module.zeros import has_zeros, sparse_weights, zero_share
 from vlatool.stage.base import Context, source_of
 from vlatool.stage.cache import STREAMS
 from vlatool.training.constraint import KeptZeros
-from vlatool.training.crew import crew_of
-from vlatool.training.device import Asked, Device, device_of
+from vlatool.training.device import Device, DeviceChoice, device_of
 from vlatool.training.events import check_events
-from vlatool.training.lesson import Lesson
+from vlatool.training.generalization_gap import gap_lines
+from vlatool.training.launcher import launch_processes
 from vlatool.training.loop import Settings, seconds_of
+from vlatool.training.objective import Objective
 from vlatool.training.report import along_lines, write_training_report
 from vlatool.training.rounds import scene_of
 from vlatool.training.session import Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
-from vlatool.training.teacher import Teacher, check_teacher, teacher_source
-from vlatool.training.torchrun import launched
-from vlatool.training.unseen import unseen_lines
-from vlatool.training.yielded import rows_asked
-from vlatool.user_code import trust
+from vlatool.training.teacher import Teacher, check_teacher
+from vlatool.training.torchrun import current_launch
+from vlatool.training.user_batches import requested_rows
 
 if TYPE_CHECKING:
     from torch import nn
@@ -92,7 +91,7 @@ class TrainingStage(ModuleStage):
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto", description="of matrix products in training; bfloat16 where the device has it"
     )
-    device: Asked = Field("auto", description="what computes: a GPU where torch finds one, else the processor")
+    device: DeviceChoice = Field("auto", description="what computes: a GPU where torch finds one, else the processor")
     threads: int = Field(0, ge=0, description="of torch, over all processes; all cores of this process when 0")
     processes: int = Field(1, ge=1, le=64, description="that share each batch, and the threads")
     shard: bool = Field(
@@ -107,18 +106,18 @@ class TrainingStage(ModuleStage):
         """The teacher's manifest, or all that it is made of where it is a policy."""
         if self.teacher is None:
             return ()
-        source = teacher_source(self.teacher)
+        source = claimed_source(self.teacher)
         return (self.teacher / MANIFEST,) if source is None else source.inputs()
 
     def key(self, source_hash: str) -> str:
         """Return the cache key, with that of a teacher that is a policy: it knows its large weights."""
-        teacher = teacher_source(self.teacher) if self.teacher else None
+        teacher = claimed_source(self.teacher) if self.teacher else None
         return super().key(f"{source_hash} {teacher.key('')}" if teacher else source_hash)
 
-    def named(self) -> Self:
+    def trust_code(self) -> Self:
         """Allow the code of a teacher that is a policy to run in this process: the user named its folder."""
-        if self.teacher and teacher_source(self.teacher):
-            trust.name(description_file(self.teacher).parent, None if self.teacher.is_dir() else self.teacher)
+        if self.teacher and (source := claimed_source(self.teacher)):
+            source.trust_code()
         return self
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
@@ -215,11 +214,11 @@ class TrainingStage(ModuleStage):
         """Return the seeds of the episodes that are played of each task, as many as there are at most."""
         return range(self.first_seed, self.plan().seed(1 + self._rounds(), tasks))
 
-    def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
+    def objective(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Objective:
         """Return what the student does with a batch, and how far that is from what the teacher says of it."""
         raise NotImplementedError(self.name())
 
-    def told(self, made: Bundle) -> tuple[str, ...]:
+    def summary(self, made: Bundle) -> tuple[str, ...]:
         """Say what the student learnt from, and how far it came."""
         training = json.loads(made.file(TRAINING).read_bytes())
         losses, last = training["losses"], max(1, len(training["losses"]) // 20)
@@ -233,10 +232,10 @@ class TrainingStage(ModuleStage):
             *along_lines(training),
             f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
-            *unseen_lines(training["rounds"]),
-            *_compared(training.get("hints", {})),
+            *gap_lines(training["rounds"]),
+            *_hint_lines(training.get("hints", {})),
             *teacher_lines(training),
-            *_judged(training.get("judged")),
+            *_selection_lines(training.get("judged")),
             *(
                 [f"weights that pruning set to zero are still zero: {zero_share(made):.1%} of all"]
                 if has_zeros(made) and not self.leaves_zeros
@@ -246,19 +245,19 @@ class TrainingStage(ModuleStage):
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Say how it was trained, where the loss curve is, and how to go on."""
-        return (*self.told(made), *curve_lines(made), *super().lines(made))
+        return (*self.summary(made), *curve_lines(made), *super().lines(made))
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Train the modules in place."""
         torch = require("torch", "build")
-        before, launch = torch.get_num_threads(), launched()
+        before, launch = torch.get_num_threads(), current_launch()
         here = launch.local_size if launch and not self.threads else self.processes
         torch.set_num_threads(max(1, (self.threads or before) // here))
         try:
-            with work_directory(self._place(source)) as place:
-                return self._trained(modules, source, place, context)
+            with work_directory(self._work_folder(source)) as folder:
+                return self._train(modules, source, folder, context)
         except OSError as error:  # of what is kept until the bundle is written, not of the bundle
-            where = file_of(error) or self._place(source)
+            where = file_of(error) or self._work_folder(source)
             raise OutputError(
                 f"The training cannot be kept: {where}: {error.strerror or error}.",
                 "make room there, or name another cache (VLATOOL_CACHE); the same command goes on from its last "
@@ -267,26 +266,26 @@ class TrainingStage(ModuleStage):
         finally:
             torch.set_num_threads(before)
 
-    def _trained(self, modules: Mapping[str, nn.Module], source: Bundle, place: Path, context: Context) -> Changed:
+    def _train(self, modules: Mapping[str, nn.Module], source: Bundle, folder: Path, context: Context) -> ModuleChanges:
         plays = self.episodes > 0 and scene_of(source) is not None
-        asked = rows_asked(self.from_batches, source, plays) if self.supervision().alpha else 0
-        plan = replace(self.plan(), yielded=asked)
-        teacher, lesson = self.prepared(modules, source)
-        settings, programs = self.settings(), (lesson.trained, teacher.program.modules)
+        asked = requested_rows(self.from_batches, source, plays) if self.supervision().alpha else 0
+        plan = replace(self.plan(), user_rows=asked)
+        teacher, objective = self.prepare_objective(modules, source)
+        settings, programs = self.settings(), (objective.trainable, teacher.program.modules)
         settings.device.choose(0)
-        crew_asked = self._job(source), self.processes, place, self.runs(source), settings.device.name
-        with settings.device.holding(*programs), crew_of(*crew_asked) as crew:
-            session = Session(plan, settings, lesson, source, teacher, place, context, crew)
+        launch_arguments = self._job(source), self.processes, folder, self.runs(source), settings.device.name
+        with settings.device.holding(*programs), launch_processes(*launch_arguments) as processes:
+            session = Session(plan, settings, objective, source, teacher, folder, context, processes)
             training = session.run()
-            return Changed(training=training, played=session.observations(self.keeps) if self.keeps else None)
+            return ModuleChanges(training=training, played=session.observations(self.keeps) if self.keeps else None)
 
-    def prepared(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Lesson]:
+    def prepare_objective(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Objective]:
         """Return the teacher of a student's modules, and what it teaches; every process of a training has its own."""
         teacher = Teacher.of(source, self.teacher, modules)
-        lesson = self.lesson(modules, source, teacher)
-        if lesson.constraint is None and has_zeros(source):
-            lesson = replace(lesson, constraint=KeptZeros(sparse_weights(modules.values())))
-        return teacher, lesson
+        objective = self.objective(modules, source, teacher)
+        if objective.constraint is None and has_zeros(source):
+            objective = replace(objective, constraint=KeptZeros(sparse_weights(modules.values())))
+        return teacher, objective
 
     def settings(self) -> Settings:
         """Return how long and how fast is trained."""
@@ -295,7 +294,7 @@ class TrainingStage(ModuleStage):
         )
 
     def _device(self) -> Device:
-        launch = launched()
+        launch = current_launch()
         return device_of(self.device, self.precision, self.processes, launch.local_size if launch else None)
 
     def supervision(self) -> Supervision:
@@ -312,20 +311,20 @@ class TrainingStage(ModuleStage):
     def _job(self, source: Bundle) -> dict[str, Any]:
         """Return what another process of the training needs to know."""
         threads = require("torch", "build").get_num_threads()
-        place = str(source.path.absolute())
-        return {"stage": self.name(), "options": self.given(), "source": place, "threads": threads}
+        path = str(source.path.absolute())
+        return {"stage": self.name(), "options": self.explicit_options(), "source": path, "threads": threads}
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Train; what a run that is killed goes on from is there until the result is written."""
         if context.events:
             check_events(context.events)
         made = super().run(source, out, context)
-        place = self._place(source_of(source, self.name()))
-        write_training_report(made, seconds_of(place), context.command)
-        forget(place)
+        folder = self._work_folder(source_of(source, self.name()))
+        write_training_report(made, seconds_of(folder), context.command)
+        remove_work(folder)
         return made
 
-    def _place(self, source: Bundle) -> Path:
+    def _work_folder(self, source: Bundle) -> Path:
         return host.cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
 
 
@@ -335,21 +334,21 @@ def curve_lines(made: Bundle) -> tuple[str, ...]:
     return (f"loss curve: {page}",) if page.is_file() else ()
 
 
-def _compared(hints: Mapping[str, Any]) -> tuple[str, ...]:
+def _hint_lines(hints: Mapping[str, Any]) -> tuple[str, ...]:
     """Say which blocks were compared with the teacher's, and which stacks were not."""
     lines = []
     for name, about in hints.items():
         blocks: dict[str, list[str]] = {}
         for graph, stack, ours, theirs in about["blocks"]:
             blocks.setdefault(f"{graph} {stack}".strip(), []).append(f"{ours}:{theirs}")
-        told = "; ".join(f"{stack} {' '.join(pairs)}" for stack, pairs in blocks.items())
-        lines.append(f"{name} of blocks (student:teacher): {told}")
+        stacks = "; ".join(f"{stack} {' '.join(pairs)}" for stack, pairs in blocks.items())
+        lines.append(f"{name} of blocks (student:teacher): {stacks}")
         lines += [f"{name}: {f'{graph} {stack}'.strip()} left out, {why}" for graph, stack, why in
                   about.get("left_out", ())]  # fmt: skip
     return tuple(lines)
 
 
-def _judged(judged: Mapping[str, Any] | None) -> tuple[str, ...]:
+def _selection_lines(judged: Mapping[str, Any] | None) -> tuple[str, ...]:
     """Say by what the weights were chosen, if they were."""
     if judged is None:
         return ()

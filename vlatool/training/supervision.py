@@ -1,4 +1,4 @@
-"""Who says what is right in a training, and how much the teacher counts: in options, and in words."""
+"""The supervision of a training: shares of teacher and expert, as options and in words."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Supervision:
     """Who says what is right.
 
     Args:
-        alpha: Share of the teacher's term in the loss; the rest is that of the expert's recorded actions.
-        label_share: Share of the recorded observations whose expert's actions are used.
+        alpha: share of the teacher's term in the loss; the rest is that of the expert's recorded actions.
+        label_share: share of the recorded observations whose expert's actions are used.
         control: ``none``, or ``noise``: the teacher's labels are those of other observations.
     """
 
@@ -38,7 +38,7 @@ class Supervision:
         """Return what a training says of its teacher, as JSON values.
 
         Args:
-            looks: Step, norm of the gradient of the teacher's term, and of the expert's, each with its share of the
+            looks: step, norm of the gradient of the teacher's term, and of the expert's, each with its share of the
                 loss, wherever both were measured.
             labels: ``used`` and ``recorded`` observations with an expert's action; empty without an expert.
 
@@ -70,7 +70,7 @@ def teacher_lines(training: Mapping[str, Any]) -> tuple[str, ...]:
     """Say of a training how large the student is, and how much its teacher counted; a sentence each.
 
     Args:
-        training: As ``module/training.json`` has it.
+        training: content of ``module/training.json``.
     """
     about = training["teacher"]
     control = (NOISE_WORDS,) if "control" in about else ()

@@ -1,4 +1,4 @@
-"""What blocks of a policy give while it runs."""
+"""The outputs of blocks of a policy while it runs."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import require
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.module.blocks import first
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-Place = tuple[str, str]
+BlockName = tuple[str, str]
 """A block: its graph, and the name of the module."""
 
 
@@ -23,9 +23,9 @@ class Form:
     """What a block gives for one observation.
 
     Args:
-        calls: How often it runs in an inference.
-        shape: Of what it gives each time; None when that is no tensor of floats, or differs from call to call.
-        channels_first: Whether the second axis, and not the last one, is that of the features.
+        calls: how often it runs in an inference.
+        shape: shape of what it gives each time; None when that is not a tensor of floats, or differs from call to call.
+        channels_first: whether the second axis, and not the last one, is that of the features.
     """
 
     calls: int
@@ -40,17 +40,17 @@ class Form:
 
 
 class Taps:
-    """Keeps what blocks give.
+    """Records the outputs of blocks.
 
     Args:
-        program: The policy.
-        places: Blocks of it.
+        program: the policy.
+        blocks: blocks of it.
     """
 
-    def __init__(self, program: BatchedProgram, places: Iterable[Place]) -> None:
+    def __init__(self, program: BatchedProgram, blocks: Iterable[BlockName]) -> None:
         self.program = program
-        self._given: dict[Place, list[Any]] = {place: [] for place in places}
-        self._channels_first: set[Place] = set()
+        self._given: dict[BlockName, list[Any]] = {block: [] for block in blocks}
+        self._channels_first: set[BlockName] = set()
 
     @contextlib.contextmanager
     def open(self, size: int) -> Iterator[None]:
@@ -60,10 +60,10 @@ class Taps:
             for (graph, name), given in self._given.items():
                 given.clear()
                 block = modules[graph].get_submodule(name)
-                hooks.callback(block.register_forward_hook(_keeping(given)).remove)
+                hooks.callback(block.register_forward_hook(_output_hook(given)).remove)
             yield
 
-    def forms(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[Place, Form]:
+    def forms(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[BlockName, Form]:
         """Run one observation, and return what each block gives."""
         modules = self.program.modules_for(1)
         with require("torch", "build").no_grad(), self.open(1):
@@ -72,28 +72,28 @@ class Taps:
             (graph, name): _form(given, modules[graph].get_submodule(name))
             for (graph, name), given in self._given.items()
         }
-        self._channels_first = {place for place, form in forms.items() if form.channels_first}
+        self._channels_first = {block for block, form in forms.items() if form.channels_first}
         return forms
 
-    def taken(self, size: int) -> dict[Place, Tensor]:
+    def take(self, size: int) -> dict[BlockName, Tensor]:
         """Return what was kept of a batch, (B * calls, ..., features), float32; the calls of a row follow each other.
 
         Blocks that gave nothing are left out.
         """
-        together = self.program.together(size)
-        found = {place: self._joined(place, given, together) for place, given in self._given.items() if given}
+        together = self.program.runs_at_once(size)
+        found = {block: self._join(block, given, together) for block, given in self._given.items() if given}
         for given in self._given.values():
             given.clear()
         return found
 
-    def _joined(self, place: Place, given: list[Any], together: bool) -> Tensor:
+    def _join(self, block: BlockName, given: list[Any], together: bool) -> Tensor:
         torch = require("torch", "build")
         values: Tensor = torch.stack(given, 1).flatten(0, 1) if together else torch.cat(given)
-        values = values.movedim(1, -1) if place in self._channels_first else values
+        values = values.movedim(1, -1) if block in self._channels_first else values
         return values.float()
 
 
-def _keeping(given: list[Any]) -> Any:
+def _output_hook(given: list[Any]) -> Any:
     def keep(_module: Any, _arguments: Any, gives: Any) -> None:
         given.append(first(gives))
 

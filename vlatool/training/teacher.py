@@ -1,4 +1,4 @@
-"""Who says what a student should have done."""
+"""The teacher of a training."""
 
 from __future__ import annotations
 
@@ -7,34 +7,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vlatool.bundle.bundle import ASSETS, MANIFEST, Bundle
+from vlatool.bundle.bundle import ASSETS, Bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.machine import host
-from vlatool.module.batched import BatchedProgram
-from vlatool.module.description import description_file
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.module.edits import Edit, read_edits
 from vlatool.module.origin import origin_of
+from vlatool.module.source import Source, claimed_source
 from vlatool.module.torch_policy import load_modules, unedited_modules
 from vlatool.runtime.statistics import load_normaliser
-from vlatool.stage.base import Context, Transform
-from vlatool.stage.build import build_stage
+from vlatool.stage.base import Context
 from vlatool.stage.run import cached_transform
 from vlatool.user_code import trust
 
 if TYPE_CHECKING:
     from torch import nn
 
-SOURCE = "sources.torch_module"
 TEACHES = "name a policy (a folder with a policy.yaml), or a bundle that vlatool prune or distill wrote"
-
-
-def teacher_source(path: Path) -> Transform | None:
-    """Return the stage that reads a teacher which is a policy, with a ``policy.yaml``; None where it is a bundle."""
-    if (path / MANIFEST).is_file() or not description_file(path).is_file():
-        return None
-    stage = build_stage(SOURCE, {"policy": path})
-    return stage if isinstance(stage, Transform) else None
 
 
 def teacher_bundle(path: Path) -> Bundle:
@@ -44,12 +34,8 @@ def teacher_bundle(path: Path) -> Bundle:
         BundleError: when there is none.
         SourceError: when it is a policy whose folder was neither named nor trusted.
     """
-    stage = teacher_source(path)
-    if stage is None:
-        return Bundle.open(path)
-    trust.require(description_file(path).parent, "the code of the teacher")
-    stage.check(None, None)
-    return cached_transform(stage, None, host.cache_directory(), Context())
+    source = _checked_source(path)
+    return Bundle.open(path) if source is None else cached_transform(source, None, host.cache_directory(), Context())
 
 
 def check_teacher(path: Path) -> None:
@@ -59,15 +45,23 @@ def check_teacher(path: Path) -> None:
         BundleError: when it is neither a bundle nor a policy.
         SourceError: as ``teacher_bundle``, and for a policy that is wrong.
     """
-    stage = teacher_source(path)
-    if stage is not None:
-        trust.require(description_file(path).parent, "the code of the teacher")
-        stage.check(None, None)
+    if _checked_source(path) is not None:
         return
     try:
-        Bundle.described(path)
+        Bundle.open_lazily(path)
     except BundleError as error:
         raise BundleError(f"The teacher cannot be opened: {error.message}", TEACHES) from error
+
+
+def _checked_source(path: Path) -> Source | None:
+    """Return the source of a teacher that is a policy, whose code may run."""
+    source = claimed_source(path)
+    if source is not None:
+        described = source.describe()
+        if described is not None and not described.graphs:
+            trust.require(described.folder, "the code of the teacher")
+        source.check(None, None)
+    return source
 
 
 @dataclass(frozen=True)
@@ -75,9 +69,9 @@ class Teacher:
     """A policy in torch that fits the student's.
 
     Args:
-        bundle: Its source bundle.
-        edits: What was done to its structure.
-        program: Its modules, and how they run.
+        bundle: its source bundle.
+        edits: what was done to its structure.
+        program: its modules, and how they run.
     """
 
     bundle: Bundle
@@ -89,9 +83,9 @@ class Teacher:
         """Open the teacher of a student.
 
         Args:
-            student: The student's bundle.
-            path: The teacher's bundle, or its policy; what the student was before any edit when None.
-            modules: The student's, which the teacher's must not share weights with.
+            student: the student's bundle.
+            path: the teacher's bundle, or its policy; what the student was before any edit when None.
+            modules: the student's, which the teacher's must not share weights with.
 
         Raises:
             RecipeError: when it is exported, takes or gives something else, or is the student.

@@ -1,8 +1,8 @@
 """A training whose processes torchrun started, on one machine or several: who this one is, and how they talk.
 
-The first process (``RANK`` 0) runs the whole command. The others follow it: they wait for calls of ``peer``, which the
-first one writes into torchrun's store (``MASTER_ADDR``, ``MASTER_PORT``), and write back how each ended. Rows, bundles
-and checkpoints are files of the first process's, which all must see under the same path.
+The first process (``RANK`` 0) runs the whole command. The others follow it: they wait for calls of ``rank_process``,
+which the first one writes into torchrun's store (``MASTER_ADDR``, ``MASTER_PORT``), and write back how each ended.
+Rows, bundles and checkpoints are files of the first process, which all must see under the same path.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from vlatool import errors
 from vlatool.errors import InputError, MissingExtra, RecipeError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of, one_line
 from vlatool.machine.version import VERSION
-from vlatool.user_code.children import Apart
+from vlatool.user_code.children import Child
 
-NAMES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
-"""What torchrun tells each process."""
+VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+"""Environment variables that torchrun sets for each process."""
 AGENT = "TORCHELASTIC_USE_AGENT_STORE"
-MEETING = "meeting"
+RENDEZVOUS = "meeting"
 """File in the folder of the training through which processes of one machine find each other; under torchrun it holds
 what shows that a process sees that folder."""
-PRELOAD = ("torch", "vlatool.training.peer")
-LEAVE = "leave"
-"""A call after which a process forgets the training."""
+PRELOAD = ("torch", "vlatool.training.rank_process")
+LEAVE_CALL = "leave"
+"""Call after which a process discards the training."""
 START_S, LEFT_S, POLL_S = 300.0, 5.0, 0.05
 """Seconds in which another process comes, and goes; and between two looks at the store."""
 LOOPBACK = ("127.", "localhost", "::1")
-AGAIN = "run the same command again on all machines: it goes on from the last checkpoint"
-SHARED = "let all machines see one cache under the same path (VLATOOL_CACHE=FOLDER on a shared file system)"
+RUN_AGAIN = "run the same command again on all machines: it goes on from the last checkpoint"
+SHARE_CACHE = "let all machines see one cache under the same path (VLATOOL_CACHE=FOLDER on a shared file system)"
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class Launch:
     """Which of torchrun's processes this one is.
 
     Args:
-        rank, size: Its number of all processes.
-        local_rank, local_size: The same of those on its machine.
-        address, port: Of the store.
+        rank, size: its number of all processes.
+        local_rank, local_size: the same of those on its machine.
+        address, port: address and port of the store.
     """
 
     rank: int
@@ -61,7 +61,7 @@ class Launch:
     port: int
 
     @property
-    def here(self) -> bool:
+    def on_one_machine(self) -> bool:
         """Whether all processes are on this machine."""
         return self.size == self.local_size or self.address.startswith(LOOPBACK)
 
@@ -69,8 +69,8 @@ class Launch:
         """Open the store.
 
         Args:
-            prefix: Of all names in it.
-            host: Whether this process serves it, unless torchrun does.
+            prefix: prefix of all names in it.
+            host: whether this process serves it, unless torchrun does.
 
         Raises:
             SourceError: when it does not answer.
@@ -87,54 +87,54 @@ class Launch:
         return distributed.PrefixStore(prefix, store)
 
 
-def launched() -> Launch | None:
-    """Return what torchrun says of this process; None where it was not started so, or alone.
+def current_launch() -> Launch | None:
+    """Return this process's place among those of torchrun; None without torchrun, or for a single process.
 
     Raises:
-        RecipeError: when that is incomplete, or no numbers.
+        RecipeError: when the variables are incomplete, or not numbers.
     """
-    said = {name: os.environ.get(name, "") for name in NAMES}
+    said = {name: os.environ.get(name, "") for name in VARIABLES}
     if not (said["RANK"] and said["WORLD_SIZE"]) or said["WORLD_SIZE"] == "1":
         return None
     missing = [name for name, value in said.items() if not value]
-    numbers = [name for name in NAMES if name != "MASTER_ADDR" and not said[name].isdecimal()]
+    numbers = [name for name in VARIABLES if name != "MASTER_ADDR" and not said[name].isdecimal()]
     if missing or numbers:
         name = (missing or numbers)[0]
         raise RecipeError(
             f"RANK and WORLD_SIZE are set, as torchrun does, and {name} is {said[name] or 'not set'!r}.",
-            f"torchrun sets {', '.join(NAMES)}; set all of them, or unset RANK and WORLD_SIZE",
+            f"torchrun sets {', '.join(VARIABLES)}; set all of them, or unset RANK and WORLD_SIZE",
         )
-    rank, size, local_rank, local_size = (int(said[name]) for name in NAMES[:4])
+    rank, size, local_rank, local_size = (int(said[name]) for name in VARIABLES[:4])
     if not (rank < size and local_rank < local_size <= size):
         raise RecipeError(
-            f"RANK={rank} of WORLD_SIZE={size} (LOCAL_RANK={local_rank} of LOCAL_WORLD_SIZE={local_size}) is no "
-            "process of torchrun's: each rank is below its size.",
+            f"RANK={rank} of WORLD_SIZE={size} (LOCAL_RANK={local_rank} of LOCAL_WORLD_SIZE={local_size}) is not "
+            "a process of torchrun's: each rank is below its size.",
             "unset RANK and WORLD_SIZE",
         )
     return Launch(rank, size, local_rank, local_size, said["MASTER_ADDR"], int(said["MASTER_PORT"]))
 
 
 def versions() -> dict[str, str]:
-    """Return what must be the same in all processes."""
+    """Return the versions that must be the same in all processes."""
     return {"vlatool": VERSION, "torch": str(require("torch", "build").__version__)}
 
 
-def shown(place: Path) -> dict[str, Any]:
-    """Return what lets other processes check that they see the folder of the training, and run the same code."""
+def write_token(folder: Path) -> dict[str, Any]:
+    """Write a token into the folder of the training; return it with the versions, for other processes to check."""
     token = secrets.token_hex(8)
-    (place / MEETING).write_text(token)
+    (folder / RENDEZVOUS).write_text(token)
     return {"token": token, "versions": versions()}
 
 
 def check_shared(job: Mapping[str, Any]) -> None:
-    """Refuse to train where the first process's folder is not seen, or other versions run.
+    """Refuse to train where the first process's folder is not visible, or versions differ.
 
     Raises:
         RecipeError: saying so.
     """
     if "token" not in job:
         return
-    who, seen = f"Process {job['rank'] + 1} of {job['size']} on {platform.node()}", Path(job["place"], MEETING)
+    who, seen = f"Process {job['rank'] + 1} of {job['size']} on {platform.node()}", Path(job["place"], RENDEZVOUS)
     for name, theirs in job["versions"].items():
         if (ours := versions()[name]) != theirs:
             raise RecipeError(f"{who} runs {name} {ours}, the first process {theirs}.", "install the same versions")
@@ -144,24 +144,24 @@ def check_shared(job: Mapping[str, Any]) -> None:
         same = False
     if not same:
         raise RecipeError(f"{who} does not see the folder in which the first process keeps rows and checkpoints: "
-                          f"{seen.parent}.", SHARED)  # fmt: skip
+                          f"{seen.parent}.", SHARE_CACHE)  # fmt: skip
 
 
-def meeting_of(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
-    """Return what opens the store of a training's group, and whether all processes are on this machine."""
-    launch = launched()
+def open_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
+    """Return a function that opens the store of a training's group, and whether all processes are on this machine."""
+    launch = current_launch()
     if launch is not None:
-        return partial(launch.store, f"vlatool-{job['token']}"), launch.here
+        return partial(launch.store, f"vlatool-{job['token']}"), launch.on_one_machine
     store = require("torch.distributed", "build").FileStore
-    return partial(store, str(Path(job["place"]) / MEETING), job["size"]), True
+    return partial(store, str(Path(job["place"]) / RENDEZVOUS), job["size"]), True
 
 
 class Follower:
-    """A process that follows this one, as ``Apart`` is one that it started: it calls functions of ``peer``.
+    """A process that follows this one, as ``Child`` is one that it started: it calls functions of ``rank_process``.
 
     Args:
-        launch: This process.
-        rank: The other one.
+        launch: this process.
+        rank: the other one.
     """
 
     def __init__(self, launch: Launch, rank: int) -> None:
@@ -169,47 +169,47 @@ class Follower:
         self._who = f"Process {rank + 1} of {launch.size}"
 
     def __enter__(self) -> Follower:
-        """Wait until it is there.
+        """Wait until the process is ready.
 
         Raises:
-            SourceError: when it does not come.
-            VlatoolError: what it met before.
+            SourceError: when it does not start.
+            VlatoolError: an error that it raised before.
         """
         self._wait("here", time.monotonic() + START_S)
         return self
 
     def __exit__(self, kind: object, *_exception: object) -> None:
         if kind is None:
-            self._ask(LEAVE, {})
+            self._send_call(LEAVE_CALL, {})
 
     def call(self, function: str, job: Mapping[str, Any], _tell: Any) -> None:
-        """Call a function there, and wait for its end.
+        """Call a function in the process, and wait until it returns.
 
         Raises:
             VlatoolError: what it raised; SourceError when the process is gone.
         """
-        self._wait(f"answer/{self._ask(function, job)}")
+        self._wait(f"answer/{self._send_call(function, job)}")
 
     def end(self) -> None:
-        """Wait for it no longer, from any thread."""
+        """Stop waiting for the process; may be called from any thread."""
         self._lost.set()
 
-    def _ask(self, function: str, job: Mapping[str, Any]) -> int:
+    def _send_call(self, function: str, job: Mapping[str, Any]) -> int:
         number = int(self._store.add(f"{self._rank}/calls", 1))
         self._store.set(f"{self._rank}/call/{number}", json.dumps({"function": function, "job": dict(job)}))
         return number
 
     def _wait(self, name: str, until: float = float("inf")) -> None:
-        """Wait for what it says, and raise what went wrong there."""
+        """Wait for a reply, and raise the error that it reports."""
         while not self._lost.is_set() and time.monotonic() < until:
             for key in (f"{self._rank}/failed", f"{self._rank}/{name}"):
                 if self._store.check([key]):
-                    self._believe(json.loads(self._store.get(key)))
+                    self._raise_error(json.loads(self._store.get(key)))
                     return
             time.sleep(POLL_S)
-        raise SourceError(f"{self._who} of the training does not answer.", AGAIN)
+        raise SourceError(f"{self._who} of the training does not answer.", RUN_AGAIN)
 
-    def _believe(self, answer: Mapping[str, str] | None) -> None:
+    def _raise_error(self, answer: Mapping[str, str] | None) -> None:
         if answer is None:
             return
         found = getattr(errors, answer["error"], None)
@@ -219,8 +219,8 @@ class Follower:
 
 
 @contextlib.contextmanager
-def leading(launch: Launch) -> Iterator[None]:
-    """Run a command as the first process; the others may end after the block."""
+def lead(launch: Launch) -> Iterator[None]:
+    """Run a command as the first process; the others end after the block."""
     store = launch.store(host=True)
     try:
         yield
@@ -232,12 +232,12 @@ def leading(launch: Launch) -> Iterator[None]:
 
 
 def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
-    """Do what the first process asks for, until its command is over.
+    """Serve the calls of the first process until its command has ended.
 
     Args:
-        launch: This process.
-        about: Whose training it is, for messages.
-        ready: Called first: what the command line has to check or allow here.
+        launch: this process.
+        about: name of the training, for messages.
+        ready: called first: what the command line has to check or allow here.
 
     Raises:
         SourceError: when the first process is gone.
@@ -247,25 +247,25 @@ def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
     try:
         ready()
     except VlatoolError as error:
-        store.set(f"{launch.rank}/failed", json.dumps(_told(error)))
+        store.set(f"{launch.rank}/failed", json.dumps(_error_record(error)))
         store.set(f"{launch.rank}/left", "1")
         raise
     store.set(f"{launch.rank}/here", "null")
     with contextlib.ExitStack() as opened:
-        child: Apart | None = None
-        while call := _next(store, f"{launch.rank}/call/{(number := number + 1)}"):
-            if call["function"] == LEAVE:
+        child: Child | None = None
+        while call := _next_call(store, f"{launch.rank}/call/{(number := number + 1)}"):
+            if call["function"] == LEAVE_CALL:
                 opened.close()
                 child = None
                 continue
             if child is None:
-                child = opened.enter_context(Apart(f"{about}, process {launch.rank + 1} of {launch.size}", PRELOAD))
-            store.set(f"{launch.rank}/answer/{number}", json.dumps(_answer(child, launch, call)))
+                child = opened.enter_context(Child(f"{about}, process {launch.rank + 1} of {launch.size}", PRELOAD))
+            store.set(f"{launch.rank}/answer/{number}", json.dumps(_run_call(child, launch, call)))
     store.set(f"{launch.rank}/left", "1")
 
 
-def _next(store: Any, name: str) -> Any:
-    """Wait for a call; return None when the first process's command is over."""
+def _next_call(store: Any, name: str) -> Any:
+    """Wait for a call; return None when the first process's command has ended."""
     try:
         while True:
             over = store.check(["over"])
@@ -275,17 +275,17 @@ def _next(store: Any, name: str) -> Any:
                 return None
             time.sleep(POLL_S)
     except RuntimeError as error:
-        raise SourceError("The first process of the training is gone.", AGAIN) from error
+        raise SourceError("The first process of the training is gone.", RUN_AGAIN) from error
 
 
-def _answer(child: Apart, launch: Launch, call: Mapping[str, Any]) -> Any:
-    """Call what is asked for; return None, or what came instead."""
+def _run_call(child: Child, launch: Launch, call: Mapping[str, Any]) -> Any:
+    """Run a call; return None, or the record of its error."""
     try:
         child.call(call["function"], {**call["job"], "rank": launch.rank}, lambda _what, _share: None)
     except VlatoolError as error:
-        return _told(error)
+        return _error_record(error)
     except (OSError, MemoryError) as error:
-        return _told(
+        return _error_record(
             SourceError(
                 f"{type(error).__name__}: {one_line(message_of(error))}",
                 "run it there with VLATOOL_DEBUG=1 to see where it was raised",
@@ -294,5 +294,5 @@ def _answer(child: Apart, launch: Launch, call: Mapping[str, Any]) -> Any:
     return None
 
 
-def _told(error: VlatoolError) -> dict[str, str]:
+def _error_record(error: VlatoolError) -> dict[str, str]:
     return {"error": type(error).__name__, "message": error.message, "fix": error.fix, "host": platform.node()}

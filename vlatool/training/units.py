@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import require
 from vlatool.module.blocks import stacks_of
-from vlatool.module.cut import RETRACE
+from vlatool.module.unit_removal import RETRACE
 from vlatool.training.group import Group
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def cut_units(modules: Mapping[str, nn.Module], group: Group) -> Any:
     fsdp = require("torch.distributed.fsdp", "build")
     kind = torch.get_default_device().type
     mesh = require("torch.distributed.device_mesh", "build").init_device_mesh(kind, (group.size,))
-    cut = {graph: module for graph, module in modules.items() if _runs_as_it_is(module)}
+    cut = {graph: module for graph, module in modules.items() if _is_called_directly(module)}
 
     class Root(torch.nn.ModuleList):  # type: ignore[misc, name-defined]
         """All units; runs first, and computes nothing, so that none of them takes itself for the first."""
@@ -37,7 +37,7 @@ def cut_units(modules: Mapping[str, nn.Module], group: Group) -> Any:
             """Give nothing."""
 
     for unit, others in _units(cut, modules):
-        unit.register_forward_hook(_apart)
+        unit.register_forward_hook(_copy_views)
         fsdp.fully_shard(unit, mesh=mesh, reshard_after_forward=True, ignored_params=others)
         unit.set_gradient_divide_factor(1.0)  # sums, as without shards
         unit.set_force_sum_reduction_for_comms(True)
@@ -50,14 +50,14 @@ def cut_units(modules: Mapping[str, nn.Module], group: Group) -> Any:
     return root
 
 
-def _apart(_module: Any, _arguments: Any, gives: Any) -> Any:
+def _copy_views(_module: Any, _arguments: Any, gives: Any) -> Any:
     """Copy what a unit gives as a view: an operation in place on it would lose what prepares ``backward``."""
     if isinstance(gives, require("torch", "build").Tensor):
         return gives.clone() if gives._is_view() else gives
-    return type(gives)(_apart(None, None, each) for each in gives) if type(gives) in (tuple, list) else gives
+    return type(gives)(_copy_views(None, None, each) for each in gives) if type(gives) in (tuple, list) else gives
 
 
-def _runs_as_it_is(module: Any) -> bool:
+def _is_called_directly(module: Any) -> bool:
     """Say whether a module is called itself: no container, and none that is traced again for each batch size."""
     nn = require("torch", "build").nn
     return getattr(module, RETRACE, None) is None and not isinstance(module, nn.ModuleDict | nn.ModuleList)
@@ -68,7 +68,7 @@ def _units(cut: Mapping[str, nn.Module], modules: Mapping[str, nn.Module]) -> li
     owners, seen, taken = owners_of(modules), set[int](), set[int]()
     blocks = [block for _, stack in reversed(stacks_of(cut, mixed=True)) for block in stack]
     units = []
-    for unit in dict.fromkeys([*filter(_runs_as_it_is, blocks), *cut.values()]):
+    for unit in dict.fromkeys([*filter(_is_called_directly, blocks), *cut.values()]):
         fits = _fitting(unit, owners, seen, _outside(unit, modules))
         seen |= {id(value) for value in unit.parameters()}
         taken |= fits

@@ -1,4 +1,4 @@
-"""What a child that runs a user's code says, checked before it is believed: that code can write what it likes.
+"""Validation of the replies of a child that runs a user's code, which can write anything.
 
 A policy shares its process with the function of vlatool that answers, and can answer in its place. It decides neither
 the exit code nor what kind of error a person sees: an error of a child is one of its input, or of a package it lacks.
@@ -17,50 +17,50 @@ from typing import Any
 from vlatool import errors
 from vlatool.errors import GraphError, InputError, MissingExtra, SourceError, VlatoolError
 from vlatool.files.json import parse_json
-from vlatool.files.limits import VARIABLE, limit
-from vlatool.files.printable import TOLD, shortened
-from vlatool.machine.risky import Deed, crashed
+from vlatool.files.limits import LIMITS_VARIABLE, limit
+from vlatool.files.printable import MAX_CHARACTERS, truncate
+from vlatool.machine.engine_calls import EngineCall, engine_crash
 
-ENDINGS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
+CONNECTION_ERRORS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
 """Errors of connections: none of a file, and to this program the sign that nobody reads it any more."""
 
 
-LONGEST = 2 * TOLD
+MAX_MESSAGE = 2 * MAX_CHARACTERS
 """Characters of a message of a child, which may quote what foreign code says."""
 
 
-LAST_WORDS = 240
+MAX_LAST_LINE = 240
 """Characters of the last line that a child printed, for an error: its end says more than its beginning."""
 
 
 @dataclass
-class Last:
-    """What a child was seen to do before it ended.
+class ChildState:
+    """What is known of a child before it ended.
 
     Args:
-        own: It runs vlatool's code alone.
-        doing: What an engine does in it.
-        told: What it told as its progress.
-        said: The last line that it printed.
+        own: whether it runs vlatool's code alone.
+        doing: what an engine does in it.
+        told: what it told as its progress.
+        said: the last line that it printed.
     """
 
     own: bool = False
-    doing: Deed | None = None
+    doing: EngineCall | None = None
     told: str = ""
     said: str = ""
 
     @property
     def words(self) -> str:
         """The end of the last line."""
-        return self.said if len(self.said) <= LAST_WORDS else f"...{self.said[-LAST_WORDS:]}"
+        return self.said if len(self.said) <= MAX_LAST_LINE else f"...{self.said[-MAX_LAST_LINE:]}"
 
 
-class Killed(SourceError):
-    """The process that runs a user's code was killed: what it was asked for may be asked of another one."""
+class ChildKilled(SourceError):
+    """The process that runs a user's code was killed: another one may repeat the request."""
 
 
 def read(line: bytes, about: str) -> dict[str, Any]:
-    """Return one thing that a child says.
+    """Parse a message of a child.
 
     Raises:
         SourceError: when it is none of those that ``vlatool.user_code._child`` says.
@@ -68,13 +68,13 @@ def read(line: bytes, about: str) -> dict[str, Any]:
     try:
         message = parse_json(line)
     except ValueError as error:
-        raise nonsense(about) from error
-    if not isinstance(message, dict) or not _makes_sense(message):
-        raise nonsense(about)
+        raise invalid_reply(about) from error
+    if not isinstance(message, dict) or not _is_valid(message):
+        raise invalid_reply(about)
     return message
 
 
-def _makes_sense(line: Mapping[str, Any]) -> bool:
+def _is_valid(line: Mapping[str, Any]) -> bool:
     match line:
         case {"progress": [str(), None]} | {"warning": str()} | {"result": _} | {"memory": True}:
             return True
@@ -85,7 +85,7 @@ def _makes_sense(line: Mapping[str, Any]) -> bool:
         case {"error": str(), "message": str(), "fix": str()} | {"raised": str(), "message": str(), "ours": bool()}:
             return isinstance(line.get("where", ""), str)
         case {"errno": int(number), "message": str(), "file": None | str()}:
-            return number in errno.errorcode and number not in ENDINGS
+            return number in errno.errorcode and number not in CONNECTION_ERRORS
     return False
 
 
@@ -93,9 +93,9 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     """Return the result that an answer holds, or raise what it says that was raised.
 
     Args:
-        told: The answer.
-        about: Whose code the child runs.
-        own: The child runs vlatool's code alone: what fails in it is a bug of vlatool.
+        told: the answer.
+        about: name of the code that the child runs.
+        own: the child runs vlatool's code alone: what fails in it is a bug of vlatool.
 
     Raises:
         InputError, MissingExtra: of the class that is named; any VlatoolError where ``own``.
@@ -109,13 +109,13 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
         raise MemoryError
     message = plain(answer["message"])
     if "error" in answer:
-        kind = Killed if answer["error"] == Killed.__name__ else getattr(errors, answer["error"], None)
+        kind = ChildKilled if answer["error"] == ChildKilled.__name__ else getattr(errors, answer["error"], None)
         if isinstance(kind, type) and issubclass(kind, VlatoolError if own else InputError | MissingExtra):
-            raise kind(shortened(answer["message"], LONGEST), shortened(answer["fix"], LONGEST))
+            raise kind(truncate(answer["message"], MAX_MESSAGE), truncate(answer["fix"], MAX_MESSAGE))
         name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
-        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}", shortened(answer["fix"], LONGEST))
+        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}", truncate(answer["fix"], MAX_MESSAGE))
     if "errno" in answer:
-        raise OSError(answer["errno"], message, answer["file"] and shortened(answer["file"], LONGEST))
+        raise OSError(answer["errno"], message, answer["file"] and truncate(answer["file"], MAX_MESSAGE))
     name = plain(answer["raised"])
     if own:
         raise RuntimeError(f"{about} failed in its process: {name}: {message}")
@@ -127,34 +127,34 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
             f"{about}: the process that runs it failed: {name}: {message}.",
             "VLATOOL_DEBUG=1 shows where; report it where that is in vlatool",
         )
-    raise left(about, name, message)
+    raise exit_error(about, name, message)
 
 
-def nonsense(about: str) -> SourceError:
-    """Return the error for what no child of vlatool says."""
+def invalid_reply(about: str) -> SourceError:
+    """Return the error for an invalid message of a child."""
     return SourceError(f"The process of the policy ({about}) answered nonsense.", "let it write to its own files alone")
 
 
 def plain(text: str) -> str:
-    """Return a text without what would steer a terminal, shortened where it is very long."""
-    text = shortened(text, LONGEST)
+    """Return a text without control characters, truncated where it is very long."""
+    text = truncate(text, MAX_MESSAGE)
     return "".join(character if unicodedata.category(character)[0] != "C" else " " for character in text).rstrip()
 
 
-def left(about: str, name: str, text: str) -> SourceError:
-    """Return the error for code that raises what is no ``Exception``."""
+def exit_error(about: str, name: str, text: str) -> SourceError:
+    """Return the error for code that raises something other than an ``Exception``."""
     if name == "SystemExit":
         return SourceError(f"{about} called sys.exit({text}).", "raise an exception that says what is wrong instead")
     return SourceError(f"{about} raised {name}{text and ': '}{text}.", "raise an Exception that says what is wrong")
 
 
-def ended(status: bytes, about: str, last: Last) -> BaseException:
+def ending_error(status: bytes, about: str, last: ChildState) -> BaseException:
     """Return the error of a child that ended without an answer.
 
     Args:
-        status: Its exit code, as the server says it.
-        about: Whose code it ran.
-        last: What it did.
+        status: its exit code, as the server says it.
+        about: name of the code that it ran.
+        last: what it did.
     """
     text = status.decode("ascii", "replace").strip()
     if not text.lstrip("-").isdigit():
@@ -163,7 +163,7 @@ def ended(status: bytes, about: str, last: Last) -> BaseException:
     if code == -signal.SIGINT:
         return KeyboardInterrupt()
     if last.doing and code != -signal.SIGKILL:
-        return _engine_ended(code, last.doing, last.words)
+        return _engine_error(code, last.doing, last.words)
     if code >= 0:
         return SourceError(
             f"{about} ended its process with exit code {code} before it was done (os._exit, or a library's exit).",
@@ -171,7 +171,7 @@ def ended(status: bytes, about: str, last: Last) -> BaseException:
         )
     name = _signal(code)
     if code == -signal.SIGKILL:
-        return Killed(
+        return ChildKilled(
             f"{about}: the process that ran it was killed (SIGKILL) before it was done.",
             "where memory ran out, use a machine with more of it",
         )
@@ -182,14 +182,14 @@ def ended(status: bytes, about: str, last: Last) -> BaseException:
     return SourceError(f"{about} crashed its process ({name}) before it was done.", "look for a library that crashes")
 
 
-def _engine_ended(code: int, doing: Deed, said: str) -> GraphError:
-    """Return the error of an engine that did not let its process live."""
+def _engine_error(code: int, doing: EngineCall, said: str) -> GraphError:
+    """Return the error of an engine that ended its process."""
     if code == -signal.SIGALRM:
         seconds = limit("engine_seconds")
-        error = crashed(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)
-        return GraphError(error.message, f"where it needs longer, raise it: {VARIABLE}=engine_seconds={10 * seconds}")
+        error = engine_crash(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)
+        return GraphError(error.message, f"if it needs longer: {LIMITS_VARIABLE}=engine_seconds={10 * seconds}")
     how = f"with {_signal(code)}" if code < 0 else f"with exit code {code}"
-    return crashed(doing, f"ended its process {how}", said)
+    return engine_crash(doing, f"ended its process {how}", said)
 
 
 def _signal(code: int) -> str:

@@ -27,21 +27,21 @@ import psutil
 from vlatool.errors import VlatoolError
 from vlatool.files.limits import limit
 from vlatool.files.printable import file_of, message_of
-from vlatool.machine import risky
-from vlatool.machine.awaited import noted_on
+from vlatool.machine import engine_calls
 from vlatool.machine.processes import adopt_orphans, die_with_parent
+from vlatool.machine.watched_calls import note_calls_on
 from vlatool.user_code import trust
-from vlatool.user_code._answers import ENDINGS
+from vlatool.user_code._answers import CONNECTION_ERRORS
 
-FDS = 4
-MESSAGE = 1 << 16
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+MAX_DESCRIPTORS = 4
+MAX_MESSAGE_BYTES = 1 << 16
+END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def main() -> None:
     """Serve until the parent is gone."""
     control = socket.socket(fileno=int(sys.argv[1]))
-    for number in ENDING:  # they reach the children, too; the parent says what becomes of this process
+    for number in END_SIGNALS:  # they reach the children, too; the parent says what becomes of this process
         signal.signal(number, signal.SIG_IGN)
     woken, wake = os.pipe()
     os.set_blocking(wake, False)
@@ -53,14 +53,14 @@ def main() -> None:
         watched: list[Any] = [control, woken, *children.values()]
         ready = select.select(watched, [], [])[0]
         if woken in ready:
-            os.read(woken, MESSAGE)
+            os.read(woken, MAX_MESSAGE_BYTES)
             _reap(children)
         for pid, status in children.items():
-            if status in ready:  # whoever asked for it wants it no more
+            if status in ready:  # the parent no longer needs it
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
         if control in ready:
-            message, fds, *_ = socket.recv_fds(control, MESSAGE, FDS)
+            message, fds, *_ = socket.recv_fds(control, MAX_MESSAGE_BYTES, MAX_DESCRIPTORS)
             if not message:
                 _end_all(children)
                 return
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def _reap(children: dict[int, socket.socket]) -> None:
-    """Say of each child that has ended how it did."""
+    """Report the exit status of each child that has ended."""
     with contextlib.suppress(ChildProcessError):
         while (ended := os.waitpid(-1, os.WNOHANG))[0]:
             status = children.pop(ended[0], None)
@@ -88,7 +88,7 @@ def _end_strays(children: Mapping[int, socket.socket]) -> None:
 
 
 def _end_all(children: Mapping[int, socket.socket]) -> None:
-    """Kill all children and what they leave, which shows once they are gone; whoever waits for this has patience."""
+    """Kill all children and what they leave, which shows once they have ended; this may take a while."""
     for pid in children:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -122,8 +122,8 @@ def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket
             for fd in (status, *own, *(other.fileno() for other in children.values())):
                 os.close(fd)
             _stand_alone(output)
-            noted_on(page)
-            code = _converse(socket.socket(fileno=talk))
+            note_calls_on(page)
+            code = _serve_requests(socket.socket(fileno=talk))
     finally:
         os._exit(code)
 
@@ -131,7 +131,7 @@ def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket
 def _stand_alone(output: int) -> None:
     """Undo what the server set up, and send whatever is printed to the parent's pipe."""
     signal.set_wakeup_fd(-1)
-    for number in (*ENDING, signal.SIGCHLD):
+    for number in (*END_SIGNALS, signal.SIGCHLD):
         signal.signal(number, signal.SIG_DFL)
     nothing = os.open(os.devnull, os.O_RDONLY)
     for fd, target in ((nothing, 0), (output, 1), (output, 2)):
@@ -142,32 +142,32 @@ def _stand_alone(output: int) -> None:
     sys.stderr = os.fdopen(2, "w", buffering=1, encoding="utf-8", errors="replace", closefd=False)
 
 
-def _converse(talk: socket.socket) -> int:
+def _serve_requests(talk: socket.socket) -> int:
     """Answer request after request until there are no more."""
     requests, answers = talk.makefile("r", encoding="utf-8"), talk.makefile("w", encoding="utf-8")
-    _settle(json.loads(requests.readline()))
-    risky.listen(lambda doing: _doing(answers, doing))
+    _apply_environment(json.loads(requests.readline()))
+    engine_calls.listen(lambda doing: _note_engine_call(answers, doing))
     for line in requests:
         request = json.loads(line)
-        with _warnings_told(answers):
-            answer = _answered(request, answers)
+        with _forward_warnings(answers):
+            answer = _answer(request, answers)
         _flush()
-        _say(answers, answer)
+        _send(answers, answer)
     return 0
 
 
-def _doing(answers: IO[str], doing: risky.Deed | None) -> None:
-    """Say what an engine does, and let the kernel end this process when that takes too long.
+def _note_engine_call(answers: IO[str], doing: engine_calls.EngineCall | None) -> None:
+    """Report a call of an engine, and let the kernel end this process when it takes too long.
 
     No thread of Python could: a library that hangs may never let one run.
     """
     if signal.getsignal(signal.SIGALRM) == signal.SIG_DFL:  # a policy may use it
         signal.setitimer(signal.ITIMER_REAL, limit("engine_seconds") if doing else 0)
-    _say(answers, {"doing": doing})
+    _send(answers, {"doing": doing})
 
 
-def _settle(parent: dict[str, Any]) -> None:
-    """Be where the parent is: directory, variables, modules, processors."""
+def _apply_environment(parent: dict[str, Any]) -> None:
+    """Take over the parent's directory, variables, module path and processors."""
     os.chdir(parent["folder"])
     os.environ.clear()
     os.environ.update(parent["environment"])
@@ -179,11 +179,11 @@ def _settle(parent: dict[str, Any]) -> None:
         sys.modules["numpy"].random.seed()
 
 
-def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
-    """Call what is asked for; return its result, or what came instead."""
+def _answer(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
+    """Run a call; return its result, or the record of its error."""
 
     def tell(what: str, share: float | None) -> None:
-        _say(answers, {"progress": [what, share]})
+        _send(answers, {"progress": [what, share]})
 
     try:
         return {"result": _function(request["call"])(request["job"], tell)}
@@ -194,22 +194,22 @@ def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
     except MemoryError:
         return {"memory": True}
     except OSError as error:
-        if error.errno not in errno.errorcode or error.errno in ENDINGS:
-            return _raised(error)
+        if error.errno not in errno.errorcode or error.errno in CONNECTION_ERRORS:
+            return _error_record(error)
         return {"errno": error.errno, "message": str(error.strerror), "file": file_of(error) or None}
     except BaseException as error:  # the seam: a user's code may raise anything
-        return _raised(error)
+        return _error_record(error)
 
 
-def _raised(error: BaseException) -> dict[str, Any]:
+def _error_record(error: BaseException) -> dict[str, Any]:
     if os.environ.get("VLATOOL_DEBUG"):
         traceback.print_exc()
     lines = message_of(error).strip().splitlines()
     told = {"raised": type(error).__name__, "message": lines[0] if lines else "", "ours": isinstance(error, Exception)}
-    return {**told, "where": _place_of_bug(error) if isinstance(error, Exception) else ""}
+    return {**told, "where": _bug_location(error) if isinstance(error, Exception) else ""}
 
 
-def _place_of_bug(error: BaseException) -> str:
+def _bug_location(error: BaseException) -> str:
     """Return the function of vlatool that raised an exception itself; empty where other code did."""
     frame = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][-1]
     module = str(frame.f_globals.get("__name__", ""))
@@ -226,13 +226,13 @@ def _function(name: str) -> Callable[..., Any]:
 
 
 @contextlib.contextmanager
-def _warnings_told(answers: IO[str]) -> Iterator[None]:
-    """Hand warnings for a person on to the parent, who shows each once."""
+def _forward_warnings(answers: IO[str]) -> Iterator[None]:
+    """Forward warnings to the parent, which shows each once."""
     before = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
         if issubclass(category, UserWarning):
-            _say(answers, {"warning": str(message)})
+            _send(answers, {"warning": str(message)})
         else:
             before(message, category, *where, **more)
 
@@ -244,7 +244,7 @@ def _warnings_told(answers: IO[str]) -> Iterator[None]:
 
 
 def _flush() -> None:
-    """Let what was printed arrive before the answer does."""
+    """Flush the output, so that it arrives before the answer."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):
             stream.flush()
@@ -252,7 +252,7 @@ def _flush() -> None:
         ctypes.CDLL(None).fflush(None)
 
 
-def _say(answers: IO[str], line: dict[str, Any]) -> None:
+def _send(answers: IO[str], line: dict[str, Any]) -> None:
     answers.write(json.dumps(line) + "\n")
     answers.flush()
 

@@ -24,22 +24,22 @@ from queue import SimpleQueue
 from typing import Any
 
 from vlatool.errors import SourceError
-from vlatool.files.printable import shortened
-from vlatool.machine.awaited import Page, new_page
+from vlatool.files.printable import truncate
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.processes import SINGLE, import_path, python_command
+from vlatool.machine.watched_calls import Page, new_page
 from vlatool.user_code import trust
-from vlatool.user_code._answers import Killed as Killed
-from vlatool.user_code._answers import Last, ended, plain, read
-from vlatool.user_code._answers import left as left
+from vlatool.user_code._answers import ChildKilled as ChildKilled
+from vlatool.user_code._answers import ChildState, ending_error, plain, read
+from vlatool.user_code._answers import exit_error as exit_error
 from vlatool.user_code._answers import result as result
-from vlatool.user_code._said import BLOCK, Said
+from vlatool.user_code._child_output import BLOCK_BYTES, ChildOutput
 
-Tell = Callable[[str, float | None], None]
-LONGEST_ANSWER = 1 << 28
+OnProgress = Callable[[str, float | None], None]
+MAX_ANSWER_BYTES = 1 << 28
 """Bytes of one line of an answer."""
-PATIENCE_S = 5.0
-LOOK_S, SAID_S = 0.2, 10.0
+STOP_TIMEOUT_S = 5.0
+POLL_S, REPORT_AFTER_S = 0.2, 10.0
 """How often a call that may never return is looked at, and from when on it is said; earlier where it may take less."""
 
 
@@ -67,7 +67,7 @@ class _Server:
         if not self.used:  # it may be in the middle of importing
             self.process.kill()
         try:
-            self.process.wait(PATIENCE_S)
+            self.process.wait(STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
@@ -77,7 +77,7 @@ _servers: dict[tuple[str, ...], _Server] = {}
 _lock = threading.Lock()
 
 
-def _forked(preload: Sequence[str], fds: list[int], environment: Mapping[str, str]) -> None:
+def _fork(preload: Sequence[str], fds: list[int], environment: Mapping[str, str]) -> None:
     """Fork a child; start a server when there is none, when it has died, or when its libraries were loaded otherwise.
 
     Some variables are read when a library is loaded, as the number of threads and the instruction set are.
@@ -96,7 +96,7 @@ def _forked(preload: Sequence[str], fds: list[int], environment: Mapping[str, st
 def prepare(preload: Sequence[str]) -> None:
     """Let the server start and import what a child will need, while this process does something else."""
     with contextlib.suppress(OSError):
-        _forked(preload, [], os.environ)
+        _fork(preload, [], os.environ)
 
 
 @atexit.register
@@ -116,13 +116,13 @@ def _stop() -> None:
         server.stop()
 
 
-class Apart:
+class Child:
     """A child process that answers calls one after the other; what a call leaves in it, the next one finds.
 
     Args:
-        about: Whose code it runs, for messages: ``policy.py``.
-        preload: Modules that the server imports before it forks.
-        environment: Variables that it has beside those of this process.
+        about: name of the code that it runs, for messages: ``policy.py``.
+        preload: modules that the server imports before it forks.
+        environment: variables that it has beside those of this process.
     """
 
     def __init__(self, about: str, preload: Sequence[str] = (), environment: Mapping[str, str] | None = None) -> None:
@@ -133,13 +133,13 @@ class Apart:
         page = new_page()
         self._page = Page(page)
         self._open: list[Any] = [self._talk, self._output, self._status]
-        self._last = Last()
-        self._said = Said(about, self._last)
+        self._last = ChildState()
+        self._said = ChildOutput(about, self._last)
         self._received = b""
         self._said_s = 0
         variables = {**os.environ, **(environment or {})}
         try:
-            _forked(preload, [talk.fileno(), output, status.fileno(), page], variables)
+            _fork(preload, [talk.fileno(), output, status.fileno(), page], variables)
         finally:
             talk.close()
             status.close()
@@ -147,17 +147,17 @@ class Apart:
             os.close(page)
         hello = {
             "folder": os.getcwd(), "environment": variables, "path": import_path(),
-            "processors": sorted(os.sched_getaffinity(0)), "named": trust.named_so_far(),
+            "processors": sorted(os.sched_getaffinity(0)), "named": trust.named_folders(),
         }  # fmt: skip
         self._send(hello)
 
-    def __enter__(self) -> Apart:
+    def __enter__(self) -> Child:
         return self
 
     def __exit__(self, kind: object, *_exception: object) -> None:
         if kind is None:  # it has nothing left to do, and ends by itself
             self._talk.shutdown(socket.SHUT_WR)
-            select.select([self._status], [], [], PATIENCE_S)
+            select.select([self._status], [], [], STOP_TIMEOUT_S)
             self._print(last=True)
         self.end()
         for stream in (self._talk, self._status):
@@ -171,14 +171,14 @@ class Apart:
             with contextlib.suppress(OSError):
                 stream.shutdown(socket.SHUT_RDWR)
 
-    def call(self, function: str, job: Mapping[str, Any], tell: Tell, *, own: bool = False) -> Any:
+    def call(self, function: str, job: Mapping[str, Any], tell: OnProgress, *, own: bool = False) -> Any:
         """Call ``module:function`` of vlatool with a job and ``tell``; return its result. All are JSON values.
 
         Args:
-            function: What is called, with ``job`` and ``tell``.
-            job: Its argument.
-            tell: Gets the child's progress.
-            own: It runs vlatool's code alone, and a policy's in children of its own.
+            function: what is called, with ``job`` and ``tell``.
+            job: its argument.
+            tell: callback for the child's progress.
+            own: whether it runs vlatool's code alone, and a policy's in its own children.
 
         Raises:
             VlatoolError: what it raises, of the same class; SourceError when the child ends without an answer.
@@ -189,7 +189,7 @@ class Apart:
         self._last.own, self._last.doing, self._last.told = own, None, ""
         self._send({"call": function, "job": dict(job)})
         while True:
-            for line in self._lines(tell):
+            for line in self._read_replies(tell):
                 if "progress" in line:
                     self._last.told = plain(line["progress"][0])
                     tell(self._last.told, line["progress"][1])
@@ -197,7 +197,7 @@ class Apart:
                     what = line["doing"]
                     self._last.doing = what and (plain(what[0]), plain(what[1]), plain(what[2]))
                 elif "warning" in line:
-                    warnings.warn(shortened(line["warning"]), UserWarning, stacklevel=2)
+                    warnings.warn(truncate(line["warning"]), UserWarning, stacklevel=2)
                 else:
                     self._print()
                     return result(line, self.about, own=own)
@@ -206,7 +206,7 @@ class Apart:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # how it ended is found by reading
             self._talk.sendall(json.dumps(line).encode() + b"\n")
 
-    def _lines(self, tell: Tell) -> Iterable[dict[str, Any]]:
+    def _read_replies(self, tell: OnProgress) -> Iterable[dict[str, Any]]:
         """Wait for the child; return what it says, and show what it prints.
 
         What it calls that may never return is looked at from here: a library may let no thread of its process run.
@@ -214,9 +214,9 @@ class Apart:
         Lines are read one by one: what was said before a line that is nonsense counts, though both came together.
         """
         waits = self._talk in self._open
-        ready = select.select(self._open, [], [], LOOK_S if waits else PATIENCE_S)[0]
+        ready = select.select(self._open, [], [], POLL_S if waits else STOP_TIMEOUT_S)[0]
         if waits and not {self._talk, self._status}.intersection(ready):
-            self._look(tell)
+            self._check_call(tell)
             if not ready:
                 return []
         if self._output in ready:
@@ -228,12 +228,12 @@ class Apart:
             return (read(line, self.about) for line in whole)
         if self._status in ready and not (self._talk in self._open and self._receive()):
             self._print(last=True)
-            raise ended(_received(self._status), self.about, self._last)
+            raise ending_error(_receive_all(self._status), self.about, self._last)
         if not ready:
             raise SourceError(f"{self.about} closed what its process answers with.", "let it close its own files alone")
         return []
 
-    def _look(self, tell: Tell) -> None:
+    def _check_call(self, tell: OnProgress) -> None:
         """Say what the child waits for, and end it where a call takes longer than it may.
 
         Raises:
@@ -245,14 +245,14 @@ class Apart:
             self.end()
             at = f" {plain(call.at)}" if call.at else ""
             raise SourceError(f"{plain(call.whose)} did not return within {call.limit_s:g} s{at}.", plain(call.fix))
-        if call is not None and waited >= min(SAID_S, call.limit_s / 10) and int(waited) > self._said_s:
+        if call is not None and waited >= min(REPORT_AFTER_S, call.limit_s / 10) and int(waited) > self._said_s:
             tell(f"waiting for {plain(call.waiting)}, {int(waited)} s of {call.limit_s:g} s", None)
         self._said_s = int(waited)
 
     def _receive(self) -> bool:
         """Read what the child says; say whether there was anything."""
         try:
-            more = self._talk.recv(BLOCK, socket.MSG_DONTWAIT)
+            more = self._talk.recv(BLOCK_BYTES, socket.MSG_DONTWAIT)
         except BlockingIOError:
             return False
         except ConnectionResetError:
@@ -260,9 +260,9 @@ class Apart:
         if not more:
             self._open.remove(self._talk)
         self._received += more
-        if len(self._received) > LONGEST_ANSWER:
+        if len(self._received) > MAX_ANSWER_BYTES:
             raise SourceError(
-                f"{self.about}: the process that runs it answers more than {LONGEST_ANSWER:,} bytes.",
+                f"{self.about}: the process that runs it answers more than {MAX_ANSWER_BYTES:,} bytes.",
                 "let it answer less: fewer episodes or samples at a time, and its own files alone",
             )
         return bool(more)
@@ -270,7 +270,7 @@ class Apart:
     def _print(self, last: bool = False) -> None:
         """Show what the child has printed."""
         while self._output in self._open and select.select([self._output], [], [], 0)[0]:
-            printed = os.read(self._output, BLOCK)
+            printed = os.read(self._output, BLOCK_BYTES)
             if not printed:
                 self._open.remove(self._output)
             self._said.take(printed)
@@ -281,23 +281,23 @@ class Apart:
 def call(
     function: str,
     job: Mapping[str, Any],
-    tell: Tell,
+    tell: OnProgress,
     about: str,
     preload: Sequence[str] = (),
     environment: Mapping[str, str] | None = None,
     *,
     own: bool = False,
 ) -> Any:
-    """Call a function in a child of its own; see ``Apart`` and ``Apart.call``."""
-    with Apart(about, preload, environment) as child:
+    """Call a function in a child of its own; see ``Child`` and ``Child.call``."""
+    with Child(about, preload, environment) as child:
         return child.call(function, job, tell, own=own)
 
 
-def spread(
+def map_jobs(
     function: str,
     jobs: Sequence[Mapping[str, Any]],
     processes: int,
-    tell: Tell,
+    tell: OnProgress,
     about: str,
     preload: Sequence[str] = (),
     last: str = "",
@@ -306,10 +306,10 @@ def spread(
     """Yield the result of every job, in order, computed in several children; close the iterator to end them.
 
     Args:
-        last: Called in every child when all is done, with an empty job.
-        done: Called with the number of a job and its result as soon as it is there, in a thread of its own.
+        last: called in every child when all is done, with an empty job.
+        done: function called with the number of a job and its result as soon as it is there, in a thread of its own.
     """  # fmt: skip
-    idle: SimpleQueue[Apart] = SimpleQueue()
+    idle: SimpleQueue[Child] = SimpleQueue()
 
     def run(number: int, job: Mapping[str, Any]) -> Any:
         child = idle.get()
@@ -322,7 +322,7 @@ def spread(
         return answer
 
     with contextlib.ExitStack() as opened, ThreadPoolExecutor(processes) as threads:
-        children = [opened.enter_context(Apart(about, preload)) for _ in range(max(1, min(processes, len(jobs))))]
+        children = [opened.enter_context(Child(about, preload)) for _ in range(max(1, min(processes, len(jobs))))]
         for child in children:
             idle.put(child)
         try:
@@ -336,9 +336,9 @@ def spread(
             raise
 
 
-def _received(stream: socket.socket) -> bytes:
+def _receive_all(stream: socket.socket) -> bytes:
     """Return what there is to read, nothing at the end."""
     try:
-        return stream.recv(BLOCK, socket.MSG_DONTWAIT)
+        return stream.recv(BLOCK_BYTES, socket.MSG_DONTWAIT)
     except (BlockingIOError, ConnectionResetError):
         return b""

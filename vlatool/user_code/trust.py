@@ -1,4 +1,4 @@
-"""Whose code may run: that of the folders which the user named in this command, or trusted before.
+"""Trust in code: only that of folders which the user named in this command, or trusted before, may run.
 
 A bundle is data: nothing that its files say makes code run. What a stage needs of a policy's code is in the folder
 that the bundle notes; it runs when the user named that folder (SOURCE, ``--policy``, ``--environment``), or trusted it
@@ -20,26 +20,26 @@ from typing import Any
 from vlatool.bundle.bundle import hash_file
 from vlatool.errors import OutputError, SourceError, UsageError
 
-PLACE = "VLATOOL_TRUST"
+TRUST_VARIABLE = "VLATOOL_TRUST"
 SCHEMA = 1
-DATA = (".safetensors", ".npz", ".npy", ".onnx", ".png", ".jpg", ".mp4")
+DATA_SUFFIXES = (".safetensors", ".npz", ".npy", ".onnx", ".png", ".jpg", ".mp4")
 """Endings of files that hold no code, whatever reads them."""
 HISTORY = ".git"
 CACHE = "__pycache__"
 """Where Python keeps ``module.TAG.pyc``: the policy's code is not read from there (``sources/_fresh.py``)."""
-MOST_FILES = 20_000
-SMALLER = "name a smaller directory"
+MAX_FILES = 20_000
+NAME_SMALLER = "name a smaller directory"
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedFolder:
     """A folder whose code may run.
 
     Args:
-        folder: Absolute, links resolved.
-        description: Its ``policy.yaml``, however it is called; empty for the usual name.
+        folder: absolute, links resolved.
+        description: its ``policy.yaml``, however it is called; empty for the usual name.
         factory: ``path.py:make`` where the user named one; empty for the one in the description.
-        remembered: Trusted before, by the hash of what is in the folder, and not named now.
+        remembered: trusted before, by the hash of what is in the folder, and not named now.
     """
 
     folder: str
@@ -48,13 +48,13 @@ class Named:
     remembered: bool = False
 
 
-_named: dict[str, Named] = {}
+_named: dict[str, NamedFolder] = {}
 
 
-def name(folder: Path, description: Path | None = None, factory: str = "") -> None:
-    """Note that the user named a folder: code in it may run in this process."""
+def allow(folder: Path, description: Path | None = None, factory: str = "") -> None:
+    """Allow the code in a folder that the user named to run in this process."""
     where = str(folder.resolve())
-    _named[where] = Named(where, str(description.resolve()) if description else "", factory)
+    _named[where] = NamedFolder(where, str(description.resolve()) if description else "", factory)
 
 
 def is_named(folder: Path) -> bool:
@@ -62,21 +62,21 @@ def is_named(folder: Path) -> bool:
     return str(folder.resolve()) in _named
 
 
-def named_so_far() -> list[list[Any]]:
+def named_folders() -> list[list[Any]]:
     """Return what was named, as JSON values for a child process."""
     return [list(astuple(folder)) for folder in _named.values()]
 
 
 def restore(named: Sequence[Sequence[Any]]) -> None:
-    """Take over what the parent process was told."""
+    """Take over the named folders of the parent process."""
     _named.clear()
-    _named.update({entry[0]: Named(*entry) for entry in named})
+    _named.update({entry[0]: NamedFolder(*entry) for entry in named})
 
 
 @contextlib.contextmanager
-def nothing_named() -> Iterator[None]:
-    """Begin a command: what an earlier one named in this process does not count for it."""
-    before = named_so_far()
+def forget_named() -> Iterator[None]:
+    """Begin a command: forget the folders that earlier commands of this process named."""
+    before = named_folders()
     restore(())
     try:
         yield
@@ -84,12 +84,12 @@ def nothing_named() -> Iterator[None]:
         restore(before)
 
 
-def require(folder: Path, runs: str) -> Named:
+def require(folder: Path, runs: str) -> NamedFolder:
     """Return how a folder was named.
 
     Args:
-        folder: Whose code would run.
-        runs: What would run: ``make() of policy.py``.
+        folder: folder whose code would run.
+        runs: what would run: ``make() of policy.py``.
 
     Raises:
         SourceError: when the folder was neither named nor trusted, or has changed since it was trusted.
@@ -98,8 +98,8 @@ def require(folder: Path, runs: str) -> Named:
     if where in _named:
         return _named[where]
     trusted = _read().get(where)
-    if trusted is not None and trusted == content(folder):
-        return Named(where, remembered=True)
+    if trusted is not None and trusted == content_hash(folder):
+        return NamedFolder(where, remembered=True)
     why = "which you did not name" if trusted is None else "which has changed since you trusted it"
     raise SourceError(
         f"This would run {runs} in {where}, {why}.",
@@ -111,13 +111,13 @@ def trust(folder: Path) -> None:
     """Remember that the code in a folder, as it is now, may run.
 
     Raises:
-        UsageError: when it is no folder, or holds too much.
+        UsageError: when it is not a folder, or has too many files.
         OutputError: when it cannot be remembered.
     """
     if not folder.is_dir():
         raise UsageError(f"--trust {folder} is not a directory.", "name the directory of a policy")
-    trusted = {**_read(), str(folder.resolve()): content(folder)}
-    file = place()
+    trusted = {**_read(), str(folder.resolve()): content_hash(folder)}
+    file = trust_file()
     draft = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -126,17 +126,18 @@ def trust(folder: Path) -> None:
         draft.replace(file)
     except OSError as error:
         draft.unlink(missing_ok=True)
-        raise OutputError(f"{file} cannot be written: {error.strerror}.", f"name another file: {PLACE}=FILE") from error
+        fix = f"name another file: {TRUST_VARIABLE}=FILE"
+        raise OutputError(f"{file} cannot be written: {error.strerror}.", fix) from error
 
 
-def place() -> Path:
+def trust_file() -> Path:
     """Return the file of what is trusted: ``$VLATOOL_TRUST``, or ``vlatool/trusted.json`` among the user's settings."""
-    if named := os.environ.get(PLACE):
+    if named := os.environ.get(TRUST_VARIABLE):
         return Path(named)
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "vlatool" / "trusted.json"
 
 
-def content(folder: Path) -> str:
+def content_hash(folder: Path) -> str:
     """Return the hash of all files of a folder that could hold code: names and bytes; links are followed.
 
     Raises:
@@ -144,15 +145,15 @@ def content(folder: Path) -> str:
     """
     digest = hashlib.sha256()
     for count, (name, path) in enumerate(_files(folder)):
-        if count >= MOST_FILES:
+        if count >= MAX_FILES:
             raise UsageError(
-                f"{folder} has more than {MOST_FILES:,} files, too many to trust.",
-                f"{SMALLER}; installed packages (.venv, node_modules) and data belong elsewhere",
+                f"{folder} has more than {MAX_FILES:,} files, too many to trust.",
+                f"{NAME_SMALLER}; installed packages (.venv, node_modules) and data belong elsewhere",
             )
         try:
             digest.update(json.dumps([name, hash_file(path) if isinstance(path, Path) else f"is {path}"]).encode())
         except OSError as error:
-            raise UsageError(f"{path} cannot be read: {error.strerror}; it cannot be trusted.", SMALLER) from error
+            raise UsageError(f"{path} cannot be read: {error.strerror}; it cannot be trusted.", NAME_SMALLER) from error
     return f"sha256:{digest.hexdigest()}"
 
 
@@ -161,7 +162,7 @@ def _files(folder: Path) -> Iterator[tuple[str, Path | str]]:
     seen: dict[tuple[int, int], str] = {}
 
     def unreadable(error: OSError) -> None:
-        raise UsageError(f"{error.filename} cannot be read: {error.strerror}; it cannot be trusted.", SMALLER)
+        raise UsageError(f"{error.filename} cannot be read: {error.strerror}; it cannot be trusted.", NAME_SMALLER)
 
     for root, folders, names in os.walk(folder, followlinks=True, onerror=unreadable):
         here = Path(root).relative_to(folder)
@@ -175,7 +176,7 @@ def _files(folder: Path) -> Iterator[tuple[str, Path | str]]:
         for name in sorted(names):
             path = Path(root, name)
             cached = here.name == CACHE and name.endswith(".pyc") and name.count(".") > 1
-            if not cached and path.suffix not in DATA and path.is_file():
+            if not cached and path.suffix not in DATA_SUFFIXES and path.is_file():
                 yield (here / name).as_posix(), path
 
 
@@ -183,9 +184,9 @@ def _read() -> dict[str, str]:
     """Return folder -> content hash of what is trusted.
 
     Raises:
-        SourceError: when somebody else may write the file, or it makes no sense.
+        SourceError: when other users may write the file, or it is invalid.
     """
-    file = place()
+    file = trust_file()
     try:
         with file.open(encoding="utf-8") as stream:
             about = os.fstat(stream.fileno())

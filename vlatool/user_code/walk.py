@@ -1,4 +1,4 @@
-"""Which files lie below a folder of a user's code."""
+"""The files below a folder of user code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vlatool.user_code.trust import CACHE
 def files_below(folder: Path) -> Iterator[Path]:
     """Yield the regular files below a folder, sorted; links are followed, each directory is entered once.
 
-    Hidden ones and bytecode are left out: they are no part of what a policy or an environment is made of. A directory
+    Hidden ones and bytecode are left out: they are not part of a policy or an environment. A directory
     that cannot be read has none.
     """
     seen: set[tuple[int, int]] = set()

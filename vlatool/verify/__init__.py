@@ -1,4 +1,4 @@
-"""Whether a policy directory gives what the code that it was made from gives, and if not, which part of it differs."""
+"""Comparison of a policy directory with the code that it was made from, and of the stages in which they differ."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Options:
 
     Args:
         against: ``original.py:act`` or ``package.module:act``.
-        data: Recorded observations; the policy's own when None.
-        samples: Observations at most.
-        tolerance: Largest relative error of an action, of an input and of the network's output.
-        seed: Of the noise that both are given.
+        data: recorded observations; the policy's own when None.
+        samples: observations at most.
+        tolerance: largest relative error of an action, of an input and of the network's output.
+        seed: seed of the noise that both are given.
     """
 
     against: str
@@ -43,9 +43,9 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
     """Run the policy and the original on the same observations, in a child process, and compare.
 
     Args:
-        bundle: A source bundle, whose torch modules run, or one with graphs.
-        options: What is compared.
-        context: Whom to tell.
+        bundle: a source bundle, whose torch modules run, or one with graphs.
+        options: what is compared.
+        context: whom to tell.
 
     Raises:
         SourceError: when the original cannot be imported, fails, or gives something that is not an action.
@@ -53,19 +53,19 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
     """
     file = factory_file(options.against, Path.cwd())
     if file is not None:
-        trust.name(file.parent)
+        trust.allow(file.parent)
     job = {
         "bundle": str(bundle.path.absolute()), "against": options.against, "folder": str(Path.cwd()),
         "data": str(options.data.absolute()) if options.data else "", "samples": options.samples,
         "tolerance": options.tolerance, "seed": options.seed,
     }  # fmt: skip
     about = split_factory(options.against)[0]
-    comparison = children.call("vlatool.verify._compare:compare", job, context.tell, about, PRELOAD)
+    comparison = children.call("vlatool.verify._compare:compare", job, context.progress, about, PRELOAD)
     return _report(bundle, options, comparison)
 
 
 def check(options: Options) -> None:
-    """Raise a usage error for options that make no sense."""
+    """Raise a usage error for invalid options."""
     if not 0 <= options.tolerance < 1:
         raise UsageError(
             f"--tolerance is {options.tolerance:g}; allowed: from 0, below 1.", "give a share such as --tolerance 0.001"

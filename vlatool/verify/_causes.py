@@ -1,4 +1,4 @@
-"""Why the actions differ: what the compared stages say, and else what would make the two equal."""
+"""Causes of a difference between actions: the compared stages, or else the changes that would make both equal."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 Change = Callable[["Sample"], Mapping[str, Array]]
-TRIED = 6
+MAX_TRIED = 6
 """Observations on which a guess must make both equal."""
-LEAST_FIT = 16
+MIN_FIT_VALUES = 16
 """Values of an element from which a straight line through them says something."""
-LEFT_OVER = 0.1
+MAX_RESIDUAL = 0.1
 """Share of a difference that a straight line may leave and still explain it: through mere rounding it leaves most."""
 NARROW = {"float16": (2.0**-11, 2.0**-25), "bfloat16": (2.0**-8, 2.0**-133)}
 """Dtype -> the relative and the least absolute rounding."""
@@ -40,7 +40,7 @@ def causes(
     text = [*known, *_of_texts(policy, samples, tolerance)]
     where = "no single change of an input or of the action makes both equal, so it is the network (weights, layers, "
     where += "eval mode, the order of the inputs), or more than one stage"
-    return [*text, f"It cannot be told for certain which stage differs: {where}."], False
+    return [*text, f"Which stage differs is not certain: {where}."], False
 
 
 def _of_quantization(policy: Policy) -> Iterator[str]:
@@ -63,7 +63,7 @@ def _of_rounding(policy: Policy, samples: Sequence[Sample]) -> Iterator[str]:
     theirs = np.concatenate([sample.expected for sample in samples])
     for dtype, (relative, least) in NARROW.items():
         within = np.abs(mine - theirs) <= 1.1 * np.maximum(relative * np.abs(mine), least)
-        if within.all() and np.array_equal(_narrowed(theirs, dtype), theirs):
+        if within.all() and np.array_equal(_round_to(theirs, dtype), theirs):
             yield (
                 f"The original's action is in {dtype}, and the difference is that rounding: let it return float32, or "
                 "pass a --tolerance that allows it."
@@ -71,7 +71,7 @@ def _of_rounding(policy: Policy, samples: Sequence[Sample]) -> Iterator[str]:
             return
 
 
-def _narrowed(values: Array, dtype: str) -> Array:
+def _round_to(values: Array, dtype: str) -> Array:
     """Return the values as that dtype holds them; bfloat16 is float32 without its lower 16 bits."""
     if dtype == "float16":
         with np.errstate(over="ignore"):
@@ -102,16 +102,16 @@ def _of_stages(
         yield from guessed
         if guessed or not before:
             return
-        those = "The inputs are" if not others else f"Of the inputs, {_listed(compared)} {_are(compared)}"
+        those = "The inputs are" if not others else f"Of the inputs, {_quoted_names(compared)} {_are(compared)}"
         words = f"{those} the same, the network's output is not, first on observation {network['first']}"
         if any(_of_quantization(policy)):
             yield f"{words}, as is to be expected."
             return
         words += ": look at weights, layers, eval mode, and the order in which forward() takes the inputs"
-        yield words + (f", and at {_listed(others)}, which preprocess() does not return." if others else ".")
+        yield words + (f", and at {_quoted_names(others)}, which preprocess() does not return." if others else ".")
 
 
-def _listed(names: Sequence[str]) -> str:
+def _quoted_names(names: Sequence[str]) -> str:
     return " and ".join(", ".join(f"'{name}'" for name in part) for part in (names[:-1], names[-1:]) if part)
 
 
@@ -125,8 +125,8 @@ def _by(samples: Sequence[Sample], stage: Mapping[str, Any]) -> str:
     mine, theirs = sample.encoded[stage["input"]], sample.inputs[stage["input"]]
     if mine.shape != theirs.shape:
         return f": {list(mine.shape)} here, {list(theirs.shape)} in the original"
-    place = np.unravel_index(int(np.abs(mine.astype(np.float64) - theirs).argmax()), mine.shape)
-    return f": {mine[place]:.6g} here, {theirs[place]:.6g} in the original, at {[int(entry) for entry in place[1:]]}"
+    index = np.unravel_index(int(np.abs(mine.astype(np.float64) - theirs).argmax()), mine.shape)
+    return f": {mine[index]:.6g} here, {theirs[index]:.6g} in the original, at {[int(entry) for entry in index[1:]]}"
 
 
 def _of_action(policy: Policy, samples: Sequence[Sample], tolerance: float) -> Iterator[str]:
@@ -147,7 +147,7 @@ def _of_lines(policy: Policy, samples: Sequence[Sample], tolerance: float) -> It
     """Fit the original's elements as straight lines of this policy's: a difference in scale or offset alone."""
     mine = np.concatenate([sample.chunk for sample in samples])
     theirs = np.concatenate([sample.expected for sample in samples])
-    if len(mine) < LEAST_FIT:
+    if len(mine) < MIN_FIT_VALUES:
         return
     labels = policy.spec.action.labels or tuple(map(str, range(mine.shape[1])))
     lines = []
@@ -162,7 +162,7 @@ def _of_lines(policy: Policy, samples: Sequence[Sample], tolerance: float) -> It
         if not np.abs(left).max() <= 10 * tolerance * float(theirs[:, index].std()):
             return
         if abs(slope - 1) > tolerance or abs(offset) > tolerance * spread:
-            if not left.std() <= LEFT_OVER * np.sqrt(np.mean((theirs - mine)[:, index] ** 2)):
+            if not left.std() <= MAX_RESIDUAL * np.sqrt(np.mean((theirs - mine)[:, index] ** 2)):
                 return
             lines.append(f"the original's {label} is {slope:.4g} times this policy's plus {offset:.4g}")
     if lines:
@@ -185,23 +185,23 @@ def _changes(policy: Policy) -> Iterator[tuple[str, Change]]:
             words = f"The normalisation of '{name}' differs: the original takes it as it is, this policy with "
             yield words + f"{tensor.normalisation}.", _as_it_is(name)
         if tensor.dtype == "uint8" and tensor.shape[-1] == 3:
-            yield f"The channels of '{name}' differ: with red and blue exchanged both are equal.", _mirrored(name)
-    for place, one in enumerate(inputs):
-        for other in inputs[place + 1 :]:
+            yield f"The channels of '{name}' differ: with red and blue exchanged both are equal.", _mirror(name)
+    for index, one in enumerate(inputs):
+        for other in inputs[index + 1 :]:
             if (one.shape, one.dtype) == (other.shape, other.dtype):
                 words = f"The inputs '{one.name}' and '{other.name}' are exchanged."
-                yield words, _exchanged(one.name, other.name)
+                yield words, _exchange(one.name, other.name)
 
 
 def _as_it_is(name: str) -> Change:
     return lambda sample: {**sample.encoded, name: _physical(sample, name)}
 
 
-def _mirrored(name: str) -> Change:
+def _mirror(name: str) -> Change:
     return lambda sample: {**sample.encoded, name: np.ascontiguousarray(sample.encoded[name][..., ::-1])}
 
 
-def _exchanged(one: str, other: str) -> Change:
+def _exchange(one: str, other: str) -> Change:
     return lambda sample: {**sample.encoded, one: sample.encoded[other], other: sample.encoded[one]}
 
 
@@ -217,7 +217,7 @@ def _equal(policy: Policy, samples: Sequence[Sample], change: Change, tolerance:
     if policy.program.keeps:
         return False
     differing = [sample for sample in samples if not sample.error <= tolerance]
-    chosen = [*differing[:TRIED], *samples[:TRIED]]
+    chosen = [*differing[:MAX_TRIED], *samples[:MAX_TRIED]]
     for sample in chosen:
         try:
             values = policy.program.run({name: value.copy() for name, value in change(sample).items()}, sample.noise)

@@ -1,4 +1,4 @@
-"""Both sides on the same observations, in this process: actions, and what is known of the stages between."""
+"""Run both sides on the same observations in this process: actions, and the stages between as far as known."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
-from vlatool.data import CALIBRATION, EVALUATION, Recording, read_recording, synthetic_observations
+from vlatool.data import Recording, read_recording, recordings_of, synthetic_observations
 from vlatool.module.torch_policy import torch_policy
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import draw
@@ -20,7 +20,7 @@ from vlatool.verify._original import Original, as_fed
 from vlatool.verify._sample import Sample, error_of
 
 Array = NDArray[Any]
-LARGEST = 1e9
+MAX_ERROR = 1e9
 
 
 def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
@@ -32,8 +32,8 @@ def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
     recording = _recording(bundle, Path(job["data"]) if job["data"] else None)
     random = np.random.default_rng(seed)
     samples = []
-    for place, (number, observation, begins) in enumerate(_observations(policy, recording, int(job["samples"]))):
-        tell("running both", place / int(job["samples"]))
+    for index, (number, observation, begins) in enumerate(_observations(policy, recording, int(job["samples"]))):
+        tell("running both", index / int(job["samples"]))
         if begins:
             policy.reset()
             original.reset()
@@ -52,8 +52,8 @@ def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
 
 
 def _recording(bundle: Bundle, data: Path | None) -> Recording | None:
-    own = [bundle.path / name for name in (EVALUATION, CALIBRATION) if name in bundle.manifest.files]
-    path = data or next(iter(own), None)
+    own = recordings_of(bundle)
+    path = data or own.evaluation or own.calibration
     return None if path is None else read_recording(path, bundle.manifest.spec)
 
 
@@ -140,17 +140,17 @@ def _error(got: Array, expected: Array) -> float:
         got, expected = got.reshape(-1), expected.reshape(-1)
         alike = (got == expected) | (np.isnan(got) & np.isnan(expected))
         got, expected = got[~alike | np.isfinite(got)], expected[~alike | np.isfinite(got)]
-    return min(relative_error(got, expected), LARGEST)
+    return min(relative_error(got, expected), MAX_ERROR)
 
 
 def _worst(errors: list[float]) -> float:
-    return float(np.nanmax([LARGEST if error != error else error for error in errors], initial=0.0))
+    return float(np.nanmax([MAX_ERROR if error != error else error for error in errors], initial=0.0))
 
 
 def _warnings(policy: Policy, original: Original, recording: Recording | None) -> list[str]:
     warnings = []
     if recording is None:
-        warnings.append("there is no recording, so both ran on random observations: pass --data FILE.npz to compare on "
+        warnings.append("nothing is recorded, so both ran on random observations: pass --data FILE.npz to compare on "
                      "what the policy is for")  # fmt: skip
     if any(step.noise for step in policy.bundle.manifest.program) and not original.takes_noise:
         warnings.append("the policy draws noise, and act() takes none: the difference is also that of the noise; write "

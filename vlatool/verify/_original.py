@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError, VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.module.factory import exits_caught, import_factory
+from vlatool.module.factory import import_factory, map_user_exceptions
 
 Array = NDArray[Any]
 
@@ -24,8 +24,8 @@ class Original:
 
     Args:
         factory: ``original.py:act`` or ``package.module:act``.
-        folder: What a path counts from.
-        spec: Of the policy that is compared.
+        folder: what a path counts from.
+        spec: spec of the policy that is compared.
 
     Raises:
         SourceError, MissingExtra: when it cannot be imported.
@@ -49,11 +49,11 @@ class Original:
     def reset(self) -> None:
         """Begin an episode, where the code has a function for it."""
         if self._reset is not None:
-            self._called(self._reset, "reset", -1)
+            self._call(self._reset, "reset", -1)
 
     def act(self, observation: Mapping[str, Any], noise: Mapping[str, Array], number: int) -> Array:
         """Return its action: (T, A) float64 in physical units, T at most the chunk; or (T,) int64 indices."""
-        answer = self._called(self._act, "act", number, observation, **self._noise(self._act, noise))
+        answer = self._call(self._act, "act", number, observation, **self._noise(self._act, noise))
         return self._indices(answer, number) if self._spec.action.kind == "discrete" else self._chunk(answer, number)
 
     def preprocess(self, observation: Mapping[str, Any], number: int) -> dict[str, Array]:
@@ -64,7 +64,7 @@ class Original:
         """
         if self._preprocess is None:
             return {}
-        answer = self._called(self._preprocess, "preprocess", number, observation)
+        answer = self._call(self._preprocess, "preprocess", number, observation)
         names = [tensor.name for tensor in self._spec.inputs]
         if not isinstance(answer, Mapping) or not answer or not set(answer) <= set(names):
             got = ", ".join(map(str, answer)) if isinstance(answer, Mapping) else f"a {type(answer).__name__}"
@@ -83,18 +83,18 @@ class Original:
         """Return what its network gives, before it is un-normalised; None when it has no function for that."""
         if self._raw is None:
             return None
-        answer = self._called(self._raw, "raw", number, observation, **self._noise(self._raw, noise))
+        answer = self._call(self._raw, "raw", number, observation, **self._noise(self._raw, noise))
         return self._array(answer, "raw()", number)
 
     def _noise(self, function: Callable[..., Any], noise: Mapping[str, Array]) -> dict[str, Any]:
         return {"noise": {name: value.copy() for name, value in noise.items()}} if _takes(function, "noise") else {}
 
-    def _called(
+    def _call(
         self, function: Callable[..., Any], name: str, number: int, *arguments: Mapping[str, Any], **more: Any
     ) -> Any:
         where = f"{name}() of '{self._name}'" + (f", on observation {number}," if number >= 0 else "")
         try:
-            with exits_caught(where):
+            with map_user_exceptions(where):
                 return function(*(copy.deepcopy(dict(argument)) for argument in arguments), **more)
         except (VlatoolError, MemoryError):
             raise
@@ -117,7 +117,7 @@ class Original:
             ) from error
         if array.dtype.kind not in "biuf" or not array.size:
             raise SourceError(
-                f"{what} of '{self._name}' gives {_described(value, array)}; wanted an array of numbers.",
+                f"{what} of '{self._name}' gives {_describe(value, array)}; wanted an array of numbers.",
                 "return a numpy array, or a tensor of float32",
             )
         if finite and not np.isfinite(array).all():
@@ -148,7 +148,7 @@ class Original:
         right = flat.dtype.kind in "iu" and 1 <= flat.size <= self._spec.chunk
         if not right or not ((flat >= 0) & (flat < len(labels))).all():
             raise SourceError(
-                f"act() of '{self._name}' gives {_described(answer, array)} for '{action.name}'; wanted an index from "
+                f"act() of '{self._name}' gives {_describe(answer, array)} for '{action.name}'; wanted an index from "
                 f"0 to {len(labels) - 1}, or one of {', '.join(labels)}.",
                 "return argmax of the logits",
             )
@@ -172,7 +172,7 @@ def _takes(function: Callable[..., Any], name: str) -> bool:
         return False
 
 
-def _described(value: Any, array: Array) -> str:
+def _describe(value: Any, array: Array) -> str:
     if isinstance(value, Mapping):
         return f"a dict of {', '.join(map(str, value))}"[:120]
     return repr(value)[:60] if array.size <= 4 else f"an array of {array.dtype} with the shape {list(array.shape)}"

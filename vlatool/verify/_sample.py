@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vlatool.runtime.policy import Policy
 
 Array = NDArray[Any]
-LARGEST = 1e9
+MAX_ERROR = 1e9
 
 
 @dataclass(frozen=True)
@@ -19,16 +19,16 @@ class Sample:
     """One observation and what both sides made of it.
 
     Args:
-        number: Its place in the recording.
-        observation: Physical values.
-        noise: What both were given in the place of noise of their own.
-        encoded: What this policy's network takes, with a batch axis.
-        raw: What its network gives.
-        chunk: Its action: (T, A) float64, or (T,) int64.
-        expected: The original's, the same, as many leading steps as it gives.
-        inputs: What the original's network takes, as far as it tells it.
-        expected_raw: What that gives, None when it does not tell it.
-        error: Relative error of the action.
+        number: its place in the recording.
+        observation: physical values.
+        noise: noise that both were given.
+        encoded: what this policy's network takes, with a batch axis.
+        raw: what its network gives.
+        chunk: its action: (T, A) float64, or (T,) int64.
+        expected: the original's, the same, as many leading steps as it gives.
+        inputs: what the original's network takes, as far as it tells it.
+        expected_raw: what that gives, None when it does not tell it.
+        error: relative error of the action.
     """
 
     number: int
@@ -47,4 +47,4 @@ def error_of(policy: Policy, got: Array, expected: Array) -> float:
     """Return the relative error of an action: by the spread of each element; the share of others where discrete."""
     if policy.spec.action.kind == "discrete":
         return float(np.mean(got != expected))
-    return min(policy.chunk_error(got, expected), LARGEST)
+    return min(policy.chunk_error(got, expected), MAX_ERROR)

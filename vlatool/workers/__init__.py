@@ -1,7 +1,7 @@
-"""Who computes jobs: children of this process, or the workers of an existing engine on several machines; a file each.
+"""Launchers of workers: child processes on this machine, or an existing cluster of several machines; one file each.
 
 A launcher knows nothing of episodes: it calls a function of vlatool with one request after the other, each in a child
-process (``vlatool.user_code.children``), and hands the answers back in the order of the requests, whoever gave them.
+process (``vlatool.user_code.children``), and returns the answers in the order of the requests.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlatool import registry
-from vlatool.errors import PluginError, UsageError, nearest
+from vlatool.errors import PluginError, UsageError, suggest
 
 KIND = "workers"
 PROCESSES = "processes"
 """The launcher that is there without any other package."""
-Tell = Callable[[str, float | None], None]
+OnProgress = Callable[[str, float | None], None]
 Done = Callable[[int, Any], None]
 Note = Callable[[str], None]
 
@@ -26,8 +26,8 @@ class Folder:
     """A folder whose path requests name; a worker on another machine is sent its files.
 
     Args:
-        path: Absolute.
-        names: Of the files below it that are needed; all but hidden ones when empty.
+        path: absolute.
+        names: names of the files below it that are needed; all but hidden ones when empty.
     """
 
     path: str
@@ -42,10 +42,10 @@ class Work:
         function: ``module:function`` of vlatool, called with each request, and ``tell``.
         requests: JSON values. A text that is the path of one of the folders, or begins with it, is that of the copy
             where the worker has one.
-        about: Whose code runs, for messages: ``environment.py``.
-        preload: Modules that the function needs.
-        last: Called in every child when all is done, with an empty request; nothing when empty.
-        folders: What the requests name.
+        about: name of the code that runs, for messages: ``environment.py``.
+        preload: modules that the function needs.
+        last: called in every child when all is done, with an empty request; nothing when empty.
+        folders: what the requests name.
     """
 
     function: str
@@ -60,7 +60,7 @@ class Workers:
     """Base of every launcher.
 
     Args:
-        count: How many workers at most; 0 for as many as there is place for.
+        count: how many workers at most; 0 for as many as there is place for.
     """
 
     def __init__(self, count: int) -> None:
@@ -69,14 +69,14 @@ class Workers:
     def check(self) -> None:
         """Raise a user error when there is nobody to compute; cheap."""
 
-    def answers(self, work: Work, tell: Tell, done: Done, note: Note) -> Generator[Any, None, None]:
+    def answers(self, work: Work, tell: OnProgress, done: Done, note: Note) -> Generator[Any, None, None]:
         """Yield the answer to every request, in order; close the iterator to end the workers.
 
         Args:
-            work: What is to be done.
-            tell: For progress.
-            done: Called with the number of a request and its answer as soon as there is one, from any thread.
-            note: Called with what a reader of the results must know of the workers, a sentence.
+            work: what is to be done.
+            tell: callback for progress.
+            done: function called with the number of a request and its answer as soon as there is one, from any thread.
+            note: function called with what a reader of the results must know of the workers, a sentence.
 
         Raises:
             VlatoolError: what the function raises for a request, once all before it are answered.
@@ -94,20 +94,20 @@ def launcher(name: str, count: int) -> Workers:
     return made
 
 
-def asked_for(text: str) -> tuple[str, int]:
+def parse_workers(text: str) -> tuple[str, int]:
     """Read what a person wrote for workers: ``4`` processes, ``ray``, or ``ray:8``; return launcher and number.
 
     Raises:
         UsageError: for anything else.
 
     Example:
-        >>> asked_for("4")
+        >>> parse_workers("4")
         ('processes', 4)
     """
     name, _, count = text.partition(":") if not text.isdecimal() else (PROCESSES, "", text)
     if name not in registry.names(KIND):
         raise UsageError(
-            f"--workers is '{text}'; it takes a number of processes, or {nearest(name, _others())}.",
+            f"--workers is '{text}'; it takes a number of processes, or {suggest(name, _other_launchers())}.",
             "write --workers 4, or --workers ray:4",
         )
     if ":" in text or count:
@@ -118,5 +118,5 @@ def asked_for(text: str) -> tuple[str, int]:
     return name, 0
 
 
-def _others() -> list[str]:
+def _other_launchers() -> list[str]:
     return [name for name in registry.names(KIND) if name != PROCESSES]

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Generator
 from typing import Any
 
-from vlatool.user_code.children import spread
-from vlatool.workers import Done, Note, Tell, Work, Workers
+from vlatool.user_code.children import map_jobs
+from vlatool.workers import Done, Note, OnProgress, Work, Workers
 
 
 class Processes(Workers):
     """Several child processes, which a server forks that has imported the libraries once."""
 
-    def answers(self, work: Work, tell: Tell, done: Done, note: Note) -> Generator[Any, None, None]:
+    def answers(self, work: Work, tell: OnProgress, done: Done, note: Note) -> Generator[Any, None, None]:
         """Yield the answers in order."""
-        return spread(work.function, work.requests, max(1, self.count), tell, work.about, work.preload, work.last, done)
+        count = max(1, self.count)
+        return map_jobs(work.function, work.requests, count, tell, work.about, work.preload, work.last, done)

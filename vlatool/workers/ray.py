@@ -18,12 +18,12 @@ from typing import Any
 from vlatool.errors import SourceError, TargetError, require, require_present
 from vlatool.files.printable import one_line
 from vlatool.user_code.children import result
-from vlatool.workers import Done, Note, Tell, Work, Workers
-from vlatool.workers._seat import Seat, order_of, this_machine
-from vlatool.workers._shipped import Parcel, blocks, parcel_of
+from vlatool.workers import Done, Note, OnProgress, Work, Workers
+from vlatool.workers._file_transfer import Parcel, blocks, parcel_of
+from vlatool.workers._remote_worker import RemoteWorker, order_of, this_machine
 
 ADDRESS = "RAY_ADDRESS"
-ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 """How often a job is given to a worker that is lost with it, and how many workers in a row may not even begin."""
 WAIT_S = 5.0
 LOOPBACK = ("localhost", "127.0.0.1", "::1", "[::1]")
@@ -39,25 +39,25 @@ class Ray(Workers):
     """
 
     def check(self) -> None:
-        """Raise when there is no ray, or no cluster.
+        """Raise when ray is not installed, or no cluster is running.
 
         Raises:
             MissingExtra: when ray is not installed.
             TargetError: when no cluster can be reached.
         """
         require_present("ray", "ray")
-        _connected()
+        _connect()
 
-    def answers(self, work: Work, tell: Tell, done: Done, note: Note) -> Generator[Any, None, None]:
-        """Yield the answers in order, whoever gave them."""
-        crew = _Crew(_connected(), work, self.count, tell, done, note)
+    def answers(self, work: Work, tell: OnProgress, done: Done, note: Note) -> Generator[Any, None, None]:
+        """Yield the answers in the order of the requests."""
+        workers = _RayWorkers(_connect(), work, self.count, tell, done, note)
         try:
-            yield from crew.run()
+            yield from workers.run()
         finally:
-            crew.dismiss(gently=sys.exc_info()[0] is None)
+            workers.dismiss(gently=sys.exc_info()[0] is None)
 
 
-def _connected() -> Any:
+def _connect() -> Any:
     """Connect this process to the cluster, once; return the library.
 
     Raises:
@@ -69,11 +69,11 @@ def _connected() -> Any:
     address = os.environ.get(ADDRESS) or "auto"
     _refuse_unreachable(address, ray.util.get_node_ip_address())
     try:
-        with _undisturbed():
+        with _keep_signals():
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
         why = one_line(str(error), 300).rstrip(".")
-        raise TargetError(f"There is no Ray cluster that takes this process ({ADDRESS}={address}): {why}.", START) \
+        raise TargetError(f"No Ray cluster accepts this process ({ADDRESS}={address}): {why}.", START) \
             from error  # fmt: skip
     return ray
 
@@ -82,8 +82,8 @@ def _refuse_unreachable(address: str, own: str) -> None:
     """Say at once that nobody listens: Ray itself goes on trying for many minutes.
 
     Args:
-        address: As Ray takes it; ``auto`` is what ``ray start`` noted on this machine.
-        own: This machine's address, which Ray takes for names of the loopback one.
+        address: address, as Ray takes it; ``auto`` is what ``ray start`` noted on this machine.
+        own: this machine's address, which Ray takes for names of the loopback one.
     """
     where = address
     if address == "auto":
@@ -102,7 +102,7 @@ def _refuse_unreachable(address: str, own: str) -> None:
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
+def _keep_signals() -> Iterator[None]:
     """Keep what Ray would change: its workers would import from the current directory, and SIGTERM would be Ray's."""
     before = os.getcwd()
     main = threading.current_thread() is threading.main_thread()
@@ -116,10 +116,10 @@ def _undisturbed() -> Iterator[None]:
             signal.signal(signal.SIGTERM, handler)
 
 
-class _Crew:
+class _RayWorkers:
     """The workers of one piece of work, and who does which job."""
 
-    def __init__(self, ray: Any, work: Work, most: int, tell: Tell, done: Done, note: Note) -> None:
+    def __init__(self, ray: Any, work: Work, most: int, tell: OnProgress, done: Done, note: Note) -> None:
         self._ray, self._work, self._tell, self._done, self._note = ray, work, tell, done, note
         self._parcels = [parcel_of(folder) for folder in work.folders]
         self._order = order_of(work, self._parcels)
@@ -127,7 +127,7 @@ class _Crew:
         self._most = most
         self._waiting = deque(range(len(work.requests)))
         self._busy: dict[Any, tuple[Any, int]] = {}
-        """What is awaited -> the worker that it comes from, and the number of its job."""
+        """Pending object -> the worker that it comes from, and the number of its job."""
         self._idle: list[Any] = []
         self._answers: dict[int, Any] = {}
         self._attempts: Counter[int] = Counter()
@@ -142,7 +142,7 @@ class _Crew:
             TargetError: when no worker can begin.
         """
         count = len(self._work.requests)
-        for _ in range(min(count, self._places())):
+        for _ in range(min(count, self._free_slots())):
             self._hire()
         for number in range(count):
             while number not in self._answers:
@@ -162,20 +162,20 @@ class _Crew:
         self._busy.clear()
         self._sent.clear()
 
-    def _places(self) -> int:
+    def _free_slots(self) -> int:
         """Return how many workers the cluster has place for.
 
         Raises:
             TargetError: when it has none.
         """
-        places = int(self._ray.cluster_resources().get("CPU", 0))
-        if places < 1:
+        slots = int(self._ray.cluster_resources().get("CPU", 0))
+        if slots < 1:
             raise TargetError("The Ray cluster has no processor for a worker.", "start a node: ray start --num-cpus=N")
-        return min(places, self._most or places)
+        return min(slots, self._most or slots)
 
     def _hire(self) -> None:
         """Ask for a worker; it begins when the cluster has a processor for it."""
-        wanted = self._ray.remote(Seat).options(
+        wanted = self._ray.remote(RemoteWorker).options(
             num_cpus=1, max_restarts=0, max_task_retries=0, scheduling_strategy="SPREAD"
         )
         seat = wanted.remote(self._order)
@@ -191,14 +191,14 @@ class _Crew:
             try:
                 answer = self._ray.get(said)
             except self._ray.exceptions.RayError as error:
-                self._lost(seat, number, error)
+                self._replace_worker(seat, number, error)
                 continue
             if number == HELLO:
-                self._arrived(seat, answer)
+                self._welcome(seat, answer)
             else:
-                self._answered(seat, number, answer)
+                self._accept_answer(seat, number, answer)
 
-    def _arrived(self, seat: Any, answer: dict[str, Any]) -> None:
+    def _welcome(self, seat: Any, answer: dict[str, Any]) -> None:
         """Send a new worker what it lacks; give one that lacks nothing a job."""
         if "machine" not in answer:  # the last block has arrived
             result(answer, "a worker of the Ray cluster")
@@ -212,7 +212,7 @@ class _Crew:
         self._next(seat)
 
     def _send(self, seat: Any, number: int) -> Any:
-        """Send a parcel, whose blocks are put into the cluster once; return what is awaited."""
+        """Send a parcel, whose blocks are put into the cluster once; return the pending object."""
         if number not in self._sent:
             parcel: Parcel = self._parcels[number]
             self._tell(f"sending {parcel.folder} to the workers", None)
@@ -237,13 +237,13 @@ class _Crew:
         for name in dict.fromkeys((*here, *there)):
             ours, theirs = (side.get(name, "none") for side in (here, there))
             if ours != theirs:
-                told = f"A worker of the Ray cluster has {name} {theirs}, this machine {ours}: what it computes may "
-                told += "differ in rounding, and so may single episodes."
-                if told not in self._told:
-                    self._told.add(told)
-                    self._note(told)
+                text = f"A worker of the Ray cluster has {name} {theirs}, this machine {ours}: what it computes may "
+                text += "differ in rounding, and so may single episodes."
+                if text not in self._told:
+                    self._told.add(text)
+                    self._note(text)
 
-    def _answered(self, seat: Any, number: int, said: dict[str, Any]) -> None:
+    def _accept_answer(self, seat: Any, number: int, said: dict[str, Any]) -> None:
         """Take what came of a job, and give the worker another one."""
         if said["printed"]:
             with contextlib.suppress(OSError, ValueError, AttributeError):
@@ -254,7 +254,7 @@ class _Crew:
             self._tell(what, None)
         answer = said["answer"]
         if "lost" in answer:
-            self._again(number, answer["lost"], answer["fix"])
+            self._retry(number, answer["lost"], answer["fix"])
         else:
             self._answers[number] = answer
             if "result" in answer:
@@ -270,22 +270,22 @@ class _Crew:
         else:
             self._idle.append(seat)
 
-    def _lost(self, seat: Any, number: int, error: Exception) -> None:
-        """Hire another worker in the place of one that ended, and let its job be done again."""
+    def _replace_worker(self, seat: Any, number: int, error: Exception) -> None:
+        """Replace a worker that ended, and retry its job."""
         with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
             self._ray.kill(seat)
         why = one_line(str(error), 300).rstrip(".")
         self._tell("a worker of the Ray cluster was lost; its job is done again", None)
         if number == HELLO:
             self._attempts[HELLO] += 1
-            if self._attempts[HELLO] >= ATTEMPTS and not self._begun:
+            if self._attempts[HELLO] >= MAX_ATTEMPTS and not self._begun:
                 raise TargetError(
                     f"No worker of the Ray cluster can begin: {why}.",
                     "install vlatool with its extras, the same version, where ray runs on each machine",
                 )
         else:
-            self._again(number, f"{self._work.about}: the worker that ran it was lost: {why}.", "")
-        if self._attempts[HELLO] < ATTEMPTS * ATTEMPTS:
+            self._retry(number, f"{self._work.about}: the worker that ran it was lost: {why}.", "")
+        if self._attempts[HELLO] < MAX_ATTEMPTS * MAX_ATTEMPTS:
             self._hire()
         elif not self._busy and not self._idle:
             raise TargetError(
@@ -293,11 +293,11 @@ class _Crew:
                 "install vlatool with its extras, the same version, where ray runs on each machine",
             )
 
-    def _again(self, number: int, why: str, fix: str) -> None:
+    def _retry(self, number: int, why: str, fix: str) -> None:
         """Let a job be done again, unless it took so many workers with it that the fault is its own."""
         self._attempts[number] += 1
-        if self._attempts[number] >= ATTEMPTS:
-            message = f"{why.rstrip('.')}, {ATTEMPTS} times in a row."
+        if self._attempts[number] >= MAX_ATTEMPTS:
+            message = f"{why.rstrip('.')}, {MAX_ATTEMPTS} times in a row."
             self._answers[number] = {"error": SourceError.__name__, "message": message, "fix": fix}
             return
         self._waiting.appendleft(number)

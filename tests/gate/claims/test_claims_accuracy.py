@@ -11,7 +11,6 @@ import pytest
 
 from vlatool.accuracy.paired import Outcome, success_row
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import EVALUATION
 from vlatool.errors import DataError
 from vlatool.gate.claims import accuracy
 from vlatool.gate.claims.accuracy import data_of, examine
@@ -165,7 +164,7 @@ def test_pairs_that_begin_alike_are_worth_as_many_as_their_starts(
     own = [replace(each, success=each.seed >= lost) for each in base]
     rows = success_row("baseline", "baseline", base), success_row("subject", "subject", own)
     claim = AccuracyClaim(max_drop=0.25, episodes=300)
-    kept = {name: record for name, record in float_bundle.manifest.files.items() if name != EVALUATION}
+    kept = {name: record for name, record in float_bundle.manifest.files.items() if name != "data/evaluation.npz"}
     bare = replace(float_bundle, manifest=replace(float_bundle.manifest, files=kept))
     found = examine(bare, bare, claim, Context(), episodes=SimpleNamespace(rows=rows))
     assert found.verdict == verdict, found.sentence

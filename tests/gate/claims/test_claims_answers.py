@@ -4,14 +4,14 @@ import pytest
 
 from vlatool.gate.claims.answers import examine
 from vlatool.gate.config import AnswersClaim
-from vlatool.measurement.agreement import Agreement, Followed
+from vlatool.measurement.agreement import Agreement, OutputAgreement
 from vlatool.measurement.pairs import Pairs
 
-GOOD = Followed("other", "action", 0.9, 24)
+GOOD = OutputAgreement("other", "action", 0.9, 24)
 
 
 def followed(*correlations: float, kind: str = "other") -> Agreement:
-    each = tuple(Followed(kind, f"out{place}", value, 24) for place, value in enumerate(correlations))
+    each = tuple(OutputAgreement(kind, f"out{place}", value, 24) for place, value in enumerate(correlations))
     return Agreement(each, looked=24)
 
 
@@ -28,7 +28,7 @@ def test_a_policy_that_was_trained_anew_need_not_follow(timed) -> None:
 
 
 def test_what_was_drawn_without_a_recording_decides_only_when_there_is_nothing_else(timed) -> None:
-    drawn = Followed("drawn", "action", 0.1, 24)
+    drawn = OutputAgreement("drawn", "action", 0.1, 24)
     assert examine(Agreement((GOOD, drawn), looked=24), timed(), AnswersClaim()).verdict == "pass"
     assert examine(Agreement((drawn,), looked=24), timed(), AnswersClaim()).verdict == "fail"
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vlatool.files.edited import stamp_of
+from vlatool.files.user_files import stamp_of
 
 
 class Strip:

@@ -97,7 +97,7 @@ def test_a_recurrent_layer_that_stays_float32_is_named(tmp_path: Path, stage: Tr
     for kind in ("gru", "elman"):
         bundle, context = exported(tmp_path / kind, kind, count=2), Context()
         made = run_transform(stage, bundle, tmp_path / f"{kind}-int8", context)
-        said[kind] = [line for line in context.said if "recurrent layer" in line]
+        said[kind] = [line for line in context.messages if "recurrent layer" in line]
         assert (made.manifest.graphs["main"].precision.get("float32", 0) > 0.5) is (kind == "gru")
     assert "gru/GRU, gru/GRU_1 computed in float32" in said["gru"][0]
     assert not said["elman"]

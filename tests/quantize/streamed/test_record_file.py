@@ -16,8 +16,8 @@ from safetensors.numpy import save_file
 
 from vlatool.bundle.bundle import hash_file
 from vlatool.errors import GraphError, OutputError, SourceError
-from vlatool.files import work
-from vlatool.files.work import work_directory
+from vlatool.files import resumable_work
+from vlatool.files.resumable_work import work_directory
 from vlatool.quantize.streamed import record_file
 from vlatool.quantize.streamed._block_quantization import BlockFormat
 from vlatool.quantize.streamed._graph_rewrite import Task, copy_task, weight_task
@@ -26,7 +26,7 @@ from vlatool.quantize.streamed._worker import serve
 from vlatool.quantize.streamed.record_file import write_records
 from vlatool.quantize.streamed.records import Record
 from vlatool.quantize.streamed.tensor_jobs import Job, records_for
-from vlatool.stage.base import Tell
+from vlatool.stage.base import OnProgress
 from vlatool.weights.shards import Reader, StoredTensor, fingerprint, read_header, read_shards, stored_array
 
 FORM = BlockFormat()
@@ -105,7 +105,7 @@ class Stop(Exception):
     """Ends a run from within."""
 
 
-def stopping(after: int) -> Tell:
+def stopping(after: int) -> OnProgress:
     left = iter(range(after))
 
     def tell(_what: str, _share: float | None) -> None:
@@ -243,7 +243,7 @@ def test_forgotten_work_is_swept(shard, tmp_path):
     old, new = tmp_path / "work" / "old", tmp_path / "work" / "new"
     for place in (old, new):
         write(records(shard), place)
-    past = time.time_ns() // 10**9 - work.FORGOTTEN_S - 60
+    past = time.time_ns() // 10**9 - resumable_work.MAX_AGE_S - 60
     os.utime(old / "lock", (past, past))
     write(records(shard), tmp_path / "work" / "third")
     assert not old.exists()

@@ -13,7 +13,7 @@ from _policies import NumberedPolicy, spec_of
 
 from vlatool import registry
 from vlatool.errors import PluginError, UsageError
-from vlatool.runtime.control import controller, layers
+from vlatool.runtime.control import build_controller, layers
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.late import LateController
 from vlatool.runtime.interface import Controller, Policy
@@ -82,7 +82,7 @@ def _added(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def first(names: tuple[str, ...], delay: int = 0) -> list[float]:
-    made = controller(NumberedPolicy(spec_of(4, 2)), names, delay)
+    made = build_controller(NumberedPolicy(spec_of(4, 2)), names, delay)
     made.reset(1)
     return [float(made.act({"t": t})[0]) for t in range(6)]
 
@@ -100,7 +100,7 @@ def test_vlatools_own_are_found_by_their_files():
 )  # fmt: skip
 def test_what_is_not_named_is_chosen_by_the_delay(names: tuple[str, ...], delay: int, player: type):
     assert player in layers(names, delayed=delay > 0)
-    assert type(controller(NumberedPolicy(spec_of()), names, delay)) is player
+    assert type(build_controller(NumberedPolicy(spec_of()), names, delay)) is player
 
 
 def test_wrappers_are_put_around_the_policy_and_the_controller_in_their_order():
@@ -125,12 +125,12 @@ def test_names_that_make_no_controller_are_refused(names: tuple[str, ...], delay
 
 def test_an_entry_that_is_neither_is_said():
     with pytest.raises(PluginError, match=r"Nothing, an entry of vlatool.control, lacks methods or properties"):
-        controller(NumberedPolicy(spec_of()), ("nothing",))
+        build_controller(NumberedPolicy(spec_of()), ("nothing",))
 
 
 def test_all_of_vlatools_controllers_are_made_of_a_policy_alone():
     for name in registry.names("control"):
-        made = controller(NumberedPolicy(spec_of(2)), (name,))
+        made = build_controller(NumberedPolicy(spec_of(2)), (name,))
         assert isinstance(made, Controller)
         np.testing.assert_array_equal(made.act({"t": 0}), [0, 0.5])
         assert isinstance(inspect.getmodule(type(made)), ModuleType)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.stage.finish import ROUNDING
+from vlatool.stage.finish import MAX_ROUNDING
 
 ROOT = Path(__file__).parents[3]
 SAMPLES = ("sample_models/vln-babyai", "sample_models/vla-metaworld")
@@ -59,22 +59,22 @@ FOR_ARM = (
     Variant("ort int8", (*STATIC, "--activations", "int8")),
     Variant("qdq uint8", (*STATIC, "--layout", "qdq")),
     Variant("qdq int8", (*STATIC, "--layout", "qdq", "--activations", "int8")),
-    Variant("int4", ("quantize", "weight-only"), ROUNDING),
-    Variant("int4 qdq", ("quantize", "weight-only", "--layout", "qdq"), ROUNDING),
+    Variant("int4", ("quantize", "weight-only"), MAX_ROUNDING),
+    Variant("int4 qdq", ("quantize", "weight-only", "--layout", "qdq"), MAX_ROUNDING),
     Variant("float16", ("quantize", "float16"), HALF_LIMIT),
 )
 """What ONNX Runtime runs on 64-bit ARM."""
 FOR_X86 = (
     FLOAT,
-    *(Variant(each.name, each.command, ROUNDING, BOTH) for each in FOR_ARM[1:]),
-    Variant("ort 7-bit", (*STATIC, "--reduce-range"), ROUNDING, BOTH),
-    Variant("ort 8-bit", (*STATIC, "--no-reduce-range"), ROUNDING, BOTH),
-    Variant("openvino", OPENVINO, ROUNDING, BOTH),
-    Variant("openvino uint8", (*OPENVINO, "--activations", "uint8"), ROUNDING, BOTH),
-    Variant("openvino 7-bit", (*OPENVINO, "--reduce-range"), ROUNDING, BOTH),
-    Variant("openvino convolutions", (*OPENVINO, "--convolutions"), ROUNDING, BOTH),
-    Variant("openvino bfloat16", (*OPENVINO, "--compute", "bfloat16"), ROUNDING, ("openvino",), optional=True),
-    Variant("bfloat16", ("quantize", "bfloat16"), ROUNDING, ("openvino",), optional=True),
+    *(Variant(each.name, each.command, MAX_ROUNDING, BOTH) for each in FOR_ARM[1:]),
+    Variant("ort 7-bit", (*STATIC, "--reduce-range"), MAX_ROUNDING, BOTH),
+    Variant("ort 8-bit", (*STATIC, "--no-reduce-range"), MAX_ROUNDING, BOTH),
+    Variant("openvino", OPENVINO, MAX_ROUNDING, BOTH),
+    Variant("openvino uint8", (*OPENVINO, "--activations", "uint8"), MAX_ROUNDING, BOTH),
+    Variant("openvino 7-bit", (*OPENVINO, "--reduce-range"), MAX_ROUNDING, BOTH),
+    Variant("openvino convolutions", (*OPENVINO, "--convolutions"), MAX_ROUNDING, BOTH),
+    Variant("openvino bfloat16", (*OPENVINO, "--compute", "bfloat16"), MAX_ROUNDING, ("openvino",), optional=True),
+    Variant("bfloat16", ("quantize", "bfloat16"), MAX_ROUNDING, ("openvino",), optional=True),
 )
 """What an x86 host can be given."""
 
@@ -152,11 +152,12 @@ def observations(bundle: Path, count: int) -> tuple[dict[str, Any], int]:
         VariantError: when the bundle carries none.
     """
     from vlatool.bundle.bundle import Bundle
-    from vlatool.data import EVALUATION, read_recording
+    from vlatool.data import read_recording, recordings_of
 
     opened = Bundle.open(bundle)
-    if EVALUATION not in opened.manifest.files:
+    evaluation = recordings_of(opened).evaluation
+    if evaluation is None:
         raise VariantError(f"{bundle} carries no recorded observations.")
-    recording = read_recording(opened.path / EVALUATION, opened.manifest.spec)
+    recording = read_recording(evaluation, opened.manifest.spec)
     rows = recording.spread(count or len(recording))
     return {name: values[rows] for name, values in recording.inputs.items()}, len(recording)

@@ -135,7 +135,7 @@ def unmade(where: tuple[str, ...], variant: Variant, why: str) -> Row:
 def row(where: tuple[str, ...], variant: Variant, answer: Answer, said: Any, bundle: Path) -> Row:
     """Return one row: how far a bundle is from what its graphs say, and who says so before it moves a robot."""
     found = None if answer.actions is None else difference(answer.actions, said[: len(answer.actions)])
-    saturates = answer.arithmetic == SATURATING and is_int8(Bundle.described(bundle).manifest)
+    saturates = answer.arithmetic == SATURATING and is_int8(Bundle.open_lazily(bundle).manifest)
     warned = "doctor: int8 products saturate" if saturates else ""
     return Row(where, variant.name, found, variant.limit, answer.refused, warned, "tell", answer.why)
 

@@ -8,7 +8,7 @@ import pytest
 from _asked import CRASHED, ask, how_it_ended, parsed, run
 from _planted import plant
 
-from vlatool.bundle.bundle import restate
+from vlatool.bundle.bundle import replace_manifest
 from vlatool.files.npz import open_npz
 from vlatool.runtime import load
 from vlatool.stage.finish import ENGINE_DIFFERENCE, GOLDEN, save_npz
@@ -60,7 +60,7 @@ def test_a_bundle_answers_and_one_that_load_refuses_is_told_with_how_wrong_it_is
 def test_a_finding_is_a_refusal_too(float_bundle, copied, observations, tmp_path):
     bundle = copied(float_bundle)
     finding = {"name": ENGINE_DIFFERENCE, "message": "another action", "stage": "quantize.x"}
-    restate(bundle, replace(bundle.manifest, findings=(finding,)))
+    replace_manifest(bundle, replace(bundle.manifest, findings=(finding,)))
     found = ask([sys.executable], {"a": bundle.path}, observations, tmp_path / "answers", tell=quiet)["a"]
     assert found.refused == "GraphError"
     assert ENGINE_DIFFERENCE in found.why

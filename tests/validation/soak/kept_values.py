@@ -236,7 +236,7 @@ def tried(name: str, place: Path) -> Iterator[tuple[str, str, str]]:
 
     kind, folder, rows = KINDS[name], place / name, observations(STEPS // LENGTH, 1)
     write_policy(folder, kind)
-    trust.name(folder)
+    trust.allow(folder)
 
     def done(stage: str, source: Any, options: Mapping[str, Any], out: str) -> Any:
         made = TorchModule(policy=folder) if not stage else build_stage(stage, dict(options))

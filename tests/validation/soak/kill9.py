@@ -34,7 +34,7 @@ from pathlib import Path
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, DataError
-from vlatool.files.written import LEDGER
+from vlatool.files.ownership import LEDGER
 from vlatool.report import REPORT, read_report
 
 COMMANDS = ("export", "quantize", "optimize", "structured", "magnitude", "video", "trials")

@@ -104,21 +104,21 @@ def compare(source: Path, made: Path, count: int) -> float:
     from vlatool.bundle.bundle import Bundle
     from vlatool.data import observations_for
     from vlatool.module.description import read_location
-    from vlatool.module.stored import stored_modules, weights_read
+    from vlatool.module.sharded_weights import stored_modules, weights_on_demand
     from vlatool.module.torch_policy import policy_of
     from vlatool.runtime import load
     from vlatool.runtime.policy import relative_error
     from vlatool.user_code import trust
 
     bundle = Bundle.open(source)
-    trust.name(read_location(source), None, "")
+    trust.allow(read_location(source), None, "")
     stored, observations = stored_modules(bundle), observations_for(bundle, count)
     noises = [noise for step in bundle.manifest.program for noise in step.noise.items()]
     random = np.random.default_rng(0)
     drawn = [
         {name: random.standard_normal(each["shape"]).astype(np.float32) for name, each in noises} for _ in observations
     ]
-    with weights_read(stored):
+    with weights_on_demand(stored):
         torch = policy_of(bundle, stored.modules, 0)
         wanted = [torch.infer(each, noise=noise).chunk for each, noise in zip(observations, drawn, strict=True)]
     policy = load(made)

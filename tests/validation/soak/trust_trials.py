@@ -28,7 +28,7 @@ from vlatool.measurement.clock_drift import drift
 from vlatool.measurement.interleaved import Contestant, latency_measurements
 from vlatool.measurement.jobs import LatencyJob
 from vlatool.measurement.paced import run_paced
-from vlatool.measurement.validity import MOVED, findings
+from vlatool.measurement.validity import MAX_DRIFT, findings
 from vlatool.measurement.worker import measure
 from vlatool.runtime.policy import Action, Policy
 
@@ -113,7 +113,7 @@ def throttled(draw: np.random.Generator, really: bool) -> bool:
     trace = 0.25 * (1 + np.abs(draw.normal(0, 0.01, 21)))
     if really:
         trace[draw.integers(5, 16) :] *= 1 + draw.uniform(0.07, 0.4)
-    return bool(abs(drift(list(trace))) > MOVED)
+    return bool(abs(drift(list(trace))) > MAX_DRIFT)
 
 
 if __name__ == "__main__":

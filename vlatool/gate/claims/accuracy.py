@@ -13,7 +13,7 @@ from vlatool.accuracy.losses import drop, losses
 from vlatool.accuracy.moved import START
 from vlatool.accuracy.paired import few_starts, repeated_starts
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import EVALUATION, read_recording
+from vlatool.data import read_recording, recordings_of
 from vlatool.errors import DataError
 from vlatool.evaluate.recorded import alone, run_recorded
 from vlatool.gate.config import AccuracyClaim
@@ -97,10 +97,10 @@ def examine(
     baselines = tuple(number for lost in drops for number in lost.baseline if number.name in DECIDE)
     trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
     verdict = "inconclusive" if trust.fails else worst(lost.verdict(claim.max_drop) for lost in drops)
-    unjudged = [warning for lost in drops for warning in lost.warnings]
+    unjudged_steps = [warning for lost in drops for warning in lost.warnings]
     reservations = [sentence.rstrip(".") for sentence in trust.sentences]
     return ClaimResult(
-        "accuracy", verdict, "; ".join([*reservations, *words, *trust.warnings, *unjudged]), measured, baselines
+        "accuracy", verdict, "; ".join([*reservations, *words, *trust.warnings, *unjudged_steps]), measured, baselines
     )
 
 
@@ -117,8 +117,8 @@ def data_of(baseline: Bundle, claim: AccuracyClaim) -> Path | None:
     Raises:
         DataError: when there are none and no episodes are asked for.
     """
-    own = baseline.path / EVALUATION if EVALUATION in baseline.manifest.files else None
-    if (data := claim.data or own) is None and not claim.episodes:
+    data = claim.data or recordings_of(baseline).evaluation
+    if data is None and not claim.episodes:
         raise DataError(
             f"Accuracy is claimed, but the baseline {baseline.path} carries no evaluation data (those of the candidate "
             "do not count) and no episodes are asked for.",
@@ -155,4 +155,4 @@ def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context,
         off, before = losses(action, mine, expert), losses(action, theirs, expert)
         words = "more distance from the expert's actions than the baseline has:"
     lost = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
-    return _Drop("recorded_drop", words, *lost, len(indices), baselines, recording.unjudged)
+    return _Drop("recorded_drop", words, *lost, len(indices), baselines, recording.unjudged_steps)

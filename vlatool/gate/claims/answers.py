@@ -8,7 +8,7 @@ from vlatool.data import DRAWN, OTHER, RECORDED
 from vlatool.gate.config import AnswersClaim
 from vlatool.gate.result import ClaimResult, worst
 from vlatool.gate.timed import Timed
-from vlatool.measurement.agreement import SEQUENCE, Agreement, Followed
+from vlatool.measurement.agreement import SEQUENCE, Agreement, OutputAgreement
 from vlatool.report import Measurement
 
 KINDS = {
@@ -58,7 +58,7 @@ def _follows(agreement: Agreement, least: float) -> tuple[str, str]:
                                                  "none: answers: {follows: null}")  # fmt: skip
 
 
-def _least(followed: Sequence[Followed]) -> list[Followed]:
+def _least(followed: Sequence[OutputAgreement]) -> list[OutputAgreement]:
     """Return the one of least correlation; none when there is none.
 
     Where there are recordings, observations that are drawn without any are far from what the policy is for, and say

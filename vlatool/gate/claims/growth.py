@@ -7,8 +7,8 @@ from dataclasses import replace
 from statistics import median
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
-from vlatool.data import CALIBRATION, EVALUATION, PLAYED
-from vlatool.files.written import LEDGER
+from vlatool.data import PLAYED, is_of_recording
+from vlatool.files.ownership import LEDGER
 from vlatool.gate.config import GrowthClaim, LatencyClaim
 from vlatool.gate.inputs import MEMORY, Inputs
 from vlatool.gate.result import ClaimResult
@@ -21,10 +21,10 @@ PROBES = 3
 """Fresh processes that load each bundle once."""
 OBSERVATIONS = 16
 """Observations that such a process answers, beside the golden one."""
-ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, CALIBRATION, EVALUATION, PLAYED, "recipe.yaml", "SIGNATURE",
+ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, PLAYED, "recipe.yaml", "SIGNATURE",
          "reports/report.html", "reports/report.md", "reports/report.json", "reports/difference.json",
          "reports/smooth_quant.json", "reports/weights.json")  # fmt: skip
-"""Files of a bundle that no robot needs, beside the golden one."""
+"""Files of a bundle that no robot needs, beside the golden one and recordings."""
 
 
 def examine_memory(
@@ -45,7 +45,7 @@ def examine_memory(
     """
     peaks: tuple[list[float], list[float]] = ([], [])
     for number in range(PROBES):
-        context.tell("memory of each in fresh processes", number / PROBES)
+        context.progress("memory of each in fresh processes", number / PROBES)
         with inputs.file(OBSERVATIONS, MEMORY, number) if inputs else contextlib.nullcontext() as path:
             for bundle, taken in zip((candidate, baseline), peaks, strict=True):
                 probed = cold_start(bundle.path, how.engine, how.threads, timeout=how.timeout, observations=path)
@@ -70,7 +70,7 @@ def deployed_bytes(bundle: Bundle) -> int:
     folders = tuple(graph.file.rpartition("/")[0] for graph in bundle.manifest.graphs.values())
     within = tuple(f"{folder}/" if folder else "" for folder in folders)
     opened = {name for name in bundle.manifest.files if name.startswith(within)}
-    spared = {*ABOUT, bundle.manifest.golden} - opened
+    spared = {*ABOUT, bundle.manifest.golden, *filter(is_of_recording, bundle.manifest.files)} - opened
     files = (path for path in bundle.path.rglob("*") if path.is_file())
     return sum(path.stat().st_size for path in files if path.relative_to(bundle.path).as_posix() not in spared)
 

@@ -11,7 +11,7 @@ from vlatool.data import Moment
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_linked
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.machine.risky import risky
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.graph_files import open_graph
@@ -39,7 +39,7 @@ class ActivationTap:
         self._outputs = [value.name for value in graph.graph.output]
         add_outputs(graph)
         self._description = f"the graph '{path.stem}' with additional outputs"
-        with risky(engine_class(), f"opened {self._description}"):
+        with engine_call(engine_class(), f"opened {self._description}"):
             self._session = engine_class()(write_linked(graph.model, path, copy), 1)
 
     def observe(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
@@ -48,7 +48,7 @@ class ActivationTap:
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run the graph, observe the values, return the graph's own outputs."""
-        with risky(engine_class(), f"ran {self._description}"):
+        with engine_call(engine_class(), f"ran {self._description}"):
             values = self._session.run(feeds)
         if self.observing:
             self.observe(feeds, values)
@@ -84,7 +84,7 @@ def run_with_taps(
         moment = each if isinstance(each, Moment) else Moment(each, numbers[index] if numbers else index)
         number = moment.number
         if index % 8 == 0:
-            context.tell(f"{activity} sample {number}", index / len(numbers) if index < len(numbers) else None)
+            context.progress(f"{activity} sample {number}", index / len(numbers) if index < len(numbers) else None)
         for tap in taps.values():
             tap.sample, tap.observing = number, moment.counts
         if moment.begins:

@@ -26,7 +26,7 @@ def recorded_moments(
     """
     keeps = keeps_values(bundle.manifest.program)
     plain = (Moment(recording.observation(number), number) for number in numbers)
-    return _hash_samples(recording.along(numbers) if keeps else plain, samples)
+    return _hash_samples(recording.with_history(numbers) if keeps else plain, samples)
 
 
 def played_moments(bundle: Bundle, samples: SampleSet) -> list[Moment]:

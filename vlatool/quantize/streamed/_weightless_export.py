@@ -12,8 +12,8 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import GraphError, SourceError, require
-from vlatool.module.faked import as_float32, run_faked
-from vlatool.module.stored import StoredModules, policy_weights, stored_modules
+from vlatool.module.fake_weights import as_float32, run_on_fake_tensors
+from vlatool.module.sharded_weights import StoredModules, policy_weights, stored_modules
 from vlatool.module.to_onnx import exported_by_torch, name_by_module, quiet_exporter, strip_notes
 from vlatool.weights.shards import FLOATS, StoredTensor, stored_array
 
@@ -57,14 +57,15 @@ def export_templates(bundle: Bundle, opset: int) -> dict[str, GraphTemplate]:
         if step.graph not in exported:
             exported[step.graph] = (exported_by_torch(module, feeds, step, opset, optimize=False).model, real)
 
-    run_faked(bundle, modules, visit)
-    return {name: _template(model, stored.places[name], real, opset, file) for name, (model, real) in exported.items()}
+    run_on_fake_tensors(bundle, modules, visit)
+    at = stored.locations
+    return {name: _template(model, at[name], real, opset, file) for name, (model, real) in exported.items()}
 
 
 def _check_dtypes(stored: StoredModules) -> None:
     for graph, module in stored.modules.items():
         for name, value in module.state_dict(keep_vars=True).items():
-            tensor = stored.places[graph][name]
+            tensor = stored.locations[graph][name]
             if value.is_floating_point() and tensor.dtype not in FLOATS:
                 raise SourceError(
                     f"'{tensor.name}' in {tensor.file.name} is {tensor.dtype}; weights may be F32, F16 or BF16.",

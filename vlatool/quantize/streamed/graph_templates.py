@@ -8,7 +8,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, VlatoolError, require
 from vlatool.graph.nodes import name_each
-from vlatool.module.stored import policy_weights, takes_shards
+from vlatool.module.sharded_weights import policy_weights, takes_shards
 from vlatool.quantize.streamed._graph_rewrite import MAX_INLINE_BYTES
 from vlatool.quantize.streamed._weightless_export import GraphTemplate, export_templates
 from vlatool.quantize.streamed.tensor_jobs import as_float32

@@ -20,7 +20,7 @@ from vlatool.quantize.streamed.records import Record
 from vlatool.weights.shards import Reader
 
 if TYPE_CHECKING:
-    from vlatool.stage.base import Tell
+    from vlatool.stage.base import OnProgress
 
 COMMIT_BYTES = 1 << 28
 """Bytes after which data and journal are flushed to the disk."""
@@ -55,7 +55,7 @@ def work_root() -> Path:
     return cache_directory() / "streams"
 
 
-def write_records(records: list[Record], plan: str, directory: Path, processes: int, tell: Tell) -> RecordFile:
+def write_records(records: list[Record], plan: str, directory: Path, processes: int, tell: OnProgress) -> RecordFile:
     """Write all records to ``directory/data``, resuming an earlier run of the same plan.
 
     Args:

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, instead, nearest
+from vlatool.errors import RecipeError, fix_for, suggest
 from vlatool.quantize.streamed._graph_rewrite import (
     PART_BYTES,
     GraphRewriter,
@@ -165,7 +165,7 @@ def _selected_products(
     for pattern in stage.graphs:
         if not fnmatch.filter(products, pattern):
             raise RecipeError(
-                f"No graph matches '{pattern}'; {nearest(pattern, products)}.", instead(pattern, products)
+                f"No graph matches '{pattern}'; {suggest(pattern, products)}.", fix_for(pattern, products)
             )
     graphs = {
         name for name in products if not stage.graphs or any(fnmatch.fnmatch(name, glob) for glob in stage.graphs)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import require, require_present
-from vlatool.files.edited import stamp_of
+from vlatool.files.user_files import stamp_of
 from vlatool.render.video import HOLD_S, Picture, Video
 
 EXTRA = "video"

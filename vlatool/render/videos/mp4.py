@@ -13,8 +13,8 @@ from typing import IO, cast
 
 import numpy as np
 
-from vlatool.errors import MissingExtra, OutputError, install, require, require_present
-from vlatool.files.edited import stamp_of
+from vlatool.errors import MissingExtra, OutputError, pip_install, require, require_present
+from vlatool.files.user_files import stamp_of
 from vlatool.render.video import HOLD_S, Picture, Video
 
 EXTRA = "mp4"
@@ -67,7 +67,7 @@ def program() -> str:
         return str(require("imageio_ffmpeg", EXTRA).get_ffmpeg_exe())
     raise MissingExtra(
         "An mp4 needs ffmpeg, and there is none on PATH; the extra 'mp4' provides one. A .gif needs the extra 'video'.",
-        install(EXTRA),
+        pip_install(EXTRA),
     )
 
 

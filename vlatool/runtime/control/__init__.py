@@ -15,7 +15,7 @@ from vlatool import registry
 from vlatool.errors import PluginError, UsageError
 from vlatool.runtime.interface import Controller, Policy
 
-KIND, BLOCKING, DELAYED = "control", "chunked", "late"
+KIND, DEFAULT_PLAYER, PLAYER_WITH_DELAY = "control", "chunked", "late"
 
 
 def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
@@ -32,15 +32,15 @@ def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
     players = [name for name, entry in entries.items() if _layer(entry) == 1]
     if len(players) > 1:
         raise UsageError(f"Both {players[0]} and {players[1]} play the chunks of the policy.", "name one of them")
-    player = players[0] if players else DELAYED if delayed else BLOCKING
+    player = players[0] if players else PLAYER_WITH_DELAY if delayed else DEFAULT_PLAYER
     entries[player] = registry.load(KIND, player)
     if delayed and not _takes(entries[player], "delay"):
         raise UsageError(f"The controller {player} waits for each inference: its actions cannot come late.",
-                         f"use {DELAYED}, or leave the latency out")  # fmt: skip
+                         f"use {PLAYER_WITH_DELAY}, or leave the latency out")  # fmt: skip
     return sorted(entries.values(), key=_layer)
 
 
-def controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) -> Controller:
+def build_controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) -> Controller:
     """Return a controller that acts with a policy: ``chunked``, ``late`` where there is a delay, or what is named.
 
     Args:

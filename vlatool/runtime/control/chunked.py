@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import UsageError
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.interface import Policy
+from vlatool.runtime.interface import Array, Policy
 
 
 class ChunkQueue:
@@ -31,13 +30,16 @@ class ChunkQueue:
         check_whole("execute", execute, 0)
         self.policy = policy
         self.execute = execute or policy.spec.execute or policy.spec.chunk
-        self._pending: list[NDArray[Any]] = []
         self.fresh = False
         """Whether the last action was the first of a chunk."""
         self._turn = threading.RLock()  # a signal handler may strike between lock and owner
         self._owner = 0
+        self._forget()
 
-    def act(self, observation: Mapping[str, Any]) -> NDArray[Any]:
+    def _forget(self) -> None:
+        self._pending: list[Array] = []
+
+    def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step: (A,) float32, or a 0-d int64 index of a discrete action.
 
         The observation is read only when a new chunk is needed. When the inference raises, the next step tries again.
@@ -51,12 +53,15 @@ class ChunkQueue:
         with self._turn:
             try:
                 self._owner = threading.get_ident()
-                self.fresh = not self._pending
-                if self.fresh:
-                    self._pending = list(self.policy.infer(observation).chunk[: self.execute])
-                return np.asarray(self._pending.pop(0))
+                return np.asarray(self._step(observation))
             finally:
                 self._owner = 0
+
+    def _step(self, observation: Mapping[str, Any]) -> Array:
+        self.fresh = not self._pending
+        if self.fresh:
+            self._pending = list(self.policy.infer(observation).chunk[: self.execute])
+        return self._pending.pop(0)
 
     def reset(self, seed: int | None = None) -> None:
         """Forget the pending actions and what the policy carries from step to step.
@@ -70,5 +75,5 @@ class ChunkQueue:
         if self._owner == threading.get_ident():
             raise UsageError("The queue is reset within its own step (a signal handler?).", "reset between two steps")
         with self._turn:
-            self._pending = []
+            self._forget()
             self.policy.reset(seed)

@@ -6,18 +6,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.spec import TensorSpec
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.interface import Policy
+from vlatool.runtime.control.chunked import ChunkQueue
+from vlatool.runtime.interface import Array, Policy
 
-Array = NDArray[Any]
 STOPPABLE_MODES = ("delta", "velocity")
 """Modes of an action in which 0 stands for no motion."""
 
 
-class LateController:
+class LateController(ChunkQueue):
     """Acts as a robot does that goes on while its policy infers.
 
     When the executed part of a chunk is used up, an inference begins with the observation of that step, and its chunk
@@ -36,34 +35,25 @@ class LateController:
     """
 
     def __init__(self, policy: Policy, execute: int = 0, *, delay: int = 0) -> None:
-        check_whole("execute", execute, 0)
         check_whole("delay", delay, 0)
-        self._policy, self._delay = policy, delay
-        self._execute = execute or policy.spec.execute or policy.spec.chunk
-        self.fresh = False
-        """Whether the last action was the first of a chunk."""
-        self._forget()
+        self._delay = delay
+        super().__init__(policy, execute)
 
     def _forget(self) -> None:
-        self._pending: list[Array] = []
+        super()._forget()
         self._rest: list[Array] = []
         self._coming: Array | None = None
         self._wait = self._taken = 0
         self._last: Array | None = None
 
-    def act(self, observation: Mapping[str, Any]) -> Array:
-        """Return the action of this control step: (A,) float32, or a 0-d int64 index.
-
-        Raises:
-            DataError, GraphError: as the policy's ``infer`` does.
-        """
+    def _step(self, observation: Mapping[str, Any]) -> Array:
         if not self._pending and self._coming is None:
-            self._coming = self._policy.infer(observation).chunk
+            self._coming = self.policy.infer(observation).chunk
             self._wait, self._taken = (0 if self._last is None else self._delay), 0
         self.fresh = self._coming is not None and self._wait == 0
         if self._coming is not None and self._wait == 0:
             chunk = list(self._coming[self._taken :])
-            self._pending, self._rest, self._coming = chunk[: self._execute], chunk[self._execute :], None
+            self._pending, self._rest, self._coming = chunk[: self.execute], chunk[self.execute :], None
         self._last = np.asarray(self._next())
         return self._last
 
@@ -74,12 +64,7 @@ class LateController:
         if self._rest:
             self._taken += 1
             return self._rest.pop(0)
-        return hold(self._policy.spec.action, self._last)
-
-    def reset(self, seed: int | None = None) -> None:
-        """Start a new episode, with noise of this seed."""
-        self._forget()
-        self._policy.reset(seed)
+        return hold(self.policy.spec.action, self._last)
 
 
 def hold(action: TensorSpec, last: Array | None) -> Array:

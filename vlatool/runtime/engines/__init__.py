@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import require
+from vlatool.runtime.engines._onnx_runtime import OnnxRuntimeSession as OnnxRuntimeSession
+from vlatool.runtime.engines._onnx_runtime import open_session, profiling_session
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,14 +55,12 @@ def traced(path: Path, scratch: Path) -> OrtProfiled:
         GraphError: when ONNX Runtime refuses it.
         MissingExtra: when onnxruntime is not installed.
     """
-    from vlatool.runtime.engines._ort_profile import OrtProfiled
-
     ort = require("onnxruntime", "ort")
     options = ort.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = 1
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    return OrtProfiled(ort, path, options, scratch, [])
+    return profiling_session(ort, path, options, scratch)
 
 
 def node_session(content: bytes) -> Any:
@@ -72,4 +72,4 @@ def node_session(content: bytes) -> Any:
     ort = require("onnxruntime", "ort")
     options = ort.SessionOptions()
     options.log_severity_level = 4
-    return ort.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
+    return open_session(ort, content, options)

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.runtime import arithmetic
-from vlatool.runtime.engines.ort_cpu import OrtCpuSession, open_session, session_options
+from vlatool.runtime.engines._onnx_runtime import open_session, session_options
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
 
 class BranchesSession(OrtCpuSession):

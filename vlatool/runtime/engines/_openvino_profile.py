@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import GraphError
-from vlatool.machine.risky import REMEDY
+from vlatool.machine.engine_calls import REMEDY
 from vlatool.runtime.engine import BFLOAT16, FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
 
 

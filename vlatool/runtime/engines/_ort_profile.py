@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vlatool.errors import GraphError
-from vlatool.machine.risky import REMEDY
 from vlatool.runtime.engine import FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
 
 INTEGER = ("MatMulInteger", "QLinear", "QGemm", "ConvInteger", "DynamicQuantize", "QAttention", "QEmbed")
@@ -19,19 +17,10 @@ CONTAINERS = ("If", "Loop", "Scan")
 
 
 class OrtProfiled:
-    """ONNX Runtime writes a trace file of every node of every run."""
+    """A session with profiling on: ONNX Runtime writes a trace file of every node of every run."""
 
-    def __init__(self, ort: Any, path: Path, options: Any, scratch: Path, left_out: list[str]) -> None:
-        options.enable_profiling = True
-        options.profile_file_prefix = str(scratch)
-        try:
-            self._session = ort.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"], disabled_optimizers=left_out
-            )
-        except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
-            raise GraphError(
-                f"ONNX Runtime cannot profile {path.name}: {str(error)[:200]}", REMEDY.format(package="onnxruntime")
-            ) from error
+    def __init__(self, session: Any) -> None:
+        self._session = session
         self._outputs = [node.name for node in self._session.get_outputs()]
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -15,13 +15,12 @@ from typing import Any
 
 from vlatool.errors import require
 from vlatool.runtime import arithmetic
-from vlatool.runtime.engines.ort_cpu import OrtCpuSession, is_true_of, session_options
+from vlatool.runtime.engines._onnx_runtime import is_true_of, session_options
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
 
 class ReferenceSession(OrtCpuSession):
     """One ONNX file open in ONNX Runtime on the CPU, with rewriting of the graph off as far as products are exact."""
-
-    optimized = False
 
     @staticmethod
     def _option_sets(ort: Any, model: Path | bytes, threads: int | None) -> list[Any]:

@@ -7,22 +7,25 @@ import ctypes
 import io
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import GraphError, instead, nearest, require
+from vlatool.errors import GraphError, fix_for, require, suggest
+from vlatool.machine.engine_calls import REMEDY
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
-from vlatool.machine.risky import REMEDY
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Stages
 from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, precision
 from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
+
+if TYPE_CHECKING:
+    from vlatool.machine.target import Target
 
 FEEDS = "give every input of the graph, of the shape and type that the graph declares"
 DEVICE = "CPU"
@@ -213,19 +216,21 @@ class OpenvinoSession(Engine):
             return arithmetic.UNKNOWN
 
     @classmethod
-    def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
+    def variants(cls, target: Target, calibrated: bool) -> dict[str, Stages]:
         """Return bfloat16 where the processor has it, and int8 with what is not quantized in that.
 
         With matrix units (AMX) products are written as convolutions, too, as ``quantize.int8.convolutions`` says; where
         int8 products saturate, weights are such that none does.
         """
         plans: dict[str, Stages] = {}
-        forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if has(*AMX) else {"": {}}
-        bfloat16 = has(*BF16)
+        forms: dict[str, dict[str, Any]] = (
+            {"": {}, "_convolutions": {"convolutions": True}} if target.has(*AMX) else {"": {}}
+        )
+        bfloat16 = target.has(*BF16)
         for form, how in forms.items() if bfloat16 else ():
             plans[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
         rest: dict[str, Any] = {"compute": "bfloat16"} if bfloat16 else {}
-        rest |= {"reduce_range": True} if has("avx2") and not has(*VNNI) else {}
+        rest |= {"reduce_range": True} if target.has("avx2") and not target.has(*VNNI) else {}
         for name, options in INT8_VARIANTS.items() if calibrated else ():
             for form, how in forms.items() if name == "int8" else list(forms.items())[-1:]:
                 stage = {"layout": "openvino", **rest, **how, **options}
@@ -310,8 +315,8 @@ def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
     """
     if compute not in HINTS:
         raise GraphError(
-            f"OpenVINO on the CPU does not compute in {compute}; {nearest(compute, filter(None, HINTS))}.",
-            instead(compute, filter(None, HINTS)),
+            f"OpenVINO on the CPU does not compute in {compute}; {suggest(compute, filter(None, HINTS))}.",
+            fix_for(compute, filter(None, HINTS)),
         )
     return {
         "INFERENCE_PRECISION_HINT": HINTS[compute],

@@ -16,7 +16,7 @@ class Huber:
     P. J. Huber, "Robust estimation of a location parameter", 1964.
 
     Args:
-        delta: From which difference on it is absolute, in units of the graph's (normalised) action.
+        delta: difference above which it is absolute, in units of the graph's (normalised) action.
     """
 
     def __init__(self, delta: float = 0.1) -> None:

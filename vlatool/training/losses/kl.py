@@ -17,7 +17,7 @@ class Kl:
     keeps the size of the gradient whatever the temperature.
 
     Args:
-        temperature: Both are softened by it; 1 for the policy's own probabilities.
+        temperature: both are softened by it; 1 for the policy's own probabilities.
     """
 
     def __init__(self, temperature: float = 2.0) -> None:

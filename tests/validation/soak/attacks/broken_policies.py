@@ -30,7 +30,7 @@ from toy_robot import write_robot
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import main as vlatool
-from vlatool.cli._run import exported
+from vlatool.cli._run import export_source
 from vlatool.errors import VlatoolError
 from vlatool.gate.config import AccuracyClaim, Gate
 from vlatool.gate.run import run_gate
@@ -42,6 +42,7 @@ from vlatool.optimize.summary import verdict_of
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.report import Measurement, Row
 from vlatool.runtime.golden import load_goldens
+from vlatool.sources import source_stage
 from vlatool.stage.base import Context
 from vlatool.stage.finish import write_golden
 
@@ -92,7 +93,7 @@ def bundles(case: Case, folder: Path, kept: Path) -> dict[str, Bundle]:
     )
     place = kept / hashlib.sha256(code.encode()).hexdigest()[:16]
     if not place.exists():
-        baseline = exported(str(folder), place / "cache", Context())
+        baseline = export_source(source_stage(str(folder)), place / "cache", Context())
         (place / "int8").mkdir()
         DynamicInt8().run(baseline, place / "int8", Context())
         shutil.copytree(baseline.path, place / "float32")

@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).parents[3]))
 from _tiny import POLICY_PY, POLICY_YAML, STATISTICS, VOCABULARY, observations, write_weights
 
 from vlatool.cli import main
-from vlatool.files.written import LEDGER
+from vlatool.files.ownership import LEDGER
 
 PERSON = {
     "notes.txt": "mine", "policy.yaml": "name: mine", "manifest.json": '{"name": "extension", "manifest_version": 3}',

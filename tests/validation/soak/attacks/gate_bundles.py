@@ -24,7 +24,7 @@ from gate_graphs import (
 )
 from onnx import TensorProto, helper
 
-from vlatool.bundle.bundle import Bundle, restate, seal
+from vlatool.bundle.bundle import Bundle, replace_manifest, seal
 from vlatool.bundle.manifest import FileRecord
 from vlatool.bundle.spec import TensorSpec
 from vlatool.data import DRAWN, Drawer, read_recording
@@ -267,7 +267,7 @@ def spare_graph(base: Bundle, out: Path) -> Bundle:
 def rewritten(bundle: Bundle, **fields: Any) -> Bundle:
     """Return the bundle with another manifest over the same files."""
     manifest = replace(bundle.manifest, **fields)
-    return restate(bundle, manifest)
+    return replace_manifest(bundle, manifest)
 
 
 def resized(base: Bundle, out: Path) -> Bundle:

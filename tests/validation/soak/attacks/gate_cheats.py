@@ -274,7 +274,7 @@ def exported(folder: Path) -> Bundle:
 
     policy = folder / "policy"
     write_policy(policy)
-    trust.name(policy)
+    trust.allow(policy)
     for name in ("source", "exported"):
         (folder / name).mkdir()
     source = TorchModule(policy=policy).run(None, folder / "source", Context())

@@ -32,7 +32,7 @@ import victim
 from mutations import Files, mutated, read, repaired, without_golden
 
 from vlatool.errors import VlatoolError
-from vlatool.files import sealed
+from vlatool.files import verified_read
 
 HANG = 10.0
 MEMORY = 1 << 30
@@ -131,7 +131,7 @@ class Attack:
 def work(original: Files, folder: Path, seed: int, numbers: range, now: mmap.mmap, out: Path) -> None:
     """Go through some tries in this process; what was found is written after each that may be the last."""
     warnings.simplefilter("ignore")
-    sealed.TICK_NS = 0  # nobody else writes here, so that nothing can change within a tick of the clock
+    verified_read.TICK_NS = 0  # nobody else writes here, so that nothing can change within a tick of the clock
     found = Found()
     attack = Attack(original, folder, seed)
     for number in numbers:

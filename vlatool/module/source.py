@@ -1,0 +1,129 @@
+"""What every source is, and which one reads what a person names: one file each in ``vlatool/sources``, or a package's.
+
+A source yields one ``Description``, however the policy was written down. Code of a policy is only found through it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from vlatool import registry
+from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
+from vlatool.errors import SourceError
+from vlatool.module.description import Description
+from vlatool.registry import Claim
+from vlatool.stage.base import Transform
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+CHECKPOINT = "; it looks like a checkpoint of another library, which needs a policy.yaml and a few lines of Python"
+WRAP = "docs/guides/lerobot-policy.md and docs/guides/hugging-face-policy.md wrap checkpoints; else "
+
+
+class Source(Transform):
+    """A way of obtaining a policy: the stage that starts a chain."""
+
+    needs: ClassVar[str] = ""
+    """What it reads, for messages: ``a .onnx file``."""
+    policy: Path | None = None
+    """What holds the description of the policy; None where only its graphs say what it is."""
+
+    @classmethod
+    def claims(cls, typed: str) -> Claim:
+        """Say how sure it is that this source reads what a person types as SOURCE; cheap, and nothing is changed."""
+        raise NotImplementedError
+
+    @classmethod
+    def of(cls, typed: str) -> Self:
+        """Return the stage for what a person types as SOURCE, which this source claims.
+
+        Raises:
+            SourceError: when it is wrong.
+        """
+        return cls.model_validate({"policy": Path(typed)})
+
+    def describe(self) -> Description | None:
+        """Return the description of the policy; None where only its graphs say what it is, once they are read.
+
+        Raises:
+            SourceError: when it is missing or wrong.
+        """
+        return None
+
+    @property
+    def has_graphs(self) -> bool:
+        """Whether the policy is graphs already, so that nothing is exported."""
+        described = self.describe()
+        return described is None or bool(described.graphs)
+
+    def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
+        """Return the same source with the options that the build record of a bundle has for it.
+
+        Raises:
+            SourceError: when the record does not fit this source.
+        """
+        return self
+
+
+def is_bundle(typed: str | Path) -> bool:
+    """Return whether a path is a bundle: what has a manifest, unless that is of a format that a source reads."""
+    path = Path(typed)
+    return (path / MANIFEST).is_file() and ((path / DIGEST).exists() or not registry.is_certain("sources", str(typed)))
+
+
+def claimed_source(typed: str | Path) -> Source | None:
+    """Return the source that claims a path, or ``path.py:make``; None for a bundle, and what no source claims.
+
+    None of the policy's code may run for that alone.
+
+    Raises:
+        SourceError: when several claim it, or it is wrong.
+    """
+    if is_bundle(typed):
+        return None
+    source: type[Source] | None = registry.claimant("sources", str(typed), SourceError)
+    return None if source is None else source.of(str(typed))
+
+
+def source_of_policy(typed: str | Path) -> Source:
+    """Return the source that claims a path, or ``path.py:make``.
+
+    Raises:
+        SourceError: as ``claimed_source``, and for a bundle, and what no source claims.
+    """
+    source = claimed_source(typed)
+    if source is None:
+        raise _unknown(str(typed))
+    return source
+
+
+def describe(policy: Path) -> Description:
+    """Return the description of a policy, read by the source that claims it.
+
+    Raises:
+        SourceError: when there is none.
+    """
+    described = source_of_policy(policy).describe()
+    if described is None:
+        raise SourceError(f"{policy} has no description.", "write a policy.yaml beside it")
+    return described
+
+
+def _unknown(typed: str) -> SourceError:
+    """Return the error of what no source claims; it lists the kinds of sources, and what each needs."""
+    path = Path(typed)
+    if is_bundle(path):
+        return SourceError(f"{path} is a bundle; the policy that it was made from is needed.", "name the policy")
+    known = f"give a bundle, or a source: {registry.requirements('sources')}"
+    if not path.is_dir():
+        return SourceError(f"'{typed}' is neither a bundle nor a policy source.", known)
+    names = sorted(file.name for file in path.iterdir())
+    checkpoint = "config.json" in names and any(name.endswith((".safetensors", ".bin")) for name in names)
+    return SourceError(
+        f"{path} is not a bundle: it has no {MANIFEST}; and no source of policies reads it (found: "
+        f"{', '.join(names[:6]) or 'nothing'}){CHECKPOINT if checkpoint else ''}.",
+        f"{WRAP if checkpoint else ''}{known}",
+    )

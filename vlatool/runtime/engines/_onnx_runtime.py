@@ -1,0 +1,400 @@
+"""What the engines on ONNX Runtime share: a subclass that names other execution providers runs on other hardware."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import GraphError, MissingExtra, require
+from vlatool.machine.engine_calls import REMEDY
+from vlatool.machine.host import gpu_driver, gpus, versions
+from vlatool.runtime.contract import Port, port
+from vlatool.runtime.engine import Engine, Node, Profiled, computing
+from vlatool.runtime.engines._ort_profile import OrtProfiled, precision
+from vlatool.runtime.stored_types import has_float8
+
+CPU = "CPUExecutionProvider"
+HOST = "cpu"
+"""Device type of the memory that NumPy's arrays are in."""
+NO_CPU_FALLBACK = ("session.disable_cpu_ep_fallback", "1")
+"""The option of ONNX Runtime (``onnxruntime_session_options_config_keys.h``) that refuses a graph with nodes that none
+of the named providers runs; left alone it computes them on the processor without a word."""
+CUT_OFF_REWRITES = ["ReluQuantRewrite", "ClipQuantRewrite"]
+SMALL = 256 * 1024
+"""Bytes of all inputs and outputs up to which a run goes through buffers that are bound once."""
+NUMPY_OF: dict[str, np.dtype[Any]] = {
+    "tensor(float)": np.dtype(np.float32),
+    "tensor(float16)": np.dtype(np.float16),
+    "tensor(double)": np.dtype(np.float64),
+    "tensor(bool)": np.dtype(np.bool_),
+    **{f"tensor({sign}int{bits})": np.dtype(f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)},
+}
+Array = NDArray[Any]
+Providers = tuple[tuple[str, Mapping[str, Any]], ...]
+"""Execution providers of ONNX Runtime, the preferred one first, each with its options."""
+ON_CPU: Providers = ((CPU, {}),)
+
+
+class OnnxRuntimeSession(Engine):
+    """One ONNX file open in ONNX Runtime on the execution providers of its class, with fallback to others off.
+
+    Args:
+        path: The ONNX file; external data is found beside it.
+        threads: Intra-op threads; the cores that this process may use when None.
+        compute: One of the dtypes in ``computes``, or empty.
+        opened: What is opened instead of ``path``: the content of the file, or another name of it.
+
+    Raises:
+        GraphError: when ONNX Runtime refuses the file, opens it on other providers, or is to compute in a dtype that
+            is not in ``computes``.
+        MissingExtra: when onnxruntime or a provider is not installed.
+    """
+
+    package = "onnxruntime"
+    extra = "ort"
+    providers: ClassVar[Providers] = ()
+    """Where a graph runs. A node that none of them runs is an error, unless the processor's provider is the last."""
+    memory: ClassVar[str] = HOST
+    """Device type of the memory in which ONNX Runtime keeps the inputs and outputs of small graphs, such as ``cuda``:
+    observations are copied there, and actions back."""
+
+    def __init__(
+        self, path: Path, threads: int | None = None, compute: str = "", opened: Path | bytes | None = None
+    ) -> None:
+        ort = self.onnxruntime()
+        if compute not in ("", *self.computes):
+            raise GraphError(
+                f"ONNX Runtime on {self._hardware()} does not compute in {compute}.",
+                f"use the engine {computing(compute)}",
+            )
+        try:
+            self._session = self._open(ort, path if opened is None else opened, threads)
+        except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
+            raise GraphError(
+                f"ONNX Runtime {ort.__version__} refuses {path}: {_first_line(error)}", self._remedy(error)
+            ) from error
+        self._check_providers(path)
+        self.path = path
+        self.deadline: float | None = None
+        self._run = self._session.run
+        self.outputs = [node.name for node in self._session.get_outputs()]
+        self.takes = {node.name: _port(node) for node in self._session.get_inputs()}
+        self.gives = {node.name: _port(node) for node in self._session.get_outputs()}
+        self._bound = BoundBuffers.of(self._session, ort, self.memory)
+        self.bound = self._bound is not None
+
+    @classmethod
+    def onnxruntime(cls) -> Any:
+        """Import ONNX Runtime, with the providers of this engine registered.
+
+        Raises:
+            MissingExtra: when onnxruntime is not installed, or has not got a provider.
+        """
+        ort = require("onnxruntime", "ort")
+        cause, library = "", cls.provider_library() if cls._missing(ort) else None
+        if library is not None:
+            try:
+                ort.register_execution_provider_library(cls._missing(ort)[0], str(library))
+            except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
+                cause = f" {library} cannot be loaded: {_first_line(error)}"
+        if missing := cls._missing(ort):
+            known = ", ".join(ort.get_available_providers())
+            words = f"ONNX Runtime {ort.__version__} has no {', '.join(missing)} on this machine; it has {known}."
+            raise MissingExtra(words + cause, cls.installation())
+        return ort
+
+    @classmethod
+    def provider_library(cls) -> Path | None:
+        """Return the file of a provider that is a plug-in; None where ONNX Runtime brings it itself.
+
+        Raises:
+            MissingExtra: when the package of the plug-in is not installed.
+        """
+        return None
+
+    @classmethod
+    def distributions(cls) -> tuple[str, ...]:
+        """Return the distributions that bring the providers: for others than the processor's, not any onnxruntime."""
+        return super().distributions() if cls._names() == [CPU] or not cls.substitutes else cls.substitutes
+
+    @classmethod
+    def is_installed(cls) -> bool:
+        """Return whether ONNX Runtime and the providers are installed, without importing them."""
+        return super().is_installed() and (cls._names() == [CPU] or bool(versions(cls.distributions())))
+
+    @classmethod
+    def execution_providers(cls) -> list[str]:
+        """Return the providers of this engine that can be used.
+
+        Raises:
+            MissingExtra: when onnxruntime cannot be imported, or has not got one of them.
+        """
+        cls.onnxruntime()
+        return cls._names()
+
+    @classmethod
+    def identity(cls) -> str:
+        """Return providers with their options, versions of the packages, graphics cards and their driver.
+
+        It is empty for the processor alone: keys and records have its instruction set and the versions anyway.
+        """
+        if cls._names() == [CPU]:
+            return ""
+        packages = versions(dict.fromkeys(("onnxruntime", *cls.distributions())))
+        parts = [f"{name} {json.dumps(dict(options), sort_keys=True, default=str)}" for name, options in cls.providers]
+        parts += [f"{name} {version}" for name, version in packages.items()]
+        return "; ".join([*parts, *gpus(), *filter(None, [gpu_driver()])])
+
+    @classmethod
+    def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
+        """Open a graph with ONNX Runtime's trace of every node on.
+
+        Raises:
+            GraphError: when ONNX Runtime refuses it.
+        """
+        ort = cls.onnxruntime()
+        return profiling_session(ort, path, session_options(ort, threads), scratch, cls.providers)
+
+    @classmethod
+    def node_precision(cls, node: Node) -> str:
+        """Return what a node computes in, by its kind and the dtype of its first input."""
+        return precision(node)
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run the graph: input name -> array, output name -> array.
+
+        Raises:
+            GraphError: when ONNX Runtime fails on these inputs.
+            TimeoutError: when ``deadline`` (seconds of ``time.monotonic``; none when None) passes.
+        """
+        try:
+            if self.deadline is not None:
+                return self._run_until(self.deadline, feeds)
+            if self._bound is not None and self._bound.takes(feeds):
+                return self._bound.run()
+            return dict(zip(self.outputs, self._run(self.outputs, feeds), strict=True))
+        except TimeoutError:
+            raise
+        except Exception as error:
+            raise GraphError(
+                f"ONNX Runtime failed in {self.path.name}: {_first_line(error)}", REMEDY.format(package="onnxruntime")
+            ) from error
+
+    def _run_until(self, deadline: float, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run, and let another thread tell ONNX Runtime to stop before its next node at the deadline."""
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        options = require("onnxruntime", "ort").RunOptions()
+        options.log_severity_level = 4
+        timer = threading.Timer(left, setattr, (options, "terminate", True))
+        timer.daemon = True
+        timer.start()
+        try:
+            if self._bound is not None and self._bound.takes(feeds):
+                return self._bound.run(options)
+            return dict(zip(self.outputs, self._run(self.outputs, feeds, options), strict=True))
+        except Exception:
+            if options.terminate:
+                raise TimeoutError from None
+            raise
+        finally:
+            timer.cancel()
+
+    @classmethod
+    def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
+        """Open a session, with other options where the first break the graph; the first error is reported."""
+        first, *others = cls._option_sets(ort, model, threads)
+        try:
+            return open_session(ort, model, first, cls.providers)
+        except Exception:
+            for options in others:
+                with contextlib.suppress(Exception):
+                    return open_session(ort, model, options, cls.providers)
+            raise
+
+    @staticmethod
+    def _option_sets(ort: Any, model: Path | bytes, threads: int | None) -> list[Any]:
+        """Return the options to try, one after the other."""
+        return [session_options(ort, threads)]
+
+    @classmethod
+    def _names(cls) -> list[str]:
+        return [name for name, _ in cls.providers]
+
+    @classmethod
+    def _missing(cls, ort: Any) -> list[str]:
+        available = ort.get_available_providers()
+        return [name for name in cls._names() if name not in available]
+
+    @classmethod
+    def _hardware(cls) -> str:
+        return "the CPU" if cls._names() == [CPU] else ", ".join(cls._names())
+
+    def _check_providers(self, path: Path) -> None:
+        """Refuse a session on other providers: ONNX Runtime leaves out those that it cannot load.
+
+        It always adds the processor's; where that is not named, ``NO_CPU_FALLBACK`` keeps every node off it.
+        """
+        wanted = self._names()
+        opened = [name for name in self._session.get_providers() if name != CPU or CPU in wanted]
+        if opened == wanted:
+            return
+        absent = ", ".join(name for name in wanted if name not in (*opened, CPU))
+        fix = "install onnxruntime alone: another package of it (onnxruntime-gpu) may be in its place"
+        raise GraphError(
+            f"{path} was opened on {', '.join(opened) or CPU}; wanted {', '.join(wanted)}.",
+            f"install the driver and the libraries that {absent} needs" if absent else fix,
+        )
+
+    @classmethod
+    def _remedy(cls, error: Exception) -> str:
+        if "fallback to CPU EP has been explicitly disabled" in str(error):
+            return f"{cls._hardware()} does not run every node of it: use another engine"
+        return REMEDY.format(package="onnxruntime")
+
+
+class BoundBuffers:
+    """Buffers that are bound to the inputs and outputs of a small graph once, for all runs.
+
+    ``run()`` of ONNX Runtime wraps every array again; writing into bound buffers instead takes some 20 us less right
+    after an inference, when the processor's caches hold the network (``vlatool benchmark overhead``). Large tensors
+    would pay more for the copy than that.
+    """
+
+    def __init__(
+        self, session: Any, ort: Any, inputs: dict[str, Array], outputs: dict[str, Array], memory: str = HOST
+    ) -> None:
+        self._inputs = [(name, buffer, buffer.shape, buffer.dtype) for name, buffer in inputs.items()]
+        self._outputs = list(outputs.items())
+        self._binding = binding = session.io_binding()
+        tensor = ort.OrtValue.ortvalue_from_numpy  # shares the memory of an array on the host, copies it elsewhere
+        self._fed = [(tensor(buffer, memory, 0), buffer) for buffer in inputs.values()]
+        self._results = [(name, tensor(buffer, memory, 0)) for name, buffer in outputs.items()]
+        for name, (value, _) in zip(inputs, self._fed, strict=True):
+            binding.bind_ortvalue_input(name, value)
+        for name, value in self._results:
+            binding.bind_ortvalue_output(name, value)
+        self._start, self._bindings = session.run_with_iobinding, binding
+        if hasattr(session, "_sess") and hasattr(binding, "_iobinding"):  # past checks that concern other providers
+            self._start, self._bindings = session._sess.run_with_iobinding, binding._iobinding
+
+    @classmethod
+    def of(cls, session: Any, ort: Any, memory: str) -> BoundBuffers | None:
+        """Return buffers for a session, or None when a shape is dynamic, a type is not numpy's, or they are large."""
+        inputs = {node.name: _buffer(node) for node in session.get_inputs()}
+        outputs = {node.name: _buffer(node) if node.shape else None for node in session.get_outputs()}  # see _port
+        small = {name: buffer for name, buffer in inputs.items() if buffer is not None}
+        results = {name: buffer for name, buffer in outputs.items() if buffer is not None}
+        total = sum(buffer.nbytes for buffer in (*small.values(), *results.values()))
+        if len(small) < len(inputs) or len(results) < len(outputs) or total > SMALL:
+            return None
+        return (cls if memory == HOST else DeviceBuffers)(session, ort, small, results, memory)
+
+    def takes(self, feeds: Mapping[str, Any]) -> bool:
+        """Copy the feeds into the buffers; False when one does not fit, so that ONNX Runtime names the mistake."""
+        for name, buffer, shape, dtype in self._inputs:
+            value = feeds.get(name)
+            if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype != dtype:
+                return False
+            buffer[...] = value
+        return len(feeds) == len(self._inputs)
+
+    def run(self, options: Any = None) -> dict[str, Array]:
+        """Run on what the buffers hold and return copies of the outputs."""
+        self._start(self._bindings, options)
+        return {name: buffer.copy() for name, buffer in self._outputs}
+
+
+class DeviceBuffers(BoundBuffers):
+    """The same in the memory of a device: what is fed is copied there before a run, and results back after it."""
+
+    def run(self, options: Any = None) -> dict[str, Array]:
+        """Run on what the buffers hold and return copies of the outputs."""
+        for value, buffer in self._fed:
+            value.update_inplace(buffer)
+        self._start(self._bindings, options)
+        return {name: np.array(value.numpy()) for name, value in self._results}
+
+
+def _port(node: Any) -> Port:
+    dtype = NUMPY_OF.get(str(node.type))
+    name = str(node.type) if dtype is None else dtype.name
+    return port(node.shape, name) if node.shape else Port(None, name)  # a scalar looks like an unknown number of axes
+
+
+def _buffer(node: Any) -> Array | None:
+    """Return an array of zeros like an input or output, or None when its shape or type is not fixed or not numpy's."""
+    dtype = NUMPY_OF.get(str(node.type))
+    if dtype is None or not all(isinstance(size, int) for size in node.shape):
+        return None
+    if 0 in node.shape or int(np.prod(node.shape)) * dtype.itemsize > SMALL:
+        return None
+    return np.zeros(node.shape, dtype)
+
+
+def session_options(ort: Any, threads: int | None) -> Any:
+    """Return what every session of ONNX Runtime is opened with; the cores that this process may use when None."""
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
+    options.inter_op_num_threads = 1
+    return options
+
+
+def disabled_optimizers(model: Path | bytes) -> list[str]:
+    """Return the rewritings of ONNX Runtime that would make a graph compute something else than it says.
+
+    They drop a Relu or Clip before a QuantizeLinear whose zero point is the smallest number of its type, since rounding
+    to uint8 cuts off what is negative, and (seen in 1.31) take every float8 for such a type: negative values come
+    through.
+    """
+    return CUT_OFF_REWRITES if is_true_of(has_float8, model) else []
+
+
+def is_true_of(question: Callable[..., bool], *about: Any) -> bool:
+    """Return what a graph is asked; a file that is none is refused when it is opened."""
+    with contextlib.suppress(GraphError, OSError):
+        return question(*about)
+    return False
+
+
+def open_session(ort: Any, model: Path | bytes, options: Any, providers: Providers = ON_CPU) -> Any:
+    """Open a graph on these providers alone, without what would make it another one."""
+    content = model if isinstance(model, bytes) else str(model)
+    if all(name != CPU for name, _ in providers):
+        options.add_session_config_entry(*NO_CPU_FALLBACK)
+    named = [(name, dict(settings)) for name, settings in providers]
+    optimizers = {"disabled_optimizers": disabled_optimizers(model)}
+    session = ort.InferenceSession(content, options, providers=named, enable_fallback=0, **optimizers)
+    if getattr(session, "_model_bytes", None):
+        session._model_bytes = b""  # Python's wrapper would keep the whole content for a fallback, which is off
+    return session
+
+
+def profiling_session(ort: Any, path: Path, options: Any, scratch: Path, providers: Providers = ON_CPU) -> OrtProfiled:
+    """Open a graph with ONNX Runtime's trace of every node on; it writes files whose names begin with ``scratch``.
+
+    Raises:
+        GraphError: when ONNX Runtime refuses it.
+    """
+    options.enable_profiling, options.profile_file_prefix = True, str(scratch)
+    try:
+        return OrtProfiled(open_session(ort, path, options, providers))
+    except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
+        raise GraphError(
+            f"ONNX Runtime cannot profile {path.name}: {str(error)[:200]}", REMEDY.format(package="onnxruntime")
+        ) from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]
