@@ -96,8 +96,8 @@ def test_they_are_raw_observations(policy_dir: Path, tmp_path: Path, monkeypatch
         seen.update({name: np.load(folder / f"{name}.npy") for name in names})
         return written(folder, names, *rest, **options)
 
-    written = session.label
-    monkeypatch.setattr(session, "label", label)
+    written = session.write_labels
+    monkeypatch.setattr(session, "write_labels", label)
     distilled(source, tmp_path / "out", **ALONE, seed=5, steps=1)
     random = np.random.default_rng(5)
     assert np.array_equal(seen["image"], random.integers(0, 256, (20, 8, 8, 3), np.uint8))

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from _policies import EchoController
+from _numbered import EchoController
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.episodes.disturbances import DisturbedController

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from _policies import EchoController, NumberedPolicy
+from _numbered import EchoController, NumberedPolicy
 
 from tests._reach import TREMBLES, bundle_of
 from vlatool.bundle.bundle import Bundle

@@ -255,6 +255,21 @@ def test_without_environment_or_tasks_the_remedy_is_named(int8_bundle):
         assert "--policy DIR" in caught.value.fix
 
 
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"controller": "lat"}, "Unknown controller 'lat'; did you mean 'late'"),
+        ({"controller": "chunked, late"}, "Both chunked and late play the chunks"),
+        ({"controller": "chunked", "latency_in_the_loop": True}, "The controller chunked waits for each inference"),
+        ({"controller": "late", "control": "random"}, "--controller is of inferences, and random actions need none"),
+        ({"latency_in_the_loop": True, "control": "random"}, "--latency-in-the-loop is of inferences, and random"),
+    ],
+)
+def test_a_controller_that_cannot_play_is_refused_before_episodes(int8_bundle, policy_template, options, says):
+    with pytest.raises(UsageError, match=says):
+        ClosedLoop(policy=policy_template, **options).check(int8_bundle, None)
+
+
 def test_jobs_come_back_in_their_order(int8_bundle, policy_template):
     jobs = [EpisodesJob("environment.py:make", str(policy_template), task, (2, 1)) for task in ("push", "reach")]
     outcomes = run_jobs(int8_bundle, jobs, "ort_cpu", Context(workers=2))

@@ -22,7 +22,7 @@ MODULES = (
     "vlatool.workers._remote_worker",
 )  # fmt: skip
 """Where messages are defined; what they are made of is followed from there."""
-NO_MESSAGES = {"_Asked"}
+NO_MESSAGES = {"_Call"}
 
 
 def messages() -> list[type]:
@@ -76,7 +76,7 @@ def test_a_message_comes_back_as_it_was(kind):
 
 def test_every_process_is_covered():
     names = {kind.__name__ for kind in messages()}
-    assert {"LatencyJob", "Measured", "PairJob", "Pairs", "Agreement", "ColdStart", "Request", "Played"} <= names
+    assert {"LatencyJob", "Benchmark", "PairJob", "Pairs", "Agreement", "ColdStart", "Request", "Played"} <= names
 
 
 def whole() -> dict[str, Any]:

@@ -357,9 +357,9 @@ def silence(weight: torch.Tensor, member: Member, keep: tuple[int, ...]) -> None
 
 
 @pytest.mark.parametrize(("edit", "says"), [
-    (Edit("main", "0.weight", "units 0.1", (0,)), "cannot be chosen from"),
-    (Edit("main", "0.weight", "units 1.0", (0,)), "cannot be chosen from"),
-    (Edit("main", "7.weight", "units 0.0", (0,)), "cannot be chosen from"),
+    (Edit("main", "0.weight", "units 0.1", (0,)), "cannot be chosen"),
+    (Edit("main", "0.weight", "units 1.0", (0,)), "cannot be chosen"),
+    (Edit("main", "7.weight", "units 0.0", (0,)), "cannot be chosen"),
     (Edit("main", "0.weight", "units 0.0", (8,)), r"are 8, numbered from 0; an edit keeps number 8"),
 ])  # fmt: skip
 def test_an_edit_that_does_not_fit_is_refused(edit: Edit, says: str):

@@ -529,7 +529,7 @@ def test_a_command_that_is_ended_ends_the_run_there(there, bundle, tmp_path, num
     import sys
     from pathlib import Path
     from vlatool.remote import ssh
-    ssh.AGENT, ssh.FURTHER = "stand_in_agent", (Path({str(tmp_path / "stand_in_agent.py")!r}),)
+    ssh.AGENT, ssh.FURTHER_MODULES = "stand_in_agent", (Path({str(tmp_path / "stand_in_agent.py")!r}),)
     tell = lambda what, share: print(what, flush=True)
     ssh.measure_on({target()!r}, {{"do": "wait"}}, [Path({str(bundle.path)!r})], tell, python={sys.executable!r},
                    ssh_options={there.server.options()!r})

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from _policies import NumberedPolicy, spec_of
+from _numbered import NumberedPolicy, spec_of
 
 from vlatool.episodes.controls import Blind
 from vlatool.episodes.disturbances import DELAY, DROPPED_FRAMES, DisturbedController

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from _policies import NumberedPolicy, spec_of
+from _numbered import NumberedPolicy, spec_of
 from _written import MEMORY, SUM, written
 
 from vlatool.errors import UsageError

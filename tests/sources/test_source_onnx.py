@@ -242,8 +242,8 @@ def test_an_axis_can_stay_free_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("x", "is no shape"), ("x=1,,4", "is no shape"), ("x=1,0,4", "is no shape"), ("y=1,6,4", "no input.*known: x"),
-        ("x=1,6", "the file has"), ("x=1,6,5", "the file has"), ("=1,6,4", "is no shape"), ("x=1,-6,4", "is no shape"),
+        ("x", "is not a shape"), ("x=1,,4", "is no shape"), ("x=1,0,4", "is no shape"), ("y=1,6,4", "not an input.*known: x"),
+        ("x=1,6", "the file has"), ("x=1,6,5", "the file has"), ("=1,6,4", "is not a shape"), ("x=1,-6,4", "is no shape"),
     ],
 )  # fmt: skip
 def test_a_shape_that_does_not_fit_the_file(tmp_path: Path, text: str, said: str) -> None:

@@ -158,7 +158,7 @@ def test_a_counter_that_goes_back_is_unmeasured() -> None:
 def test_a_counter_that_was_read_once_is_unmeasured() -> None:
     found = summarise(collect(energy("rapl.package-0", None, (0, 50))))
     assert found.counters == {}
-    assert "read once" in reasons(found)["rapl.package-0"]
+    assert "read only once" in reasons(found)["rapl.package-0"]
 
 
 def throttle(kind: str, *values: float) -> Iterable[tuple[float, Reading]]:

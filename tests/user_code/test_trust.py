@@ -165,7 +165,7 @@ def forged(bundle: Bundle, **source: Any) -> Bundle:
         ({"factory": "x"}, "names no factory"),
         ({"arguments": {"layers": 1, "path": "evil.pt"}}, "says arguments: .*evil.pt"),
         ({"weights": "*.bin"}, r"says weights: '\*.bin'"),
-        ({"code": {"../policy.py": "0"}}, "which is not a file beside the factory"),
+        ({"code": {"../policy.py": "0"}}, "which is not beside the factory"),
         ({"code": ["policy.py"]}, "an invalid record"),
     ],
 )

@@ -110,7 +110,7 @@ def run_agreement(job: PairJob) -> Agreement:
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Call:
     kind: str
     observation: Mapping[str, Any]
     noise: Mapping[str, Any] | None
@@ -119,7 +119,7 @@ class _Asked:
 
 def _answers(
     policies: Sequence[Any], pool: Sequence[Any], job: PairJob, afresh: bool = True
-) -> tuple[list[_Asked], int]:
+) -> tuple[list[_Call], int]:
     """Ask both for every observation, some bits of which are new, right after a reset (``afresh``) or in a row."""
     from vlatool.errors import GraphError
     from vlatool.measurement.answers import vary_observation
@@ -127,7 +127,7 @@ def _answers(
 
     numbers = np.random.default_rng([job.seed, 3])
     steps, spec = policies[0].bundle.manifest.program, policies[0].spec
-    calls: list[_Asked] = []
+    calls: list[_Call] = []
     skipped = 0
     end = time.monotonic() + job.seconds
     for index, drawn in enumerate(pool):
@@ -140,9 +140,7 @@ def _answers(
         except GraphError:
             skipped += 1
             continue
-        calls.append(
-            _Asked(drawn.kind, observation, noise, (theirs, _outputs(policies[1], observation, noise, afresh)))
-        )
+        calls.append(_Call(drawn.kind, observation, noise, (theirs, _outputs(policies[1], observation, noise, afresh))))
     return calls, skipped
 
 
@@ -154,7 +152,7 @@ def _outputs(
     return {name: np.array(value) for name, value in policy.infer(observation, noise=noise).outputs.items()}
 
 
-def _strays(policy: Any, calls: Sequence[_Asked], which: int, seed: int) -> int:
+def _strays(policy: Any, calls: Sequence[_Call], which: int, seed: int) -> int:
     """Count the answers that are others in another order without reset; 0 for a policy that keeps values by design."""
     from vlatool.measurement.answers import Answers
 
@@ -166,7 +164,7 @@ def _strays(policy: Any, calls: Sequence[_Asked], which: int, seed: int) -> int:
     return answers.strays
 
 
-def _usual(policy: Any, tensor: Any, calls: Sequence[_Asked]) -> Array:
+def _usual(policy: Any, tensor: Any, calls: Sequence[_Call]) -> Array:
     """Return how much each element of an output varies: over all observations, or by its statistics if that is more."""
     from vlatool.runtime.statistics import load_normaliser
 
@@ -176,7 +174,7 @@ def _usual(policy: Any, tensor: Any, calls: Sequence[_Asked]) -> Array:
     return np.asarray(spread if normaliser is None else np.maximum(spread, np.abs(normaliser.scale)))
 
 
-def _agreements(policies: Sequence[Any], calls: Sequence[_Asked], usual: Mapping[str, Array]) -> list[OutputAgreement]:
+def _agreements(policies: Sequence[Any], calls: Sequence[_Call], usual: Mapping[str, Array]) -> list[OutputAgreement]:
     kind, count = calls[0].kind, len(calls)
     followed = []
     for tensor in policies[0].spec.outputs:

@@ -59,7 +59,7 @@ class Pairs:
     Args:
         baseline_ms, candidate_ms: milliseconds of each call, in the order of the pairs.
         places: what each pair was called with: an observation given exactly, or the same one varied, are two places
-            (``turns.place_of``); each pair has one of its own when empty.
+            (``turns.variant_index``); each pair has one of its own when empty.
         slow: logarithms of candidate over baseline, of further pairs at the place that seemed the slowest for the
             candidate; empty when none seemed slow.
         slow_input: observation of that place, in words.

@@ -78,7 +78,7 @@ class PolicyRun:
         golden_error: relative difference of the golden action; None without one.
         golden_explained: largest difference that rounding explains.
         reach: dtype -> 10^9 multiply-accumulates in a second of a large matrix product in the same engine
-            (``reach.reached``); none where it was not timed.
+            (``reach.measure_reach``); none where it was not timed.
         answers: answers of the timed calls; None when they were not looked at.
         memory: None when it was not looked for, or cannot be.
         phases: parts of an inference; none when they were not timed.

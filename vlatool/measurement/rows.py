@@ -51,12 +51,8 @@ def measurements(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | 
     numbers.append(_jitter(samples))
     busy = measured.cpu_s / max(measured.wall_s, 1e-9)
     numbers.append(Measurement("cpu", busy, "cores", note="user and system time of the process over the run"))
-    return [
-        *numbers,
-        *_board(measured, pace.inferences if pace else len(samples)),
-        *_golden(policy),
-        *cold_rows(policy),
-    ]
+    board = _board(measured, pace.inferences if pace else len(samples))
+    return [*numbers, *board, *_golden(policy), *cold_rows(policy)]
 
 
 def _throughput(samples: Sequence[float]) -> Measurement:

@@ -211,9 +211,7 @@ def _keep(module: Any, edit: Edit) -> None:
     torch = require("torch", "build")
     size = next((name for name in SIZES[edit.axis] if hasattr(module, name)), "")
     if not size or getattr(module, "groups", 1) != 1 or getattr(module, "transposed", False):
-        raise SourceError(
-            f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen from.", REMAKE
-        )
+        raise SourceError(f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen.", REMAKE)
     if max(edit.keep) >= getattr(module, size):
         has = f"'{edit.module}' has {getattr(module, size)} {edit.axis}"
         raise SourceError(f"{has}, numbered from 0; an edit keeps number {max(edit.keep)}.", REMAKE)

@@ -144,7 +144,5 @@ def _code(bundle: Bundle) -> dict[str, str]:
         raise SourceError(f"{bundle.path} has an invalid record of the policy's code.", RESTART)
     for name in code:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or str(PurePosixPath(name)) != name:
-            raise SourceError(
-                f"{bundle.path} records code as {name!r}, which is not a file beside the factory.", RESTART
-            )
+            raise SourceError(f"{bundle.path} records the code {name!r}, which is not beside the factory.", RESTART)
     return {str(name): str(digest) for name, digest in code.items()}

@@ -157,7 +157,7 @@ def _leaf(walk: Walk, edit: Edit) -> int:
     atoms = {atom.path: atom.leaf for atom in walk.factors.atoms(shape[axis])} if axis < len(shape) else {}
     leaf = atoms.get(tuple(path))
     if leaf is None or walk.factors.is_frozen(leaf):
-        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.", REMAKE)
+        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen.", REMAKE)
     if max(edit.keep) >= (size := walk.factors.sizes[leaf]):
         kept = f"numbered from 0; an edit keeps number {max(edit.keep)}"
         raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}, {kept}.", REMAKE)

@@ -43,7 +43,7 @@ class Qat(ImitationStage):
         description="of the bundle, as the method that follows takes it; that of --profile's board unless given",
     )
 
-    def computed(self) -> contextlib.AbstractContextManager[Any]:
+    def compute_context(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which products are rounded."""
         rounded: contextlib.AbstractContextManager[Any] = fake_quantization(self.weights)
         return rounded

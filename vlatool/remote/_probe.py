@@ -125,7 +125,8 @@ def refusal(
     fix = f"install Python {version_text(OLDEST)} or later there, or name one: --remote-python /path/to/venv/bin/python"
     if pythons:
         versions = ", ".join(f"{other.command} is {version_text(other.version)}" for other in pythons)
-        return TargetError(f"The Python of {target} is too old: {versions}; {version_text(OLDEST)} is needed.", fix)
+        oldest = version_text(OLDEST)
+        return TargetError(f"The Python of {target} is too old: {versions}; {oldest} or later is needed.", fix)
     if codes:
         which = python or "python3"
         names = " and ".join(packages)

@@ -29,7 +29,7 @@ STRETCHES = 20
 
 
 class HeldOut:
-    """The recorded observations in two: one part to learn from, one to judge with.
+    """The recorded observations in two parts: one for training, one held out.
 
     Args:
         folder: folder of the training.
@@ -40,12 +40,12 @@ class HeldOut:
         self._frames = frames(folder / FOLDER)
         self.expert = Expert(folder / FOLDER, frames)
         self.recording: Recording | None = None
-        """What is held out, after ``prepare``."""
+        """The held-out part, after ``prepare``."""
         self._training_part: Observations | None = None
 
     @property
     def training_part(self) -> Observations:
-        """Return the observations to learn from."""
+        """Return the observations for training."""
         if self._training_part is None:
             raise RuntimeError("prepare() comes first")
         return self._training_part
@@ -78,7 +78,7 @@ class HeldOut:
         self.expert.read()
 
     def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, device: Device) -> float:
-        """Return the mean loss of what is held out.
+        """Return the mean loss of the held-out part.
 
         Args:
             loss: loss of a batch.
@@ -88,7 +88,7 @@ class HeldOut:
         return mean_loss(self._frames, self._frames.sample((0,), len(self._frames)), loss, rows, device)
 
     def mixture_loss(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, device: Device) -> float:
-        """Return the same as a mixture of both terms.
+        """Return the mean loss of the held-out part as a mixture of both terms.
 
         Args:
             alpha: share of the teacher.
@@ -114,7 +114,7 @@ def _write_required(fallback: Callable[[Path], bool], recorded: int, target: Pat
 
 
 def held_out_mask(recording: Recording) -> NDArray[np.bool_]:
-    """Say of each observation whether it is held out: whole episodes where there are two or more, else stretches."""
+    """Return the mask of held-out observations: whole episodes where there are two or more, else stretches."""
     size = len(recording)
     groups = recording.episodes
     if groups is None or len(np.unique(groups)) < 2:

@@ -39,7 +39,7 @@ class RankProcesses:
         Args:
             rounds: how many rounds of rows there are.
             rows: how many rows in all of them.
-            until: number of the step to stop before.
+            until: number of steps after which to stop.
 
         Raises:
             VlatoolError: the error of one of them, or how it ended.

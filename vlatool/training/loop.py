@@ -1,4 +1,4 @@
-"""The training loop: AdamW, warm-up and cosine, averaged weights, and a run that is killed goes on as if it were not.
+"""The training loop: AdamW, warm-up and cosine, averaged weights; a killed run resumes bit for bit.
 
 What a step does depends on the seed, its number and the weights alone: a run that continues from a checkpoint ends with
 the same weights, bit for bit, on the same processor with the same number of threads and processes.
@@ -38,18 +38,18 @@ CHECKPOINT = "checkpoint.safetensors"
 CLIP = 1.0
 """Largest norm of the gradient."""
 GRADIENT_SAMPLES = (0.05, 0.5, 0.95)
-"""Shares of the steps after which the gradients of the terms of a loss are measured, where it has several."""
+"""Shares of the steps at which the gradient of each term of a loss with several terms is measured."""
 WARMUP = 0.05
 """Share of the steps in which the learning rate rises."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How long and how fast is trained.
+    """Settings of the training loop.
 
     Args:
         steps: updates of the weights.
-        learning_rate: its highest value.
+        learning_rate: highest learning rate.
         weight_decay: weight decay of weights with two axes or more, decoupled (AdamW).
         average: decay of the exponential moving average of the weights, which is the result.
         seed: seed of the batches.
@@ -119,14 +119,14 @@ class Trainer:
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time since the training began, of all runs up to their last checkpoints."""
+        """Wall-clock time of the training, over all runs up to their last checkpoints."""
         return time.monotonic() - self._start
 
     def train(self, until: int, draw: Draw, progress: Callable[[int, float], None]) -> None:
-        """Take steps until so many are done.
+        """Take steps up to a number.
 
         Args:
-            until: number of the step to stop before.
+            until: number of steps after which to stop.
             draw: function that returns the loss of a randomly drawn batch.
             progress: function called with the number of steps and the mean of the last losses.
 
@@ -144,7 +144,7 @@ class Trainer:
                 saved = time.monotonic()
 
     def _checkpoint_due(self, saved: float) -> bool:
-        """Say whether it is time for a checkpoint, which all processes write together where each holds parts."""
+        """Return whether a checkpoint is due, which all processes write together where weights are sharded."""
         due = self._group.rank == 0 and time.monotonic() - saved > self._settings.checkpoint_s
         return self._group.total(float(due)) > 0 if self._shards.several else due
 
@@ -171,7 +171,7 @@ class Trainer:
         self.losses.append(loss)
 
     def _measure_gradients(self, mixture: Mixture, random: np.random.Generator) -> float:
-        """Add the gradients of all terms, and remember the norm of each; return the loss."""
+        """Add the gradients of all terms, and record the norm of each; return the loss."""
         weights, total, norms = list(self._weights.values()), 0.0, []
         sums: list[Tensor | None] = [None] * len(weights)
         for term in mixture.terms:
@@ -198,11 +198,11 @@ class Trainer:
         return total
 
     def judge(self, score: float) -> None:
-        """Remember how well the averaged weights do, and the weights where none did better."""
+        """Record the score of the averaged weights, and the weights if it is the best."""
         self.best.look(score, self.step, self._average)
 
     def _update_average(self) -> None:
-        """Let the average follow the weights, closely in the first steps."""
+        """Update the moving average of the weights, with a smaller decay in the first steps."""
         decay = min(self._settings.average, (1 + self.step) / (10 + self.step))
         with require("torch", "build").no_grad():
             for name, value in self._weights.items():
@@ -219,7 +219,7 @@ class Trainer:
 
     @contextlib.contextmanager
     def averaged_weights(self) -> Iterator[None]:
-        """Let the averaged weights be the weights within the block."""
+        """Use the averaged weights as weights within the block."""
         self.swap()
         try:
             with self._shards.computing():
@@ -228,11 +228,11 @@ class Trainer:
             self.swap()
 
     def whole(self) -> contextlib.AbstractContextManager[None]:
-        """Return a context in which the modules of the first process hold all weights; all processes must come."""
+        """Return a context in which the modules of the first process have all weights; all processes must enter it."""
         return self._shards.in_modules(keep=self._group.rank == 0)
 
     def look(self, look: Callable[[], None]) -> None:
-        """Let programs find out together whether their modules take batches, where processes hold parts of weights."""
+        """Let programs probe together whether their modules take batches, where weights are sharded."""
         if self._shards.several:
             with self._settings.device.computing(), self._shards.computing(), self._shards.probing_batches():
                 look()
@@ -240,7 +240,7 @@ class Trainer:
     def finish(self) -> None:
         """Replace the weights by their average, the best one where that is known, and stop tracking gradients.
 
-        The modules of the first process hold all of them from now on; all processes must come.
+        The modules of the first process have all weights from then on; all processes must call this.
         """
         self._average.update(self.best.weights)
         self.swap()
@@ -252,7 +252,7 @@ class Trainer:
         self._shards.gather(keep=self._group.rank == 0)
 
     def save(self) -> None:
-        """Write a checkpoint, whole or not at all; the first process does, with the parts of all.
+        """Write a checkpoint atomically; the first process writes it, with the parts of all.
 
         Raises:
             OSError: when it cannot be written.
@@ -274,7 +274,7 @@ class Trainer:
             stream_tensors(draft, forms, (shards.whole(name, held) for _, name, held in tensors), about)
 
     def _checkpoint_tensors(self) -> Iterator[tuple[str, str, Tensor]]:
-        """Yield what a checkpoint holds: kind, name of the weight, and tensor, or this process's part of it."""
+        """Yield the content of a checkpoint: kind, name of the weight, and tensor, or this process's part of it."""
         for name, value in self._weights.items():
             yield "weight", name, value
             yield "average", name, self._average[name]
@@ -284,7 +284,7 @@ class Trainer:
             yield "best", name, held
 
     def _resume(self) -> None:
-        """Go on from the checkpoint, if there is one.
+        """Resume from the checkpoint, if there is one.
 
         Raises:
             DataError: when it is damaged.
@@ -325,6 +325,6 @@ class Trainer:
 
 
 def seconds_of(folder: Path) -> float:
-    """Return the wall-clock time that a training took, as its last checkpoint says."""
+    """Return the wall-clock time of a training from its last checkpoint."""
     with require("safetensors", "build").safe_open(str(folder / CHECKPOINT), "pt") as opened:
         return float(opened.metadata()["seconds"])

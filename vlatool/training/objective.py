@@ -33,7 +33,7 @@ class Objective:
         expert: the same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
         unroll: how far the training goes back in time, where the student keeps values; ``loss`` then takes stretches
             of episodes instead of rows.
-        turns: whether the teacher also shows single turns of its loop (``rounds.label``).
+        turns: whether the teacher also shows single turns of its loop (``rounds.write_labels``).
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Rounds of training data: recordings, or episodes in which somebody acts, and what the teacher would do."""
+"""Rounds of training data: recordings or episodes, with the teacher's labels."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ROWS = 32
 
 
 def scene_of(source: Bundle) -> tuple[EpisodesJob, tuple[str, ...]] | None:
-    """Return where a policy's description says that it acts, and the tasks; None when it names no environment."""
+    """Return the environment and the tasks of a policy's description; None without an environment."""
     origin = origin_of(source)
     make, tasks = origin.environment.get("make"), origin.environment.get("tasks")
     if not make or not tasks:
@@ -43,7 +43,7 @@ def scene_of(source: Bundle) -> tuple[EpisodesJob, tuple[str, ...]] | None:
 
 
 class Observations(Protocol):
-    """Observations, each read when it is its turn."""
+    """A sized iterable of observations that are read one by one."""
 
     def __len__(self) -> int: ...
 
@@ -75,7 +75,7 @@ def write_observations(
 
 def write_labels(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: BatchedProgram,
                  seed: Sequence[int], context: Context, *, turns: bool = False) -> list[str]:  # fmt: skip
-    """Write what the teacher gives for every row of a round, and the noise that it drew, beside the inputs.
+    """Write the teacher's outputs for every row of a round, and the noise that it drew, beside the inputs.
 
     A teacher that keeps values is run along the episodes.
 
@@ -119,7 +119,7 @@ def write_labels(frames: Path, names: Sequence[str], outputs: Sequence[str], tea
 def _teacher_batches(
     teacher: BatchedProgram, inputs: Mapping[str, Array], begins: Array | None, seed: Sequence[int], *, turns: bool
 ) -> Iterator[tuple[Sequence[int], Array, Array, dict[str, Tensor], dict[str, Tensor]]]:
-    """Yield what the teacher was shown: seed, rows (B,), which of them to write, its values, and the noise.
+    """Yield batches of the teacher: seed, rows (B,), mask of the rows to write, its values, and the noise.
 
     Args:
         teacher: its program.
@@ -151,7 +151,7 @@ def _rows_at(inputs: Mapping[str, Array], rows: Array) -> dict[str, Tensor]:
 
 
 def _turns(teacher: BatchedProgram, values: Mapping[str, Tensor], random: np.random.Generator) -> dict[str, Tensor]:
-    """Return for each row the number of a turn, and what the teacher carried into and out of it."""
+    """Return for each row the number of a turn, and the values that the teacher carried into and out of it."""
     if teacher.loop is None:
         raise ValueError("a program with a loop has turns")
     paths = {name: values[PATH + name] for name in teacher.loop.carry.values()}
@@ -163,7 +163,7 @@ def _turns(teacher: BatchedProgram, values: Mapping[str, Tensor], random: np.ran
 
 
 def tensors(rows: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
-    """Return the arrays of a batch whose names begin so, without that beginning, as tensors."""
+    """Return the arrays of a batch with a prefix, without the prefix, as tensors."""
     others = (LABEL, NOISE, EXPERT)
     return {
         name[len(prefix) :]: on_device(value)
@@ -173,7 +173,7 @@ def tensors(rows: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
 
 
 def next_round(frames: Frames, number: int, fill: Any) -> None:
-    """Use a round; write it first when no earlier run did.
+    """Use a round, writing it first unless an earlier run did.
 
     Args:
         frames: all rounds.

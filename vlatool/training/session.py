@@ -1,4 +1,4 @@
-"""One training: rounds of episodes and labels, and the steps between them."""
+"""The course of a training: rounds of episodes and labels, and the steps between them."""
 
 from __future__ import annotations
 
@@ -41,20 +41,20 @@ from vlatool.training.teacher import Teacher
 from vlatool.training.user_batches import write_user_batches
 
 ROUND = "round-{:03d}.json"
-"""File that says who acted in a round, and how well."""
+"""File with the actor and the results of a round."""
 ALONG_KEY = "along"
-"""Of the first round: how far a student that keeps values was from its teacher over whole episodes of it."""
+"""Key in the first round: loss of a student that keeps values over whole episodes."""
 MAX_RECORDED = 100_000
-"""Recorded observations at most."""
+"""Largest number of recorded observations."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is played when.
+    """The plan of episodes and batches.
 
     Args:
         batch: observations in a step.
-        episodes: episodes that the teacher plays first, over all tasks.
+        episodes: number of episodes that the teacher plays first, over all tasks.
         student_episodes: student episodes that the student plays at each pause.
         pauses: numbers of the steps before which it does.
         noise: what disturbs the actions in them, see ``EpisodesJob``.
@@ -77,7 +77,7 @@ class Plan:
     supervision: Supervision = TEACHER_ALONE
 
     def episode_count(self, number: int) -> int:
-        """Return how many episodes a round has."""
+        """Return the number of episodes of a round."""
         return self.student_episodes if number else self.episodes
 
     def seed(self, number: int, tasks: int) -> int:
@@ -86,7 +86,7 @@ class Plan:
 
 
 class Session:
-    """Trains a student; what was done is kept in a folder, from which a run that was killed goes on.
+    """Trains a student; its progress is stored in a folder, from which a killed run resumes.
 
     Args:
         plan: what is played when.
@@ -130,7 +130,7 @@ class Session:
         self._success = ""
 
     def run(self) -> dict[str, Any]:
-        """Play, label and train until all steps are done; return what there is to know of it."""
+        """Play, label and train until all steps are done; return the record of the training."""
         if self._trainer.step:
             self._context.progress(f"going on from step {self._trainer.step}", None)
         if self._held_out is not None:
@@ -154,14 +154,14 @@ class Session:
         return self._summary()
 
     def observations(self, most: int) -> dict[str, Any]:
-        """Return rows of the inputs, spread over all rounds, fewer where they are large: name -> (N, ...)."""
+        """Return rows of the inputs, spread over all rounds, fewer if they are large: name -> (N, ...)."""
         names = [tensor.name for tensor in self._spec.inputs]
         first = self._frames.rows(np.zeros(1, int))
         held = self._frames.sample_rows(kept_rows(most, sum(first[name].nbytes for name in names)))
         return {name: held[name] for name in (*names, BEGINS) if name in held}
 
     def _prepare_expert(self) -> None:
-        """Write what the expert did, to learn from and to judge with, where the expert is asked."""
+        """Write the expert's actions for training and evaluation, where the expert is used."""
         if self._objective.expert is None:
             return
         chosen = self._plan.supervision.label_share, self._settings.seed
@@ -172,11 +172,11 @@ class Session:
         self._held_out.expert.prepare(self._held_out.recording, self._source, *chosen, self._encode)
 
     def _recording(self) -> Recording | None:
-        """Return what is recorded, whole episodes where student or teacher keep values."""
+        """Return the recorded observations, as whole episodes where student or teacher keep values."""
         return at_most(self._source, MAX_RECORDED, whole=self._along)
 
     def _compare(self, when: str) -> None:
-        """Note how far a student that keeps values is from its teacher over whole episodes, and not in windows."""
+        """Record the loss of a student that keeps values over whole episodes instead of windows."""
         if self._objective.unroll is None or not self._frames.count:
             return
         about = self._round(0)
@@ -196,11 +196,11 @@ class Session:
             self._trainer.save()
 
     def _in_all_processes(self, function: str, **job: Any) -> contextlib.AbstractContextManager[None]:
-        """Let the other processes do the same within the block, where each holds a part of the weights."""
+        """Call a function in the other processes during the block, where weights are sharded."""
         return self._processes.calling(function, job) if self._settings.shard else contextlib.nullcontext()
 
     def _pause(self, number: int) -> bool:
-        """Let the student play, and say whether it has stopped getting better."""
+        """Let the student play, and return whether it has stopped improving."""
         if self._plays:
             with self._forecast.pause():
                 next_round(self._frames, number, partial(self._write_student_round, number))
@@ -217,10 +217,10 @@ class Session:
         return best.rounds_without_improvement(number) >= patience
 
     def _measure_gap(self, number: int) -> None:
-        """Note how far the student is from its teacher in the round that it has just played, before it trains on it."""
+        """Record the student's loss on the round that it has just played, before it trains on it."""
         about = self._round(number)
         if LOSS_KEY in about or about["step"] != self._trainer.step or self._settings.shard:
-            return  # an earlier run did, or cannot: the weights of then are gone
+            return  # an earlier run did it, or the weights of that step are gone
         how = self._objective.loss, self._plan.batch, self._settings.device
         with self._trainer.averaged_weights():
             about[LOSS_KEY] = last_round_losses(self._frames, number, *how)
@@ -228,7 +228,7 @@ class Session:
         self._write_round(number, about)
 
     def _score(self, number: int) -> float:
-        """Return how well the averaged weights do: the share of episodes that succeed, or less the held-out loss."""
+        """Return the score of the averaged weights: the success rate, or the negative held-out loss."""
         if self._held_out is None:
             about = self._round(number)
             return float(about["successes"] / about["episodes"])
@@ -268,7 +268,7 @@ class Session:
             draft.write_text(json.dumps(about))
 
     def _note_success(self, number: int) -> None:
-        """Remember for the progress how well the student did."""
+        """Remember the student's success rate for the progress."""
         about = self._round(number)
         share = about["successes"] / about["episodes"]
         self._success = f"student {share:.1%} of {about['episodes']}"
@@ -279,12 +279,12 @@ class Session:
         self._label(target, 0, 1)
 
     def _write(self, observations: Observations, target: Path) -> None:
-        """Write recorded observations, and where their episodes begin where that matters."""
+        """Write recorded observations, and the beginnings of their episodes where they matter."""
         begins = episode_begins(observations) if self._along and isinstance(observations, Recording) else None
         write_observations(self._encode, observations, target, begins)
 
     def _write_held_out_batches(self, target: Path) -> bool:
-        """Write rows to judge with that the policy's function yields; say whether it does."""
+        """Write rows for evaluation from the user's function; return whether there is one."""
         if self._plan.user_rows:
             self._write_user_batches(-(-self._plan.user_rows // 10), self._settings.seed + 1, target)
             self._label(target, 0, 1)
@@ -294,7 +294,7 @@ class Session:
         write_user_batches(self._source, count, seed, target, self._context, along=self._along)
 
     def _write_first_round(self, target: Path) -> None:
-        """Write the first round: recordings, batches of the policy's own, and the teacher's episodes."""
+        """Write the first round: recordings, batches of the user's function, and the teacher's episodes."""
         recorded = (self._recording() or []) if self._along else recorded_observations(self._source, MAX_RECORDED)
         chosen = self._held_out.training_part if self._held_out is not None else recorded
         self._write(chosen, target / "recorded")
@@ -303,7 +303,7 @@ class Session:
         self._play(target, 0)
 
     def _write_student_round(self, number: int, target: Path) -> None:
-        """Write a round of the student's episodes; its averaged weights act."""
+        """Write a round of episodes of the student with its averaged weights."""
         with self._trainer.averaged_weights():
             self._play(target, number)
 
@@ -341,7 +341,7 @@ class Session:
             exchange_labels(target, labels, seeds)
 
     def _actor(self, target: Path, number: int) -> Bundle:
-        """Write who plays as a bundle, which the processes that play open."""
+        """Write the policy that plays as a bundle for the processes of the episodes."""
         target.mkdir()
         source, teacher = self._source, self._teacher
         if number:

@@ -1,4 +1,4 @@
-"""A stage that trains a policy to do what a teacher does: its options, and its course."""
+"""The base of stages that train a policy to imitate a teacher: options, and the course of the training."""
 
 from __future__ import annotations
 
@@ -45,23 +45,23 @@ if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
 FIRST_SEED = 1_000_000
-"""Of the first episode to train on."""
+"""Seed of the first training episode."""
 LAST_SHARE = 0.9
-"""Share of the steps after which no further episodes are played: what they bring could hardly be learnt any more."""
+"""Share of the steps after which no further episodes are played: little could still be learnt from them."""
 
 
 class TrainingStage(ModuleStage):
-    """Trains on recordings and, where the policy names an environment, on episodes; the teacher says what is right.
+    """Trains on recordings and, where the policy names an environment, on episodes, all labelled by the teacher.
 
-    No expert is needed: first the teacher acts, then again and again the student, and the teacher says what it would
-    have done wherever they came to (DAgger: Ross et al., arXiv 1011.0686).
+    No expert is needed: first the teacher acts, then repeatedly the student, and the teacher labels every observation
+    that they reach (DAgger: Ross et al., arXiv 1011.0686).
     """
 
     changed_first: ClassVar[bool] = True
-    """Whether a policy that is as its factory makes it has nothing to learn."""
+    """Whether an unchanged policy has nothing to learn."""
     trains: ClassVar[bool] = True
     keeps: ClassVar[int] = 0
-    """Observations that stay in the bundle, to take the ranges of activations from."""
+    """Number of observations that are stored in the bundle, for the ranges of activations."""
     teacher: Path | None = Field(
         None, description="the teacher: a policy, or its source bundle; the policy before any edit when empty"
     )
@@ -103,25 +103,25 @@ class TrainingStage(ModuleStage):
     )
 
     def inputs(self) -> tuple[Path, ...]:
-        """The teacher's manifest, or all that it is made of where it is a policy."""
+        """The teacher's manifest, or the inputs of its source where it is a policy."""
         if self.teacher is None:
             return ()
         source = claimed_source(self.teacher)
         return (self.teacher / MANIFEST,) if source is None else source.inputs()
 
     def key(self, source_hash: str) -> str:
-        """Return the cache key, with that of a teacher that is a policy: it knows its large weights."""
+        """Return the cache key, including that of a teacher that is a policy (which covers its large weights)."""
         teacher = claimed_source(self.teacher) if self.teacher else None
         return super().key(f"{source_hash} {teacher.key('')}" if teacher else source_hash)
 
     def trust_code(self) -> Self:
-        """Allow the code of a teacher that is a policy to run in this process: the user named its folder."""
+        """Allow the code of a teacher that is a policy to run in this process, because the user named its folder."""
         if self.teacher and (source := claimed_source(self.teacher)):
             source.trust_code()
         return self
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """No episode of the training is one of the evaluation's, and the teacher is another policy."""
+        """Check that training and evaluation share no episodes, and that the teacher is another policy."""
         super().check(source, profile)
         for tensor in source.manifest.spec.inputs if source else ():
             if not tensor.shape:
@@ -158,7 +158,7 @@ class TrainingStage(ModuleStage):
             )
 
     def _check_kept_values(self, source: Bundle | None) -> None:
-        """Refuse windows where nothing is kept, and what windows are not made for."""
+        """Refuse windows for policies that keep no values, and options that do not work with windows."""
         if source is None:
             return
         kept = [name for step in source.manifest.program for name in step.keep]
@@ -182,7 +182,7 @@ class TrainingStage(ModuleStage):
             )
 
     def _check_shard(self, source: Bundle | None, parts: int) -> None:
-        """Refuse parts of weights where nobody holds the others, or where processes would not gather equally often."""
+        """Refuse sharding with one process, with sparse weights, or with unequal parts of a batch."""
         if self.shard and source is not None and has_zeros(source):
             raise RecipeError(
                 f"--shard cuts layers into parts, and {source.manifest.name} has weights that pruning set to zero and "
@@ -202,24 +202,24 @@ class TrainingStage(ModuleStage):
             )
 
     def pauses(self) -> list[int]:
-        """Return before which steps the student plays, or is judged on recorded observations."""
+        """Return the steps before which the student plays, or is evaluated on recorded observations."""
         looks = self.student_episodes or self.patience
         return list(range(self.every, round(self.steps * LAST_SHARE), self.every)) if looks else []
 
     def _rounds(self) -> int:
-        """Return how often the student plays, the judgement of the last weights included."""
+        """Return how often the student plays, including the evaluation of the last weights."""
         return len(self.pauses()) + bool(self.patience)
 
     def seeds(self, tasks: int) -> range:
-        """Return the seeds of the episodes that are played of each task, as many as there are at most."""
+        """Return the seeds of the episodes of each task, at most."""
         return range(self.first_seed, self.plan().seed(1 + self._rounds(), tasks))
 
     def objective(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Objective:
-        """Return what the student does with a batch, and how far that is from what the teacher says of it."""
+        """Return the objective: the student's loss on a batch with the teacher's labels."""
         raise NotImplementedError(self.name())
 
     def summary(self, made: Bundle) -> tuple[str, ...]:
-        """Say what the student learnt from, and how far it came."""
+        """Return sentences on the training data and the losses."""
         training = json.loads(made.file(TRAINING).read_bytes())
         losses, last = training["losses"], max(1, len(training["losses"]) // 20)
         seen = sum(round_["observations"] for round_ in training["rounds"])
@@ -244,7 +244,7 @@ class TrainingStage(ModuleStage):
         )
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
-        """Say how it was trained, where the loss curve is, and how to go on."""
+        """Return sentences on the training, the loss curve and the next step."""
         return (*self.summary(made), *curve_lines(made), *super().lines(made))
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
@@ -256,7 +256,7 @@ class TrainingStage(ModuleStage):
         try:
             with work_directory(self._work_folder(source)) as folder:
                 return self._train(modules, source, folder, context)
-        except OSError as error:  # of what is kept until the bundle is written, not of the bundle
+        except OSError as error:  # about the work folder, not about the bundle
             where = file_of(error) or self._work_folder(source)
             raise OutputError(
                 f"The training cannot be kept: {where}: {error.strerror or error}.",
@@ -280,7 +280,7 @@ class TrainingStage(ModuleStage):
             return ModuleChanges(training=training, played=session.observations(self.keeps) if self.keeps else None)
 
     def prepare_objective(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Objective]:
-        """Return the teacher of a student's modules, and what it teaches; every process of a training has its own."""
+        """Return the teacher for a student's modules, and the objective; each process of a training has its own."""
         teacher = Teacher.of(source, self.teacher, modules)
         objective = self.objective(modules, source, teacher)
         if objective.constraint is None and has_zeros(source):
@@ -288,7 +288,7 @@ class TrainingStage(ModuleStage):
         return teacher, objective
 
     def settings(self) -> Settings:
-        """Return how long and how fast is trained."""
+        """Return the settings of the training loop."""
         return Settings(
             self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, self._device(), shard=self.shard
         )
@@ -298,24 +298,24 @@ class TrainingStage(ModuleStage):
         return device_of(self.device, self.precision, self.processes, launch.local_size if launch else None)
 
     def supervision(self) -> Supervision:
-        """Return who says what is right: the teacher, unless a stage asks somebody else, too."""
+        """Return the supervision: by the teacher alone, unless a stage adds an expert."""
         return TEACHER_ALONE
 
     def plan(self) -> Plan:
-        """Return what is played when; nobody plays where nobody would say what was right."""
+        """Return the plan of episodes; none are played where no teacher would label them."""
         supervision = self.supervision()
         episodes = (self.episodes, self.student_episodes) if supervision.alpha else (0, 0)
         played = (self.batch, *episodes, self.pauses(), self.noise, self.first_seed)
         return Plan(*played, self.patience, self.accumulate, supervision=supervision)
 
     def _job(self, source: Bundle) -> dict[str, Any]:
-        """Return what another process of the training needs to know."""
+        """Return the job for another process of the training."""
         threads = require("torch", "build").get_num_threads()
         path = str(source.path.absolute())
         return {"stage": self.name(), "options": self.explicit_options(), "source": path, "threads": threads}
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
-        """Train; what a run that is killed goes on from is there until the result is written."""
+        """Train; the checkpoint of a killed run stays until the result is written."""
         if context.events:
             check_events(context.events)
         made = super().run(source, out, context)
@@ -329,13 +329,13 @@ class TrainingStage(ModuleStage):
 
 
 def curve_lines(made: Bundle) -> tuple[str, ...]:
-    """Say where the report of a training is, where there is one."""
+    """Return a sentence that names the report of a training, if there is one."""
     page = made.path / REPORTS / "report.html"
     return (f"loss curve: {page}",) if page.is_file() else ()
 
 
 def _hint_lines(hints: Mapping[str, Any]) -> tuple[str, ...]:
-    """Say which blocks were compared with the teacher's, and which stacks were not."""
+    """Return sentences on the blocks that were compared with the teacher's, and the stacks that were not."""
     lines = []
     for name, about in hints.items():
         blocks: dict[str, list[str]] = {}
@@ -349,7 +349,7 @@ def _hint_lines(hints: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _selection_lines(judged: Mapping[str, Any] | None) -> tuple[str, ...]:
-    """Say by what the weights were chosen, if they were."""
+    """Return a sentence on how the best weights were selected, if they were."""
     if judged is None:
         return ()
     scores = ", ".join(f"{score:.4g}" for score in judged["scores"])

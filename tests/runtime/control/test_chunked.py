@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from _policies import NumberedPolicy, spec_of
+from _numbered import NumberedPolicy, spec_of
 
 from vlatool.bundle.spec import TensorSpec
 from vlatool.runtime import Action, ChunkQueue, load

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from _policies import NumberedPolicy, spec_of
+from _numbered import NumberedPolicy, spec_of
 
 from vlatool import registry
 from vlatool.errors import PluginError, UsageError

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from _policies import MOVES, NumberedPolicy, spec_of
+from _numbered import MOVES, NumberedPolicy, spec_of
 
 from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import UsageError
