@@ -22,7 +22,7 @@ from vlatool import errors, measures, registry, report
 from vlatool.bundle import manifest, spec
 from vlatool.cli._schemas import COMMANDS, definitions
 from vlatool.gate import config
-from vlatool.hardware.profile import load_profile, names
+from vlatool.hardware.profile import load_profile, profile_names
 from vlatool.stage.base import Stage
 from vlatool.stage.build import stage_kinds
 
@@ -288,7 +288,7 @@ def errors_page() -> str:
 def profiles_page() -> str:
     """Return a row for each shipped profile."""
     rows = ["# Hardware profiles\n", "| name | board |", "|---|---|"]
-    rows += [f"| `{name}` | {load_profile(name).title} |" for name in names()]
+    rows += [f"| `{name}` | {load_profile(name).title} |" for name in profile_names()]
     return "\n".join(rows) + "\n\nEvery figure with its source: `vlatool profiles show NAME`.\n"
 
 

@@ -13,8 +13,8 @@ from vlatool.latency_model.features import Shares, rows_of
 from vlatool.latency_model.fit import conformal
 from vlatool.latency_model.folds import Sample
 from vlatool.latency_model.gaussian_process import Scales
-from vlatool.latency_model.model import Known, LatencyModel
-from vlatool.latency_model.published import Point, read_points
+from vlatool.latency_model.model import LatencyModel, TrainingData
+from vlatool.latency_model.published_latencies import Point, read_points
 
 Load = Callable[..., Workload]
 
@@ -37,7 +37,7 @@ def model(points: list[Point]) -> LatencyModel:
     parts, bounds = {}, {}
     for part in ("processors", "npu"):
         mine = Sample.of([point for point in points if (point.kind == "npu") == (part == "npu")])
-        parts[part] = Known(rows_of(mine.questions, Shares()), mine.logs, Scales())
+        parts[part] = TrainingData(rows_of(mine.questions, Shares()), mine.logs, Scales())
         bounds[part] = conformal(mine, Scales(), Shares())
     return LatencyModel(parts, dict.fromkeys(parts, Shares()), bounds, {"figures": len(points)})
 

@@ -15,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from vlatool.module.axes import Member, Walk
 from vlatool.module.unit_removal import RETRACE, remove_units, trace_module
 from vlatool.prune._selection import Selection
-from vlatool.prune._units import Group, Rank, groups_of, rank_units
+from vlatool.prune._unit_groups import Rank, UnitGroup, find_groups, rank_units
 from vlatool.prune.structured import Structured
 from vlatool.stage.base import Context
 
@@ -31,7 +31,7 @@ def silence(module: nn.Module, member: Member, gone: Collection[int]) -> None:
         module.state_dict()[member.weight].index_fill_(member.axis, torch.tensor(places), 0.0)
 
 
-def silenced(module: nn.Module, groups: Sequence[Group]) -> nn.Module:
+def silenced(module: nn.Module, groups: Sequence[UnitGroup]) -> nn.Module:
     """Return a copy in which the units that do not stay do nothing."""
     silent = copy.deepcopy(module)
     for group in groups:
@@ -70,7 +70,7 @@ def check_pruned(
         ratio: Share of the work that is to go.
     """
     walks = {"main": Walk(trace_module(module.eval(), feeds))}
-    groups = groups_of(walks, Selection((), ()), 2, what)
+    groups = find_groups(walks, Selection((), ()), 2, what)
     rank_units(groups, rank, {"main": module}, None, 0)  # type: ignore[arg-type]
     done = Structured(ratio=ratio, multiple=2, least=0.2).choose(walks, groups, {"main": 1}, Context())
     small = remove_units(copy.deepcopy(module), feeds, done.edits) if done.edits else module

@@ -40,6 +40,13 @@ def test_files_with_an_underscore_are_no_entries(kind):
     assert registry.names(kind("gadgets_a", _shared="", lamp="")) == ["lamp"]
 
 
+def test_sub_packages_are_not_entries(kind, tmp_path):
+    name = kind("gadgets_parts", lamp="")
+    (tmp_path / name / "parts").mkdir()
+    (tmp_path / name / "parts/__init__.py").touch()
+    assert registry.names(name) == ["lamp"]
+
+
 def test_listing_imports_nothing(kind):
     assert registry.names(kind("gadgets_b", broken="raise RuntimeError")) == ["broken"]
 

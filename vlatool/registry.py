@@ -1,8 +1,9 @@
 """(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or one of another package; imports only what is named.
 
-One entry, one file, found by its file name: there is no list to edit. A file whose name starts with ``_`` is shared by
-its folder and is not an entry. Another package adds an entry by an entry point of the group ``vlatool.<kind>``
-(``vlatool.quantize``, ``vlatool.engines``, ...) that names a module or a class in it; vlatool's own come first.
+One entry, one file, found by its file name: there is no list to edit. A file whose name starts with ``_`` and a
+sub-package are shared by the folder and are not entries. Another package adds an entry by an entry point of the group
+``vlatool.<kind>`` (``vlatool.quantize``, ``vlatool.engines``, ...) that names a module or a class in it; vlatool's own
+come first.
 """
 
 from __future__ import annotations
@@ -224,7 +225,7 @@ def _builtin_names(kind: str) -> list[str]:
     if spec is None or spec.submodule_search_locations is None:
         return []
     files = pkgutil.iter_modules(spec.submodule_search_locations)
-    return sorted(file.name for file in files if not file.name.startswith("_"))
+    return sorted(file.name for file in files if not (file.ispkg or file.name.startswith("_")))
 
 
 def _only_class(source: ModuleType) -> type:

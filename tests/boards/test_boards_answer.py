@@ -27,11 +27,11 @@ from vlatool.boards.simulate import Change
 from vlatool.boards.torch_workload import torch_workload
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, DataError, OutputError, SourceError, UsageError
-from vlatool.graph.stored import LAYOUT, digest, read_workload
 from vlatool.graph.workload import workload
-from vlatool.hardware.profile import load_profile, names
+from vlatool.graph.workload_file import LAYOUT_VERSION, digest, read_workload
+from vlatool.hardware.profile import load_profile, profile_names
 from vlatool.latency_model.board import Candidate, outcomes
-from vlatool.latency_model.model import shipped
+from vlatool.latency_model.model import load_model
 from vlatool.machine.host import cache_directory
 from vlatool.prune.neurons import Neurons
 from vlatool.render.sections.boards import limit_ms
@@ -68,7 +68,7 @@ def test_a_damaged_count_is_made_again(float_bundle: Bundle, content: bytes) -> 
     wanted = counted(float_bundle, Context())
     kept()[0].write_bytes(content)
     assert counted(float_bundle, Context()) == wanted
-    assert json.loads(kept()[0].read_text())["layout"] == LAYOUT
+    assert json.loads(kept()[0].read_text())["layout"] == LAYOUT_VERSION
 
 
 def test_a_cache_that_cannot_be_written_costs_time_alone(float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +108,7 @@ def test_a_count_of_something_else_is_made_again(
     elif change == "spec":
         description.write_text(description.read_text().replace("control_hz: 10", "control_hz: 20"))
     elif change == "another version":
-        monkeypatch.setattr("vlatool.graph.stored.VERSION", "99")
+        monkeypatch.setattr("vlatool.graph.workload_file.VERSION", "99")
     bundle = opened(str(policy_dir), Context())
     assert counted(bundle, Context()) == torch_workload(bundle)
 
@@ -228,14 +228,14 @@ def tried(board: str, engine: str, precision: str, source: str) -> dict[str, Any
 def turns() -> dict[str, list[str]]:
     """Return board -> the engines that no board before it has, or one of its own, in turn."""
     found: dict[str, list[str]] = {}
-    for number, board in enumerate(names()):
+    for number, board in enumerate(profile_names()):
         engines = list(load_profile(board).engines)
         new = [engine for engine in engines if not any(engine in each for each in found.values())]
         found[board] = new or [engines[number % len(engines)]]
     return found
 
 
-@pytest.mark.parametrize("board", names())
+@pytest.mark.parametrize("board", profile_names())
 def test_a_simulation_is_json_without_nan_or_a_reason(board: str, float_bundle: Bundle) -> None:
     """In an engine of each board, so that every engine has its turn; in each of them in the full form."""
     engines = load_profile(board).engines
@@ -249,14 +249,14 @@ def test_a_simulation_is_json_without_nan_or_a_reason(board: str, float_bundle: 
 
 
 def test_every_engine_has_its_turn() -> None:
-    every = {engine for board in names() for engine in load_profile(board).engines}
+    every = {engine for board in profile_names() for engine in load_profile(board).engines}
     assert {engine for engines in turns().values() for engine in engines} == every
 
 
 def test_a_change_that_cannot_be_predicted_is_json_without_nan(float_bundle: Bundle) -> None:
     load = counted(float_bundle, Context())
     way = Candidate(load_profile("raspberry-pi-5-hailo8"), "default", "hailort", "int8")
-    outcome = outcomes([way], load, shipped())[0]
+    outcome = outcomes([way], load, load_model())[0]
     assert not outcome.latency.known
     found = _change(Change("int8 in the place of float32", outcome))
     assert (found["latency_ms"], found["why"]) == (None, outcome.latency.why)

@@ -25,7 +25,7 @@ from vlatool.cli._stages import DEFAULTS
 from vlatool.cli.optimize import share
 from vlatool.errors import GateFailed, GraphError, Inconclusive, UsageError
 from vlatool.files.npz import open_npz
-from vlatool.hardware.profile import names
+from vlatool.hardware.profile import profile_names
 from vlatool.report import Measurement, Report, Row, read_report
 from vlatool.runtime import load
 from vlatool.stage.base import Context
@@ -386,12 +386,12 @@ def test_doctor_says_what_is_there_and_how_to_mend_the_rest(vlatool):
 def test_profiles_are_listed(vlatool):
     code, out, _ = vlatool("profiles", "list")
     assert code == 0
-    assert [line.split()[0] for line in out.splitlines()] == names()
+    assert [line.split()[0] for line in out.splitlines()] == profile_names()
     _, out, _ = vlatool("profiles", "list", "--json")
-    assert [profile["name"] for profile in json.loads(out)] == names()
+    assert [profile["name"] for profile in json.loads(out)] == profile_names()
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", profile_names())
 def test_a_profile_is_shown_with_the_source_of_every_figure(vlatool, name):
     code, out, _ = vlatool("profiles", "show", name)
     assert code == 0

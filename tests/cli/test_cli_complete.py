@@ -14,7 +14,7 @@ from typer._completion_classes import BashComplete
 from vlatool import registry
 from vlatool.cli import app
 from vlatool.hardware.platforms import platform_names
-from vlatool.hardware.profile import names
+from vlatool.hardware.profile import profile_names
 
 
 @pytest.fixture
@@ -53,8 +53,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
 )  # fmt: skip
 def test_profiles_are_completed(completed, line: tuple[str, ...]) -> None:
-    assert completed(*line, "") == names()
-    assert completed(*line, "raspberry") == [name for name in names() if name.startswith("raspberry")]
+    assert completed(*line, "") == profile_names()
+    assert completed(*line, "raspberry") == [name for name in profile_names() if name.startswith("raspberry")]
     assert completed(*line, "no-such") == []
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from vlatool.cli import main
-from vlatool.hardware.profile import load_profile, names
+from vlatool.hardware.profile import load_profile, profile_names
 from vlatool.report import Report, read_report
 
 SMALL = ["--boards", "raspberry-pi-5", "--boards", "jetson-orin-nano", "--boards", "raspberry-pi-5-hailo8"]
@@ -70,7 +70,7 @@ def test_hwselect_looks_at_every_board_when_none_is_named(vlatool, float_bundle)
     code, out, _ = vlatool("hwselect", float_bundle.path, "--json")
     assert code == 0
     report = Report.from_json(out)
-    owned = {name for name in names() if load_profile(name).price_usd_per_hour is None}
+    owned = {name for name in profile_names() if load_profile(name).price_usd_per_hour is None}
     assert {row.name for row in report.rows} == owned
     assert report.limits == {"hz": 10.0}, "the control rate of the policy"
 
@@ -313,7 +313,7 @@ def test_profiles_are_validated_by_name_file_and_directory(vlatool):
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[:2] == ["ok  raspberry-pi-5", "ok  jetson-nano"]
-    assert sorted(lines[2:]) == [f"ok  {name}" for name in names()]
+    assert sorted(lines[2:]) == [f"ok  {name}" for name in profile_names()]
 
 
 def test_what_is_wrong_in_several_profiles_is_listed_at_once(vlatool, tmp_path):

@@ -13,7 +13,7 @@ from tests._reach import folder_of
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import MAX_PLAYED, PLAYED, Encoded, kept_rows, played_observations, recorded_observations
 from vlatool.errors import DataError
-from vlatool.quantize._calibrate import calibrate
+from vlatool.quantize.calibration.activation_statistics import calibrate
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.sources.torch_module import TorchModule

@@ -10,7 +10,7 @@ import pytest
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.episodes.body import Body, same_unit_elements
-from vlatool.motion.measure import measured
+from vlatool.motion.measure import measure_episode
 
 ACTION = TensorSpec("action", (1, 2, 4), unit=("m", "m", "m", "1"), labels=("x", "y", "z", "gripper"))
 SPEC = PolicySpec((TensorSpec("state", (1, 4)),), (ACTION,), control_hz=10.0, chunk=2)
@@ -43,7 +43,7 @@ def test_all_that_is_told_is_kept():
     assert track.collision.tolist() == [False, True, False, False, False, False]
     assert track.fresh.tolist() == [True, False] * 3
     assert (track.alike, track.grip, track.shortest) == ((0, 1, 2), 3, 0.3)
-    found = measured(track)
+    found = measure_episode(track)
     assert found["path_length"] == pytest.approx(0.6)
     assert found["detour"] == pytest.approx(2.0)
     assert found["collisions"] == 1.0
@@ -53,7 +53,13 @@ def test_nothing_told_leaves_the_actions():
     for infos in (told(), [None] * (STEPS + 1), ["text"] * (STEPS + 1), [{}, *told()[1:]]):
         body = played(infos)
         assert not body.refused
-        assert set(measured(body.track())) == {"task_time", "action_rate", "seam_jump", "reversals", "gripper_flips"}
+        assert set(measure_episode(body.track())) == {
+            "task_time",
+            "action_rate",
+            "seam_jump",
+            "reversals",
+            "gripper_flips",
+        }
 
 
 def test_a_reset_that_tells_nothing_begins_with_the_first_step():
@@ -103,7 +109,7 @@ def test_what_is_wrong_gives_no_number_and_a_reason(case: str):
     series, name, why = WRONG[case]
     series = {key: value * 3 if isinstance(value, list) and len(value) == 3 else value for key, value in series.items()}
     body = played(told(**series))
-    found = measured(body.track())
+    found = measure_episode(body.track())
     assert list(body.refused) == [name]
     assert body.refused[name]
     assert re.search(why, body.refused[name]), body.refused
@@ -117,7 +123,7 @@ def test_an_episode_of_one_step():
     body.look({"position": (0.0, 0.0)})
     body.add_action(np.zeros(4, np.float32), True)
     body.look({"position": (3.0, 4.0)})
-    found = measured(body.track())
+    found = measure_episode(body.track())
     assert found["task_time"] == pytest.approx(0.1)
     assert found["path_length"] == pytest.approx(5.0)
     assert "jerk" not in found

@@ -16,10 +16,10 @@ from vlatool.cli import app
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError
 from vlatool.explain import Options, _Findings, _times, explain, explanation
-from vlatool.explain._islands import QuantizedGraph, fallbacks, timed
+from vlatool.explain._candidates import measure
+from vlatool.explain._float_roundtrips import QuantizedGraph, fallbacks, with_times
 from vlatool.explain._operators import GROUPS, profile, shares
 from vlatool.explain._origin import command, observations_of, origin
-from vlatool.explain._remedy import measure
 from vlatool.machine.host import fingerprint
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -347,7 +347,7 @@ def test_round_trips_are_found_by_structure(tmp_path):
         helper.make_model(helper.make_graph(nodes, "g", values[:1], values[1:], [scale, zero])), tmp_path / "g.onnx"
     )
     graph = QuantizedGraph("g", tmp_path / "g.onnx")
-    assert [(each.start, each.between, each.end) for each in timed(graph.islands(), [])] == [
+    assert [(each.start, each.between, each.end) for each in with_times(graph.round_trips(), [])] == [
         ("back", (), "again"),
         ("last", ("Relu",), "end"),
     ]

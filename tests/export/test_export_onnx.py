@@ -385,7 +385,7 @@ def test_a_policy_in_another_float_is_exported_in_float32_and_told(tmp_path: Pat
     source = TorchModule(policy=tmp_path).run(None, folders[0], Context())
     context = Context()
     exported = ExportOnnx().run(source, folders[1], context)
-    assert f"layers compute in {name}; the graph is written in float32" in context.messages[0]
+    assert f"layers compute in {name}; the graph is converted to float32" in context.messages[0]
     graph = onnx.load(exported.path / "graphs/main.onnx").graph
     assert {tensor.data_type for tensor in graph.initializer} == {1}
     assert exported.manifest.graphs["main"].precision == {"float32": 1.0}

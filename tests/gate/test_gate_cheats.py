@@ -11,10 +11,10 @@ import pytest
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
 from vlatool.gate import run as run_gate_module
-from vlatool.gate.claims import growth
 from vlatool.gate.inputs import TIMING, Inputs
 from vlatool.measurement import turns
 from vlatool.measurement.agreement import run_agreement
+from vlatool.measurement.cold_start import cold_start
 from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.turns import run_job
 
@@ -95,7 +95,7 @@ def test_what_is_slow_on_some_observations_is_found_in_one_process(cheated, tmp_
 def test_more_memory_on_any_text_shows(cheated, tmp_path: Path) -> None:
     made = gate_cheats.CHEATS["more memory on any text"].make(cheated["tiny"], tmp_path / "candidate")
     with Inputs(cheated["tiny"], None, seed=1).file(8, TIMING) as path:
-        probed = [growth.cold_start(bundle.path, "", 1, observations=path).peak_rss_mb
+        probed = [cold_start(bundle.path, "", 1, observations=path).peak_rss_mb
                   for bundle in (made, cheated["tiny"])]  # fmt: skip
     assert probed[0] > probed[1] + 60
 

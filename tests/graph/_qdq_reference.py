@@ -10,7 +10,7 @@ import onnx.parser
 import onnxruntime
 from onnx import numpy_helper
 
-from vlatool.graph.layers import Layer, Style, calibrated_values, find_layers, hoisted
+from vlatool.graph.layers import Layer, Style, calibrated_values, find_layers, hoisted_values
 from vlatool.graph.nodes import name_nodes
 from vlatool.graph.qdq import insert_qdq
 
@@ -52,7 +52,7 @@ def quantized(
     model: Any, style: Style, ranges: dict[str, tuple[float, float]], **options: bool
 ) -> tuple[Any, list[Layer]]:
     layers = find_layers(model, OPS, **options)
-    wanted = calibrated_values(layers, style, hoisted(model, layers, style))
+    wanted = calibrated_values(layers, style, hoisted_values(model, layers, style))
     insert_qdq(model, layers, {name: ranges.get(name, (-3.0, 3.0)) for name in wanted}, style)
     onnx.checker.check_model(model, full_check=True)
     return model, layers

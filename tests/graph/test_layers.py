@@ -12,9 +12,9 @@ from _arithmetic import exact
 from _qdq_reference import IMAGE, OPS, STYLES, X, close, conv, graph, quantized, rounded, rounded_weight, run, weight
 
 from vlatool.errors import GraphError
-from vlatool.graph.layers import find_layers, hoisted, split_gemm
+from vlatool.graph.layers import find_layers, hoisted_values, split_gemms
 from vlatool.graph.nodes import name_nodes
-from vlatool.quantize._reductions import keep_axes
+from vlatool.quantize.int8.reductions import keep_reduced_axes
 from vlatool.runtime.engines.openvino import OpenvinoSession
 
 
@@ -39,7 +39,7 @@ def test_values_are_quantized_before_what_only_moves_them(move: str, shape: str,
     style = STYLES["hoist"]
     low = 0.0 if source == "node" else -3.0
     model, layers = quantized(graph(text, **known), style, {"a": (low, 3.0)})
-    assert hoisted(graph(text, **known), layers, style) == {"m": "a"}
+    assert hoisted_values(graph(text, **known), layers, style) == {"m": "a"}
     order = [node.op_type for node in model.graph.node]
     moves = [order.index(kind) for kind in ("Reshape", "Transpose", "Split", "Unsqueeze") if kind in order]
     assert order.index("QuantizeLinear") < min(moves)
@@ -103,12 +103,12 @@ def test_gemm_becomes_matmul_and_keeps_its_name_and_values(transposed: int) -> N
     w, b = weight(6, 5), weight(5, seed=2)
     text = f"(float[4,6] x) => (float[4,5] y) {{ y = Gemm<transB={transposed}>(x, w, b) }}"
     model = graph(text, w=np.ascontiguousarray(w.T) if transposed else w, b=b)
-    assert split_gemm(model) == 1
+    assert split_gemms(model) == 1
     assert [(node.op_type, node.name) for node in model.graph.node] == [("MatMul", "Gemm_0"), ("Add", "Gemm_0/bias")]
     close(run(model, x=X)["y"], X @ w + b)
     for options in ("alpha=2.0", "transA=1"):
         kept = graph(f"(float[6,6] x) => (float[6,5] y) {{ y = Gemm<{options}>(x, w) }}", w=w)
-        assert split_gemm(kept) == 0
+        assert split_gemms(kept) == 0
 
 
 def test_nodes_get_names_of_their_own() -> None:
@@ -136,7 +136,7 @@ def test_reductions_are_computed_right_by_openvino(kind: str, before: str, tmp_p
     wide = {"x": (-4.0, 4.0), "m": (-150.0, 150.0) if kind == "ReduceSum" else (-40.0, 40.0)}
     model, _ = quantized(graph(text, **known), style, wide)
     wanted = run(model, x=x)["y"]
-    assert keep_axes(model) == 1
+    assert keep_reduced_axes(model) == 1
     onnx.checker.check_model(model, full_check=True)
     np.testing.assert_array_equal(run(model, x=x)["y"], wanted)
     onnx.save(model, tmp_path / "a.onnx")
@@ -147,13 +147,13 @@ def test_reductions_are_computed_right_by_openvino(kind: str, before: str, tmp_p
 def test_reductions_of_older_opsets_and_those_that_keep_their_axes() -> None:
     x = weight(4, 6, seed=3)
     old = graph("(float[4,6] x) => (float[4] y) { y = ReduceMean<axes=[1], keepdims=0>(x) }", opset=13)
-    assert keep_axes(old) == 1
+    assert keep_reduced_axes(old) == 1
     close(run(old, x=x)["y"], x.mean(1))
     everything = graph("(float[4,6] x) => (float y) { y = ReduceMean<keepdims=0>(x) }")
-    assert keep_axes(everything) == 1
+    assert keep_reduced_axes(everything) == 1
     close(run(everything, x=x)["y"], x.mean())
     for kept in ("y = ReduceMean(x)", "y = ReduceMean<keepdims=1>(x)", "y = Relu(x)"):
-        assert keep_axes(graph(f"(float[4,6] x) => (float[a,b] y) {{ {kept} }}")) == 0
+        assert keep_reduced_axes(graph(f"(float[4,6] x) => (float[a,b] y) {{ {kept} }}")) == 0
 
 
 @pytest.mark.parametrize(

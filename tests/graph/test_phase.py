@@ -12,7 +12,7 @@ import pytest
 from onnx import numpy_helper
 
 from vlatool.bundle.program import ProgramStep
-from vlatool.graph.files import part_phases
+from vlatool.graph.files import split_phases
 from vlatool.graph.nodes import name_nodes
 from vlatool.graph.phase import cut_phases
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
@@ -45,7 +45,7 @@ def run(folder: Path, model: Any, feeds: dict[str, Any], *steps: ProgramStep) ->
     """Run a program of one graph, or of the two that it is cut into."""
     path = folder / "main.onnx"
     onnx.save(model, path)
-    program, parted = part_phases(steps, "main", path)
+    program, parted = split_phases(steps, "main", path)
     sessions = {name: OrtCpuSession(folder / f"{name}.onnx", 1) for name in ("main", *parted)}
     return np.asarray(Program(program, sessions, seed=0).run(dict(feeds))["y"])
 
@@ -100,7 +100,7 @@ def test_a_graph_in_a_loop_is_left_whole(tmp_path: Path) -> None:
     step = ProgramStep("main", {"x": "x", "t": "t"}, {"y": "y"}, repeat=3, carry={"y": "x"})
     onnx.save(graph(TIME), tmp_path / "main.onnx")
     before = (tmp_path / "main.onnx").read_bytes()
-    assert part_phases((step,), "main", tmp_path / "main.onnx") == ((step,), {})
+    assert split_phases((step,), "main", tmp_path / "main.onnx") == ((step,), {})
     assert (tmp_path / "main.onnx").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["main.onnx"]
 

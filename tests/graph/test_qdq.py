@@ -30,7 +30,7 @@ from vlatool.errors import GraphError
 from vlatool.graph.layers import Layer, Style, check_weights, find_layers
 from vlatool.graph.nodes import read_names
 from vlatool.graph.qdq import quantize_weight
-from vlatool.quantize._integer_matmul import use_integer_matmul
+from vlatool.quantize.int8.integer_matmul import use_integer_matmul
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.weight_pairs import weights_fit
 

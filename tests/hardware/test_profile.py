@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from vlatool.errors import OutputError, ProfileError
 from vlatool.hardware import profile as module
-from vlatool.hardware.profile import Profile, copy_profile, load_profile, names
+from vlatool.hardware.profile import Profile, copy_profile, load_profile, profile_names
 
 SHIPPED = (
     "a100-80gb", "h100-80gb", "intel-nuc-12-pro", "intel-nuc-13-pro", "intel-nuc-14-pro", "jetson-agx-orin-32gb",
@@ -57,13 +57,13 @@ def unit_names(profile: Profile) -> list[str]:
 
 
 def test_the_shipped_profiles_are_these() -> None:
-    assert names() == sorted(SHIPPED)
+    assert profile_names() == sorted(SHIPPED)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_profiles_are_sound(name: str) -> None:
     found = load_profile(name)
-    assert found.name == name in names()
+    assert found.name == name in profile_names()
     assert len(figures(found)) > 14
     for text in found.sources.values():
         assert not re.search(r"(^|[\s(\"'])(~|/work|/home|/root|/tmp|/mnt|/usr|file:|[A-Z]:\\)", text), text
@@ -105,7 +105,7 @@ def test_narrower_types_are_not_slower_and_at_most_twice_as_fast(name: str) -> N
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_engines_rest_on_a_runtime_that_was_published(name: str) -> None:
-    from vlatool.latency_model.published import RUNTIMES
+    from vlatool.latency_model.published_latencies import RUNTIMES
 
     profile = load_profile(name)
     for engine in profile.engines.values():
@@ -226,7 +226,7 @@ def test_user_directory_comes_first(tmp_path: Path, valid: dict[str, Any], monke
     write(tmp_path, valid | {"title": "mine"}, "raspberry-pi-5")
     write(tmp_path, valid | {"name": "robot-arm"}, "robot-arm")
     monkeypatch.setenv("VLATOOL_PROFILES", f"{tmp_path / 'absent'}:{tmp_path}")
-    assert {*SHIPPED, "robot-arm"} <= {*names()}
+    assert {*SHIPPED, "robot-arm"} <= {*profile_names()}
     assert load_profile("raspberry-pi-5").title == "mine"
     assert load_profile(str(tmp_path / "robot-arm.yaml")).name == "robot-arm"
 
@@ -238,7 +238,7 @@ def test_wheel_layout_comes_before_the_checkout(
     write(tmp_path / "_profiles", valid | {"name": "wheeled"}, "wheeled")
     monkeypatch.setattr(module, "__file__", str(tmp_path / "hardware/profile.py"))
     monkeypatch.delenv("VLATOOL_PROFILES", raising=False)
-    assert names() == ["wheeled"]
+    assert profile_names() == ["wheeled"]
 
 
 def test_each_problem_is_a_readable_line(tmp_path: Path, valid: dict[str, Any]) -> None:
@@ -402,7 +402,7 @@ def test_a_board_has_other_names(typed: str, board: str) -> None:
 
 
 def test_no_two_boards_have_one_name() -> None:
-    listed = [alias for name in names() for alias in (name, *load_profile(name).aliases)]
+    listed = [alias for name in profile_names() for alias in (name, *load_profile(name).aliases)]
     assert len(listed) == len(set(listed))
 
 

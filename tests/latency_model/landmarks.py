@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vlatool.latency_model.features import rows_of
-from vlatool.latency_model.fit import by_part
+from vlatool.latency_model.fit import split_by_part
 from vlatool.latency_model.folds import Sample
-from vlatool.latency_model.model import Known, LatencyModel, shipped
-from vlatool.latency_model.published import Point, merged, read_points
-from vlatool.latency_model.score import lines, score_points
+from vlatool.latency_model.model import LatencyModel, TrainingData, load_model
+from vlatool.latency_model.published_latencies import Point, merge_versions, read_points
+from vlatool.latency_model.score import score_points, summary_lines
 
 UNSEEN = Path(__file__).with_name("unseen.csv")
 LANDMARKS = (
@@ -41,17 +41,17 @@ def main() -> int:
     fresh = read_points(UNSEEN)
     print(f"{'':38}{'device':27}{'runtime':17}{'dtype':9}{'published':>10}{'predicted':>11}  80 % interval")
     for title, name, device, file in LANDMARKS:
-        rest = merged([point for point in known if not about(name, point)])
-        model = fitted(rest, shipped())
+        rest = merge_versions([point for point in known if not about(name, point)])
+        model = fitted(rest, load_model())
         asked = [
             point for point in (fresh if file else known)
-            if about(name, point) and point.question and point.question.place.device.startswith(device)
+            if about(name, point) and point.question and point.question.compute_unit.device.startswith(device)
         ]  # fmt: skip
         answers = model.predict([point.question for point in asked if point.question])
         for point, answer in zip(asked, answers, strict=True):
             print(line(title, point, answer.ms, answer.low, answer.high, answer.why))
     print()
-    for text in lines(score_points(UNSEEN)):
+    for text in summary_lines(score_points(UNSEEN)):
         print(text)
     return 0
 
@@ -67,18 +67,18 @@ def line(title: str, point: Point, ms: float, low: float, high: float, why: str)
     question = point.question
     runtime, dtype = (question.runtime, question.precision) if question else ("", "")
     told = why or f"{low:.3g}-{high:.3g} {'inside' if low <= published <= high else 'OUTSIDE'}"
-    device = question.place.device if question else ""
+    device = question.compute_unit.device if question else ""
     return f"{title:38}{device:27}{runtime:17}{dtype:9}{published:>10.4g}{ms:>11.4g}  {told}"
 
 
 def fitted(points: Sequence[Point], like: LatencyModel) -> LatencyModel:
     """Return the model with the scales of another one, given these points."""
-    parts: dict[str, Known] = {}
-    for part, mine in by_part(points).items():
+    parts: dict[str, TrainingData] = {}
+    for part, mine in split_by_part(points).items():
         if not mine:
             continue
-        sample = Sample.of(mine)
-        parts[part] = Known(rows_of(sample.questions, like.shares[part]), sample.logs, like.parts[part].scales)
+        sample = Sample.from_points(mine)
+        parts[part] = TrainingData(rows_of(sample.questions, like.shares[part]), sample.logs, like.parts[part].scales)
     return LatencyModel(parts, like.shares, like.conformal, like.about)
 
 

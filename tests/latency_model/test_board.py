@@ -8,26 +8,26 @@ import pytest
 
 from vlatool.errors import ProfileError
 from vlatool.graph.workload import PRECISIONS, GraphWorkload, Workload, stored_precision
-from vlatool.hardware.profile import Profile, load_profile, names
+from vlatool.hardware.profile import Profile, load_profile, profile_names
 from vlatool.latency_model.board import (
     BUSY,
     Candidate,
     Outcome,
-    at,
     candidates,
+    compute_unit_of,
     idle_watts,
     memory_mb,
     outcomes,
-    place_of,
     power_limit,
-    quantized_as,
+    rescale,
+    stored_quantization,
     watts,
     weight_bytes,
     work_of,
 )
 from vlatool.latency_model.features import Shares, roofline_parts
 from vlatool.latency_model.model import LatencyModel
-from vlatool.latency_model.published import known_devices
+from vlatool.latency_model.published_latencies import known_devices
 
 Load = Callable[..., Workload]
 PI = load_profile("raspberry-pi-5")
@@ -74,13 +74,13 @@ def test_a_graph_has_the_precision_of_most_of_it(macs: dict[str, int], precision
 
 def test_a_bundle_has_the_precision_of_its_largest_graph() -> None:
     graphs = {"small": GraphWorkload({"float32": 10}), "large": GraphWorkload({"int8": 90})}
-    assert quantized_as(Workload(graphs, {"small": 1, "large": 1})) == "int8"
-    assert quantized_as(Workload(graphs, {"small": 100, "large": 1})) == "float32"
-    assert quantized_as(Workload({"small": graphs["small"]}, {"small": 1})) == ""
+    assert stored_quantization(Workload(graphs, {"small": 1, "large": 1})) == "int8"
+    assert stored_quantization(Workload(graphs, {"small": 100, "large": 1})) == "float32"
+    assert stored_quantization(Workload({"small": graphs["small"]}, {"small": 1})) == ""
 
 
 def test_a_place_has_the_clocks_of_its_mode() -> None:
-    fast, slow = (place_of(Candidate(ORIN, mode, "ort_tensorrt", "int8")) for mode in ("MAXN_SUPER", "7W"))
+    fast, slow = (compute_unit_of(Candidate(ORIN, mode, "ort_tensorrt", "int8")) for mode in ("MAXN_SUPER", "7W"))
     assert (fast.device, fast.unit) == ("jetson-orin-nano-8gb-super", "gpu"), "named as in the published figures"
     assert (fast.cores, slow.cores) == (8, 4)
     assert (fast.clock_ghz, slow.clock_ghz) == (1.02, 0.408)
@@ -90,31 +90,31 @@ def test_a_place_has_the_clocks_of_its_mode() -> None:
 
 
 def test_a_place_has_the_instruction_set_of_its_unit() -> None:
-    assert place_of(Candidate(ORIN, "7W", "ort_tensorrt", "int8")).isa == "sm_87"
-    assert place_of(Candidate(PI, "default", "ort_cpu", "int8")).isa == "asimd asimdhp asimddp"
+    assert compute_unit_of(Candidate(ORIN, "7W", "ort_tensorrt", "int8")).isa == "sm_87"
+    assert compute_unit_of(Candidate(PI, "default", "ort_cpu", "int8")).isa == "asimd asimdhp asimddp"
 
 
 def test_a_unit_with_its_own_way_to_memory_has_its_bandwidth() -> None:
     narrow = PI.units["cpu"].model_copy(update={"bandwidth_gb_s": PI.bandwidth_gb_s.model_copy(update={"value": 3.0})})
     board = PI.model_copy(update={"units": {"cpu": narrow}})
-    assert place_of(Candidate(board, "default", "ort_cpu", "int8")).bandwidth_gb_s == 3.0
-    assert place_of(Candidate(PI, "default", "ort_cpu", "int8")).bandwidth_gb_s == 17.1
+    assert compute_unit_of(Candidate(board, "default", "ort_cpu", "int8")).bandwidth_gb_s == 3.0
+    assert compute_unit_of(Candidate(PI, "default", "ort_cpu", "int8")).bandwidth_gb_s == 17.1
 
 
 def test_a_hailo_hangs_on_a_narrow_bus() -> None:
     """The accelerator reaches the memory of the Pi through PCI Express, whatever the memory's own bandwidth."""
-    place = place_of(Candidate(HAILO, "default", "hailort", "int8"))
+    place = compute_unit_of(Candidate(HAILO, "default", "hailort", "int8"))
     assert place.bandwidth_gb_s <= known_devices()["hailo-8", "npu"].bandwidth_gb_s
 
 
 def test_one_processor_is_one_device_whatever_is_plugged_in() -> None:
-    plain, beside = (place_of(Candidate(board, "default", "ort_cpu", "int8")) for board in (PI, HAILO))
+    plain, beside = (compute_unit_of(Candidate(board, "default", "ort_cpu", "int8")) for board in (PI, HAILO))
     assert beside.device == plain.device == "raspberry-pi-5"
 
 
 def test_an_integrated_gpu_is_asked_about_as_one() -> None:
     nuc = load_profile("intel-nuc-13-pro")
-    place = place_of(Candidate(nuc, nuc.default_mode, "openvino_gpu", "int8"))
+    place = compute_unit_of(Candidate(nuc, nuc.default_mode, "openvino_gpu", "int8"))
     assert (place.device, place.unit) == ("i7-1360p", "igpu")
 
 
@@ -122,7 +122,7 @@ def test_unknown_engines_and_modes_are_refused(load: Load) -> None:
     with pytest.raises(ProfileError, match="has no engine 'tensorrt'; did you mean 'ort_tensorrt'"):
         _ = Candidate(ORIN, "25W", "tensorrt").figures
     with pytest.raises(ProfileError, match="has no power mode '20W'"):
-        place_of(Candidate(ORIN, "20W", "ort_tensorrt"))
+        compute_unit_of(Candidate(ORIN, "20W", "ort_tensorrt"))
     with pytest.raises(ProfileError, match="has no power mode '20W'"):
         watts(Candidate(ORIN, "20W", "ort_tensorrt"))
 
@@ -202,7 +202,7 @@ def test_a_bundle_with_one_float_graph_is_unknown_on_an_npu(certain: LatencyMode
     assert not found["hailort"].latency.known
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", profile_names())
 def test_no_prediction_is_faster_than_the_peaks(certain: LatencyModel, load: Load, name: str) -> None:
     work = load(gmacs=400.0, weights_m=2000.0)
     asked = candidates(load_profile(name), work)
@@ -271,7 +271,7 @@ def test_a_board_that_is_asked_rarely_draws_less(certain: LatencyModel, load: Lo
 def test_a_workload_is_scaled_graph_by_graph(load: Load) -> None:
     graph = load().graphs["main"]
     work = Workload({"a": graph, "b": graph}, {"a": 1, "b": 10})
-    found = at(work, {"a": (0.5, 0.25, 0.1)}, {"b": 5})
+    found = rescale(work, {"a": (0.5, 0.25, 0.1)}, {"b": 5})
     assert found.runs == {"a": 1, "b": 5}
     assert found.graphs["b"] == graph
     changed = found.graphs["a"]

@@ -7,15 +7,26 @@ import numpy as np
 import pytest
 
 from vlatool.graph.workload import PRECISIONS, TRAITS
-from vlatool.latency_model.features import LAYER_MS, Place, Question, Shares, Work, roofline_ms, roofline_parts, rows_of
+from vlatool.latency_model.features import (
+    LAYER_MS,
+    ComputeUnit,
+    Question,
+    Shares,
+    Work,
+    roofline_ms,
+    roofline_parts,
+    rows_of,
+)
 from vlatool.latency_model.gaussian_process import KEYS
 
 WORK = Work(1e9, 4e6, 2e6, 30, frozenset({"attention"}), "net 224")
-PLACE = Place("board", "cpu", 4, 2.0, {"float32": 0.1, "float16": 0.2, "int8": 0.4}, 10.0, "15W", "asimd asimddp")
+PLACE = ComputeUnit("board", "cpu", 4, 2.0, {"float32": 0.1, "float16": 0.2, "int8": 0.4}, 10.0, "15W", "asimd asimddp")
 WHOLE = Shares(**dict.fromkeys(vars(Shares()), 1.0))
 
 
-def ask(precision: str = "float32", work: Work = WORK, place: Place = PLACE, runtime: str = "ncnn-cpu") -> Question:
+def ask(
+    precision: str = "float32", work: Work = WORK, place: ComputeUnit = PLACE, runtime: str = "ncnn-cpu"
+) -> Question:
     return Question(work, place, runtime, precision)
 
 

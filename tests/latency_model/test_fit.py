@@ -14,11 +14,20 @@ from landmarks import fitted
 from vlatool.errors import DataError, OutputError
 from vlatool.latency_model import fit, model
 from vlatool.latency_model.features import Question, Shares, rows_of
-from vlatool.latency_model.fit import ALL_COUNT, Scores, assess, conformal, fit_files, loss, thinned, tune
+from vlatool.latency_model.fit import (
+    SHRINKAGE_COUNT,
+    Scores,
+    conformal,
+    fit_files,
+    loss,
+    search_objective,
+    subsample,
+    tune,
+)
 from vlatool.latency_model.folds import Folds, Sample
 from vlatool.latency_model.gaussian_process import Process, Scales
 from vlatool.latency_model.model import LEVEL, LatencyModel, read_model
-from vlatool.latency_model.published import Point, read_points
+from vlatool.latency_model.published_latencies import Point, read_points
 
 SCALES, SHARES = Scales(), Shares()
 
@@ -50,7 +59,7 @@ def folds(sample: Sample) -> Folds:
 @pytest.mark.parametrize("name", ["models", "devices"])
 def test_leaving_a_group_out_is_fitting_without_it(folds: Folds, sample: Sample, name: str) -> None:
     groups = getattr(sample, name)
-    error, deviation = folds.without(groups)
+    error, deviation = folds.leave_out(groups)
     for code in np.unique(groups):
         wanted = refitted(sample, groups != code, groups == code)
         np.testing.assert_allclose(error[groups == code], wanted[0], atol=1e-8)
@@ -58,7 +67,7 @@ def test_leaving_a_group_out_is_fitting_without_it(folds: Folds, sample: Sample,
 
 
 def test_telling_one_model_of_a_device_is_fitting_with_it(folds: Folds, sample: Sample) -> None:
-    error, deviation, places, _ = folds.calibrated(sample.devices)
+    error, deviation, places, _ = folds.leave_out_calibrated(sample.devices)
     at = 0
     for device in np.unique(sample.devices):
         mine = sample.devices == device
@@ -73,7 +82,7 @@ def test_telling_one_model_of_a_device_is_fitting_with_it(folds: Folds, sample: 
 
 
 def test_once_tells_one_model_of_each_device(folds: Folds, sample: Sample) -> None:
-    error, deviation, told = folds.once(sample.devices, np.random.default_rng(0))
+    error, deviation, told = folds.leave_out_once(sample.devices, np.random.default_rng(0))
     for device in np.unique(sample.devices):
         mine = sample.devices == device
         (model,) = np.unique(sample.models[mine & told])
@@ -85,14 +94,14 @@ def test_once_tells_one_model_of_each_device(folds: Folds, sample: Sample) -> No
 
 
 def test_no_more_models_are_told_than_asked_for(folds: Folds, sample: Sample) -> None:
-    few, all_of_them = (len(folds.calibrated(sample.devices, most)[0]) for most in (2, 32))
+    few, all_of_them = (len(folds.leave_out_calibrated(sample.devices, most)[0]) for most in (2, 32))
     assert few == all_of_them / 3, "two of six models each"
 
 
 def test_devices_with_one_model_each_can_be_assessed(points: list[Point]) -> None:
     """Nothing is left to predict once the one model is told; that is no reason to fail."""
-    single = Sample.of([point for point in points if point.model == "resnet50" and point.kind != "npu"])
-    assert math.isfinite(assess(single, SCALES, SHARES))
+    single = Sample.from_points([point for point in points if point.model == "resnet50" and point.kind != "npu"])
+    assert math.isfinite(search_objective(single, SCALES, SHARES))
 
 
 def test_the_loss_is_relative_and_weighs_the_tail() -> None:
@@ -104,25 +113,25 @@ def test_the_loss_is_relative_and_weighs_the_tail() -> None:
 def test_intervals_hold_their_share_of_what_was_left_out(sample: Sample, folds: Folds) -> None:
     found = conformal(sample, SCALES, SHARES)
     assert set(found) == {"known", "unseen", "calibrated"}
-    error, deviation = folds.without(sample.models)
+    error, deviation = folds.leave_out(sample.models)
     inside = np.abs(error) / deviation <= found["known"]["npu"] + 1e-9
     most = LEVEL * 7 / 6 + 2 / len(error)
     assert LEVEL <= inside.mean() <= most, "all of them speak for a unit that has none; six models are few"
-    error, deviation, places, _ = folds.calibrated(sample.devices)
+    error, deviation, places, _ = folds.leave_out_calibrated(sample.devices)
     cpu = sample.units[places] == 0
     inside = (np.abs(error) / deviation)[cpu] <= found["calibrated"]["cpu"] + 1e-9
     assert inside.mean() >= LEVEL, "three devices, whose figures lie nearer than those of all"
-    everywhere = Scores.calibrated(sample, folds)
-    assert found["calibrated"]["cpu"] == everywhere.reach(0)
-    whole = np.abs(error) / deviation <= everywhere.reach(3) + 1e-9
+    everywhere = Scores.for_calibrated(sample, folds)
+    assert found["calibrated"]["cpu"] == everywhere.quantile(0)
+    whole = np.abs(error) / deviation <= everywhere.quantile(3) + 1e-9
     assert whole.mean() == pytest.approx(LEVEL, abs=0.05), "all of them, by devices"
 
 
 def test_the_search_lowers_what_it_assesses(sample: Sample) -> None:
     told: list[str] = []
-    before = assess(sample, SCALES, SHARES)
+    before = search_objective(sample, SCALES, SHARES)
     scales, shares = tune(sample, SCALES, SHARES, 3.0, tell=told.append)
-    assert assess(sample, scales, shares) < before
+    assert search_objective(sample, scales, shares) < before
     assert told
     assert all(0 < getattr(shares, name.name) <= 1 for name in dataclasses.fields(shares) if name.name != "layers")
     assert scales.constant == SCALES.constant, "the constant is not searched"
@@ -134,7 +143,7 @@ def test_without_time_nothing_is_searched(sample: Sample) -> None:
 
 def test_points_without_a_question_are_left_out(points: list[Point]) -> None:
     broken = dataclasses.replace(points[0], question=None, why="no ground")
-    found = Sample.of([broken, *points[:6]])
+    found = Sample.from_points([broken, *points[:6]])
     assert len(found.logs) == 6
     assert found.logs.tolist() == [point.log_ms for point in points[:6]]
 
@@ -181,7 +190,7 @@ def test_a_fit_writes_what_is_then_read(points_file: Path, no_data: Path) -> Non
     assert told[-1].startswith("written: ")
     assert json.loads((no_data / "latency.json").read_text())["about"] == {"figures": 60, "seed": 3, "level": LEVEL}
     questions = [point.question for point in read_points(points_file) if point.question]
-    found = model.shipped().predict(questions)
+    found = model.load_model().predict(questions)
     for answer, point in zip(found, read_points(points_file), strict=True):
         assert not answer.known or abs(answer.ms / math.exp(point.log_ms) - 1) < 0.15, "what it was fitted on, it knows"
     assert sum(answer.known for answer in found) == 58, "all but a transformer on two Hailos"
@@ -214,13 +223,13 @@ def test_a_fit_without_a_row_to_ask_says_why(
 
 
 def test_the_search_looks_at_some_figures_of_each_setting(points: list[Point]) -> None:
-    assert len(thinned(points, most=20)) == len({point.question for point in points if point.question})
-    few = thinned(points, most=2, seed=1)
+    assert len(subsample(points, limit=20)) == len({point.question for point in points if point.question})
+    few = subsample(points, limit=2, seed=1)
     settings = [(point.group, point.question.runtime, point.question.precision) for point in few if point.question]
     assert max(map(settings.count, settings)) == 2
     assert set(few) < set(points)
-    assert few == thinned(points, most=2, seed=1)
-    assert few != thinned(points, most=2, seed=2)
+    assert few == subsample(points, limit=2, seed=1)
+    assert few != subsample(points, limit=2, seed=2)
 
 
 def scored(values: np.ndarray, groups: np.ndarray, units: np.ndarray) -> Scores:
@@ -232,13 +241,15 @@ def test_a_unit_of_few_devices_is_drawn_towards_all() -> None:
     few, others = np.repeat([0, 1], 25), np.arange(2, 2 + 400)
     values, units = np.append(np.full(50, 0.1), np.full(400, 2.0)), np.repeat([2, 0], [50, 400])
     scores = scored(values, np.append(few, others), units)
-    assert scores.reach(2) == pytest.approx((2 * 0.1 + ALL_COUNT * 2.0) / (2 + ALL_COUNT))
-    assert scores.reach(1) == pytest.approx(2.0 * ALL_COUNT / ALL_COUNT), "a unit without figures has those of all"
+    assert scores.quantile(2) == pytest.approx((2 * 0.1 + SHRINKAGE_COUNT * 2.0) / (2 + SHRINKAGE_COUNT))
+    assert scores.quantile(1) == pytest.approx(2.0 * SHRINKAGE_COUNT / SHRINKAGE_COUNT), (
+        "a unit without figures has those of all"
+    )
     many = scored(values, np.append(np.arange(50), 50 + others), units)
-    assert many.reach(2) < 0.3
-    assert scores.reach(2, but=0) == pytest.approx((0.1 + ALL_COUNT * 2.0) / (1 + ALL_COUNT))
+    assert many.quantile(2) < 0.3
+    assert scores.quantile(2, but=0) == pytest.approx((0.1 + SHRINKAGE_COUNT * 2.0) / (1 + SHRINKAGE_COUNT))
     lone = scored(values[:25], scores.groups[:25], units[:25])
-    assert lone.reach(2, but=0) == math.inf, "nothing is left"
+    assert lone.quantile(2, but=0) == math.inf, "nothing is left"
 
 
 def test_figures_of_one_device_are_no_independent_witnesses() -> None:
@@ -246,20 +257,20 @@ def test_figures_of_one_device_are_no_independent_witnesses() -> None:
     values = np.append(np.full(100, 3.0), np.linspace(0.1, 2.0, 80))
     units = np.zeros(180, int)
     together = scored(values, np.append(np.zeros(100), np.arange(1, 81)), units)
-    assert together.reach(0) < 3.0
+    assert together.quantile(0) < 3.0
     apart = scored(values, np.arange(180), units)
-    assert apart.reach(0) == 3.0
+    assert apart.quantile(0) == 3.0
 
 
 def test_few_draws_widen_the_interval() -> None:
     """Of nine draws, each as likely to be the largest, four fifths of the next are below the eighth."""
     values, units = np.arange(1.0, 10.0), np.zeros(9, int)
-    assert scored(values, np.arange(9), units).reach(0) == 8
-    assert Scores(values, np.arange(9), units, np.arange(9) + 0.0).reach(0) == 8
+    assert scored(values, np.arange(9), units).quantile(0) == 8
+    assert Scores(values, np.arange(9), units, np.arange(9) + 0.0).quantile(0) == 8
     many = Scores(np.repeat(values, 50), np.repeat(np.arange(9), 50), np.zeros(450, int), np.arange(450))
-    assert many.reach(0) == 8
+    assert many.quantile(0) == 8
     plain = Scores(np.arange(1.0, 101.0), np.arange(100), np.zeros(100, int), np.arange(100))
-    assert plain.reach(0) == 81
+    assert plain.quantile(0) == 81
 
 
 @pytest.mark.parametrize("text", ["mine", "[]", '{"about": 1}', None])

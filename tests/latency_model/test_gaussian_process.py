@@ -73,7 +73,7 @@ def test_a_measurement_moves_its_device_and_narrows_it() -> None:
     logs = measured(told)
     before, width = Process(told, logs, SCALES).predict(asked)
     first = asked.take(slice(0, 1))
-    slow = Rows.joined(told, first)
+    slow = Rows.concatenate(told, first)
     after, narrow = Process(slow, np.append(logs, before[0] + 1.0), SCALES).predict(asked)
     assert (after > before).all(), "a slow measurement makes the whole device slower"
     assert (narrow < width).all()
@@ -111,7 +111,7 @@ def test_mean_and_covariance_are_those_of_the_textbook(count: int) -> None:
 
 def test_rows_are_joined_and_taken_in_order() -> None:
     first, second = rows(3, 11), rows(2, 12)
-    both = Rows.joined(first, second)
+    both = Rows.concatenate(first, second)
     assert len(both) == 5
     np.testing.assert_array_equal(both.take(slice(3, 5)).model, second.model)
     np.testing.assert_array_equal(both.take([0]).keys["pair"], first.keys["pair"][:1])

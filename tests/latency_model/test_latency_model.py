@@ -10,20 +10,29 @@ import pytest
 
 from vlatool.errors import DataError
 from vlatool.graph.workload import Workload
-from vlatool.hardware.profile import load_profile, names
+from vlatool.hardware.profile import load_profile, profile_names
 from vlatool.latency_model import model as module
-from vlatool.latency_model.features import Place, Question, Work
-from vlatool.latency_model.model import WIDEST, LatencyModel, crowds, no_ground, part_of, read_model, shipped, write
-from vlatool.latency_model.published import Point, known_devices
+from vlatool.latency_model.features import ComputeUnit, Question, Work
+from vlatool.latency_model.model import (
+    MAX_HALF_INTERVAL,
+    LatencyModel,
+    crowded_runtimes,
+    load_model,
+    part_of,
+    read_model,
+    unknown_reason,
+    write,
+)
+from vlatool.latency_model.published_latencies import Point, known_devices
 
 CONV = Work(1.8e9, 11.7e6, 2.5e6, 21)
 VIT = Work(4.6e9, 22e6, 11.9e6, 74, frozenset({"attention"}))
 PI = known_devices()["raspberry-pi-4", "cpu"]
 HAILO = known_devices()["hailo-8", "npu"]
-NEW = Place("my-board", "cpu", 4, 2.0, {"float32": 0.12, "int8": 0.5}, 15.0)
+NEW = ComputeUnit("my-board", "cpu", 4, 2.0, {"float32": 0.12, "int8": 0.5}, 15.0)
 
 
-def ask(work: Work = CONV, place: Place = PI, runtime: str = "ncnn-cpu", precision: str = "float32") -> Question:
+def ask(work: Work = CONV, place: ComputeUnit = PI, runtime: str = "ncnn-cpu", precision: str = "float32") -> Question:
     return Question(work, place, runtime, precision)
 
 
@@ -35,7 +44,7 @@ def reread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
         write(model, tmp_path)
         monkeypatch.setattr(module, "DATA", tmp_path)
         read_model.cache_clear()
-        return shipped()
+        return load_model()
 
     yield through
     read_model.cache_clear()
@@ -72,7 +81,9 @@ def test_answers_are_in_the_order_of_the_questions(model: LatencyModel) -> None:
     ids=["transformer-on-hailo", "float32-on-npu", "w4-on-npu", "unknown", "none", "runtime-of-the-other-part"],
 )
 def test_without_ground_there_is_no_number_but_a_reason(model: LatencyModel, question: Question, why: str) -> None:
-    given = replace(question, place=replace(question.place, peaks={**question.place.peaks, "float32": 1.0}))
+    given = replace(
+        question, compute_unit=replace(question.compute_unit, peaks={**question.compute_unit.peaks, "float32": 1.0})
+    )
     answer = model.predict([given])[0]
     assert not answer.known
     assert math.isnan(answer.ms)
@@ -98,7 +109,7 @@ def test_a_part_that_is_missing_has_no_answer(model: LatencyModel) -> None:
 def test_a_measurement_on_a_new_board_counts_there(model: LatencyModel) -> None:
     other = replace(CONV, macs=3e9, layers=30)
     before = model.predict([ask(other, NEW)])[0]
-    told = model.conditioned([(ask(CONV, NEW), 4 * model.predict([ask(CONV, NEW)])[0].ms)])
+    told = model.condition([(ask(CONV, NEW), 4 * model.predict([ask(CONV, NEW)])[0].ms)])
     after = told.predict([ask(other, NEW)])[0]
     assert (before.regime, after.regime) == ("unseen", "calibrated")
     assert after.ms > 1.5 * before.ms, "the board is slower than was thought"
@@ -107,20 +118,20 @@ def test_a_measurement_on_a_new_board_counts_there(model: LatencyModel) -> None:
 
 
 def test_a_measurement_is_believed(model: LatencyModel) -> None:
-    told = model.conditioned([(ask(CONV, NEW), 123.0)])
+    told = model.condition([(ask(CONV, NEW), 123.0)])
     assert told.predict([ask(CONV, NEW)])[0].ms == pytest.approx(123.0, rel=0.1)
 
 
 def test_nothing_measured_changes_nothing(model: LatencyModel) -> None:
-    same = model.conditioned([])
+    same = model.condition([])
     assert same.parts == model.parts
     assert same.own == frozenset()
 
 
 def test_what_was_measured_is_taken_in_once(model: LatencyModel) -> None:
-    told = model.conditioned([(ask(CONV, NEW), 123.0)])
-    assert model.conditioned([(ask(CONV, NEW), 123.0)]) is told, "for each bundle that a command predicts"
-    other = model.conditioned([(ask(CONV, NEW), 60.0)])
+    told = model.condition([(ask(CONV, NEW), 123.0)])
+    assert model.condition([(ask(CONV, NEW), 123.0)]) is told, "for each bundle that a command predicts"
+    other = model.condition([(ask(CONV, NEW), 60.0)])
     assert other.predict([ask(CONV, NEW)])[0].ms < told.predict([ask(CONV, NEW)])[0].ms
 
 
@@ -141,11 +152,11 @@ def test_a_runtime_with_very_many_figures_counts_where_it_is_asked_about(
     orin = known_devices()["jetson-agx-orin-64gb", "gpu"]
     crowded, other = ask(place=orin, runtime="tensorrt", precision="float16"), ask()
     with_all = {each: model.predict([each])[0].ms for each in (crowded, other)}
-    assert crowds(known.rows) == set()
-    monkeypatch.setattr(module, "CROWD", 17)  # three devices with TensorRT have 18 figures
-    (crowd,) = crowds(known.rows)
-    assert len(known.without([]).rows) == 42
-    assert len(known.without([crowd]).rows) == 42 - 18
+    assert crowded_runtimes(known.rows) == set()
+    monkeypatch.setattr(module, "MAX_IDLE_FIGURES", 17)  # three devices with TensorRT have 18 figures
+    (crowd,) = crowded_runtimes(known.rows)
+    assert len(known.process_without([]).rows) == 42
+    assert len(known.process_without([crowd]).rows) == 42 - 18
     without = model.predict([other])[0].ms
     assert without != with_all[other]
     assert without == pytest.approx(with_all[other], rel=0.1), "it says little of it"
@@ -158,11 +169,11 @@ def test_a_directory_takes_the_place_of_the_shipped_model(
     model: LatencyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(model, tmp_path)
-    before = shipped().about
+    before = load_model().about
     monkeypatch.setenv("VLATOOL_LATENCY", str(tmp_path))
-    assert shipped().about == model.about != before
+    assert load_model().about == model.about != before
     monkeypatch.delenv("VLATOOL_LATENCY")
-    assert shipped().about == before
+    assert load_model().about == before
 
 
 def test_a_directory_of_another_version_is_named(
@@ -174,7 +185,7 @@ def test_a_directory_of_another_version_is_named(
     np.savez(tmp_path / "latency.npz", **older)
     monkeypatch.setenv("VLATOOL_LATENCY", str(tmp_path))
     with pytest.raises(DataError, match="it was fitted by another version of vlatool") as caught:
-        shipped()
+        load_model()
     assert "hwselect fit" in caught.value.fix
 
 
@@ -182,9 +193,9 @@ def test_an_npu_that_was_never_published_is_unknown(model: LatencyModel) -> None
     other = replace(HAILO, device="hailo-99")
     asked = ask(place=other, runtime="hailort", precision="int8")
     (found,) = model.predict([asked])
-    assert (found.regime, found.why) == ("unseen", module.OTHER_NPU)
-    assert model.predict([replace(asked, place=HAILO)])[0].known
-    told = model.conditioned([(asked, 20.0)])
+    assert (found.regime, found.why) == ("unseen", module.UNKNOWN_NPU)
+    assert model.predict([replace(asked, compute_unit=HAILO)])[0].known
+    told = model.condition([(asked, 20.0)])
     assert told.predict([asked])[0].known, "once it was measured"
 
 
@@ -221,7 +232,7 @@ def test_a_directory_without_a_model_is_named(
         arrays.write_bytes(data)
     monkeypatch.setenv("VLATOOL_LATENCY", str(folder))
     with pytest.raises(DataError, match=r"The latency model in .* cannot be read") as caught:
-        shipped()
+        load_model()
     assert str(folder) in caught.value.message
     assert "unset VLATOOL_LATENCY" in str(caught.value.fix)
 
@@ -229,7 +240,7 @@ def test_a_directory_without_a_model_is_named(
 def test_npus_are_asked_apart() -> None:
     assert part_of(ask()) == "processors"
     assert part_of(ask(place=HAILO)) == "npu"
-    assert no_ground(ask(), published=True, seen=True) == ""
+    assert unknown_reason(ask(), published=True, device_known=True) == ""
 
 
 # ---- the model that is shipped
@@ -238,8 +249,8 @@ def test_npus_are_asked_apart() -> None:
 def test_every_shipped_answer_lies_in_its_interval(load: Callable[..., Workload]) -> None:
     from vlatool.latency_model.board import candidates, outcomes
 
-    asked = [way for name in names() for way in candidates(load_profile(name), load())]
-    found = outcomes(asked, load(), shipped())
+    asked = [way for name in profile_names() for way in candidates(load_profile(name), load())]
+    found = outcomes(asked, load(), load_model())
     assert len(found) > 200
     known = [outcome.latency for outcome in found if outcome.latency.known]
     assert len(known) > len(found) / 4
@@ -248,7 +259,7 @@ def test_every_shipped_answer_lies_in_its_interval(load: Callable[..., Workload]
         latency = outcome.latency
         if latency.known:
             assert 0 < latency.low <= latency.ms <= latency.high
-            assert latency.high / latency.low <= math.exp(2 * WIDEST) * 1.0001
+            assert latency.high / latency.low <= math.exp(2 * MAX_HALF_INTERVAL) * 1.0001
         else:
             assert latency.why
             assert math.isnan(latency.ms)
@@ -258,14 +269,14 @@ def test_the_shipped_model_says_nothing_of_a_transformer_on_hailo(load: Callable
     from vlatool.latency_model.board import Candidate, outcomes
 
     way = Candidate(load_profile("raspberry-pi-5-hailo8"), "default", "hailort", "int8")
-    latency = outcomes([way], load(traits=frozenset({"attention"})), shipped())[0].latency
+    latency = outcomes([way], load(traits=frozenset({"attention"})), load_model())[0].latency
     assert not latency.known
     assert "Hailo" in latency.why
 
 
 def test_the_shipped_model_was_fitted_on_thousands_of_figures() -> None:
-    assert shipped().about["figures"] > 2000
-    assert shipped() is shipped(), "read once"
-    for part, process in shipped().parts.items():
+    assert load_model().about["figures"] > 2000
+    assert load_model() is load_model(), "read once"
+    for part, process in load_model().parts.items():
         assert np.isfinite(process.logs).all(), part
-        assert set(shipped().conformal[part]) == {"known", "unseen", "calibrated"}
+        assert set(load_model().conformal[part]) == {"known", "unseen", "calibrated"}

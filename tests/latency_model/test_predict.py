@@ -3,12 +3,12 @@ import math
 
 import pytest
 
-from vlatool.hardware.profile import load_profile, names
-from vlatool.latency_model.measured import Measured, store
+from vlatool.hardware.profile import load_profile, profile_names
+from vlatool.latency_model.board_measurements import BoardMeasurement, store
 from vlatool.latency_model.predict import predictions
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", profile_names())
 @pytest.mark.parametrize("kind", ["float_bundle", "int8_bundle"])
 def test_every_board_gets_latency_memory_and_energy_as_predictions_for_that_board(name, kind, request):
     found = {each.name: each for each in predictions(load_profile(name), request.getfixturevalue(kind))}
@@ -46,7 +46,7 @@ def test_what_was_measured_on_the_board_decides(float_bundle, monkeypatch, tmp_p
     board = load_profile("raspberry-pi-5")
     before, *_ = predictions(board, float_bundle)
     work = {"macs": 3e5, "weights": 5e3, "activations": 2e3, "layers": 10, "traits": ["attention"]}
-    store([Measured(board.name, board.default_mode, board.engine, "float32", work, 4 * before.value)])
+    store([BoardMeasurement(board.name, board.default_mode, board.engine, "float32", work, 4 * before.value)])
     after, *_ = predictions(board, float_bundle)
     assert "from other devices, runtimes or precisions" in before.note
     assert after.note.startswith("ort_cpu, power mode default: with your own measurement on this device")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from vlatool.errors import DataError, UsageError
-from vlatool.latency_model.published import Point, read_points
-from vlatool.latency_model.refit import dealt, one_fold, refit_points
+from vlatool.latency_model.published_latencies import Point, read_points
+from vlatool.latency_model.refit import deal_folds, one_fold, refit_points
 
 Rows = list[dict[str, str]]
 Written = Callable[[Rows], Path]
@@ -49,10 +49,10 @@ def test_a_calibrated_board_is_nearer(points: list[Point]) -> None:
 def test_every_model_and_every_board_is_left_out_once(points: list[Point]) -> None:
     asked = [point for point in points if point.question]
     for kind, names in (("models", {point.model for point in asked}), ("devices", {point.group for point in asked})):
-        parts = dealt(asked, kind, 3)
+        parts = deal_folds(asked, kind, 3)
         assert sorted(name for part in parts for name in part) == sorted(names)
-    assert dealt(asked, "models", 1) != dealt(asked, "models", 2)
-    assert dealt(asked, "devices", 1) == dealt(asked, "devices", 2)
+    assert deal_folds(asked, "models", 1) != deal_folds(asked, "models", 2)
+    assert deal_folds(asked, "devices", 1) == deal_folds(asked, "devices", 2)
 
 
 def test_a_whole_file_is_scored_in_processes(published: Rows, points_at: Written) -> None:

@@ -11,7 +11,7 @@ import pytest
 from vlatool.errors import DataError, UsageError
 from vlatool.latency_model import score
 from vlatool.latency_model.model import LatencyModel
-from vlatool.latency_model.score import lines, score_points
+from vlatool.latency_model.score import score_points, summary_lines
 
 Written = Callable[[list[dict[str, str]]], Path]
 
@@ -19,7 +19,7 @@ Written = Callable[[list[dict[str, str]]], Path]
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch, model: LatencyModel) -> None:
     """The shipped model is the small one, which takes no seconds to read."""
-    monkeypatch.setattr(score, "shipped", lambda: model)
+    monkeypatch.setattr(score, "load_model", lambda: model)
 
 
 def finite(value: object) -> bool:
@@ -113,7 +113,7 @@ def test_what_cannot_be_asked_is_counted_with_its_reason(published: list[dict[st
     found = score_points(path)
     assert (found["rows"], found["predicted"]) == (4, 1)
     assert found["unknown"] == {"nothing is known of the device 'abacus' (cpu)": 3}
-    text = list(lines(found))
+    text = list(summary_lines(found))
     assert "1 of 4 rows predicted" in text[1]
     assert text[-1] == "  unknown, 3: nothing is known of the device 'abacus' (cpu)"
 
@@ -124,12 +124,12 @@ def test_a_file_of_which_nothing_can_be_asked_has_no_numbers(
     for held_out in (None, "models", "devices", "calibrated"):
         found = score_points(points_at([published[0] | {"device": "abacus"}]), held_out)
         assert (found["predicted"], found["groups"]) == (0, {})
-        assert list(lines(found))
+        assert list(summary_lines(found))
 
 
 def test_a_person_reads_a_line_for_each_group(points_file: Path) -> None:
     found = score_points(points_file)
-    text = list(lines(found))
+    text = list(summary_lines(found))
     assert text[1].startswith("58 of 60 rows predicted")
     assert [line.split()[0] for line in text[3:7]] == ["all", "cpu", "gpu", "npu"]
     assert "The interval is meant to hold 80%." in text
@@ -140,6 +140,6 @@ def test_a_model_without_a_kind_of_unit_says_so(
     points_file: Path, model: LatencyModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parts = {"processors": model.parts["processors"]}
-    monkeypatch.setattr(score, "shipped", lambda: replace(model, parts=parts))
+    monkeypatch.setattr(score, "load_model", lambda: replace(model, parts=parts))
     with pytest.raises(DataError, match="The latency model has no figures of npu"):
         score_points(points_file, "models")

@@ -61,7 +61,7 @@ def test_the_current_directory_is_not_where_children_import_from(
     monkeypatch.setattr(sys, "path", [first and str(shadowed), *sys.path])
     assert str(shadowed) not in import_path()
     assert "" not in import_path()
-    for line in (python_code("import random, json, numpy"), python_command("vlatool.quantize._worker")):
+    for line in (python_code("import random, json, numpy"), python_command("vlatool.quantize.streamed._worker")):
         subprocess.run(line, input="", text=True, check=True)
     assert marks(shadowed) == []
 

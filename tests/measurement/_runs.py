@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from vlatool.measurement.results import Benchmark, PolicyRun
-from vlatool.telemetry import Recorded
+from vlatool.telemetry import Summary
 
-QUIET = Recorded(10.0, (), None, (), {}, {}, ())
+QUIET = Summary(10.0, (), None, (), {}, {}, ())
 
 
 def run_of(policy: PolicyRun, **more) -> Benchmark:

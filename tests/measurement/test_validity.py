@@ -10,7 +10,7 @@ from vlatool.measurement.clock_drift import canary_ms, drift
 from vlatool.measurement.jobs import LatencyJob, Limits
 from vlatool.measurement.results import GraphEngine, PolicyRun
 from vlatool.measurement.validity import findings, validity
-from vlatool.telemetry import Counted, Gauge
+from vlatool.telemetry import Change, Gauge
 
 JOB = LatencyJob(("a",))
 
@@ -92,9 +92,9 @@ def test_a_run_that_was_full_is_noted():
 def test_a_contended_processor_is_suspect():
     one = only(found(switches=5000))
     assert (one.effect, "500 times in a second" in one.reason) == ("suspect", True)
-    stolen = telemetry(counters={"process.machine_steal": Counted("s", 1.0, 10.0, "")})
+    stolen = telemetry(counters={"process.machine_steal": Change("s", 1.0, 10.0, "")})
     assert "2.5%" in only(found(telemetry=stolen)).reason
-    little = telemetry(counters={"process.machine_steal": Counted("s", 0.1, 10.0, "")})
+    little = telemetry(counters={"process.machine_steal": Change("s", 0.1, 10.0, "")})
     assert seen_in(found(telemetry=little)) == ()
 
 

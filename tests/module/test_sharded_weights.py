@@ -24,7 +24,7 @@ from vlatool.module.sharded_weights import graph_weights, stored_modules, takes_
 from vlatool.module.torch_policy import load_modules, policy_of, torch_policy, unedited_modules
 from vlatool.prune.depth import Depth
 from vlatool.prune.neurons import Neurons
-from vlatool.quantize.weight_only import LOSSES, WeightOnly
+from vlatool.quantize.weight_only import LOSS_REPORT, WeightOnly
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.samples._language import DecoderShape
@@ -129,7 +129,7 @@ def test_weight_only_quantizes_the_blocks_that_are_kept(whole: Bundle, pruned: B
     def layers(bundle: Bundle, name: str) -> dict:
         made = run_transform(WeightOnly(), bundle, tmp_path / name, Context())
         assert action(made, load(made.path)).shape == (8, 7)
-        return {each["layer"]: each for each in json.loads((made.path / LOSSES).read_text())["layers"]}
+        return {each["layer"]: each for each in json.loads((made.path / LOSS_REPORT).read_text())["layers"]}
 
     one, other = layers(whole, "whole"), layers(pruned, "pruned")
     assert len(other) == 7 * 3 + 1

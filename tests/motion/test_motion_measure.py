@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from _full import small_or_full
 
-from vlatool.motion.measure import FEWEST, ratio_of
+from vlatool.motion.measure import MIN_PAIRS, ratio_of
 
 
 def pairs(seed: int, count: int, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +43,7 @@ def test_equal_episodes_have_a_ratio_of_exactly_one():
 
 @pytest.mark.parametrize(("own", "base", "wanted"), [
     ([], [], None), ([0.0, 0.0], [0.0, 0.0], (1.0, 1.0, 1.0)), ([1.0, 0.0], [0.0, 0.0], None),
-    ([2.0] * (FEWEST - 1), [1.0] * (FEWEST - 1), (2.0, 0.0, float("inf"))),
+    ([2.0] * (MIN_PAIRS - 1), [1.0] * (MIN_PAIRS - 1), (2.0, 0.0, float("inf"))),
 ])  # fmt: skip
 def test_few_pairs_and_none(own: list[float], base: list[float], wanted: tuple[float, float, float] | None):
     assert ratio_of(np.array(own), np.array(base)) == wanted

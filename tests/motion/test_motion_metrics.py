@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vlatool.motion.measure import measured, metrics
+from vlatool.motion.measure import measure_episode, metrics
 from vlatool.motion.track import Track
 from vlatool.report import COUNT
 
@@ -157,14 +157,14 @@ def smooth(count: int, hz: float) -> Track:
 
 def test_units_of_length_scale_what_they_must():
     metres = smooth(161, 80.0)
-    in_mm = measured(replace(metres, position=1e3 * metres.position, joints=1e3 * metres.joints))
-    for name, value in measured(metres).items():
+    in_mm = measure_episode(replace(metres, position=1e3 * metres.position, joints=1e3 * metres.joints))
+    for name, value in measure_episode(metres).items():
         power = {"path_length": 1, "joint_path": 1, "jerk": 2, "joint_jerk": 2}.get(name, 0)
         assert in_mm[name] == pytest.approx(value * 1e3**power, rel=1e-9), name
 
 
 def test_a_rate_scales_time_and_jerk_and_nothing_else():
-    slow, fast = measured(smooth(161, 40.0)), measured(smooth(161, 80.0))
+    slow, fast = measure_episode(smooth(161, 40.0)), measure_episode(smooth(161, 80.0))
     for name, value in slow.items():
         factor = {"task_time": 0.5, "jerk": 2.0**6, "joint_jerk": 2.0**6}.get(name, 1.0)
         if name != "spectral_arc_length":  # of frequencies up to 10 Hz: both are far below
@@ -172,7 +172,7 @@ def test_a_rate_scales_time_and_jerk_and_nothing_else():
 
 
 def test_the_same_motion_seen_twice_as_often_is_the_same_motion():
-    once, twice = measured(smooth(161, 80.0)), measured(smooth(321, 160.0))
+    once, twice = measure_episode(smooth(161, 80.0)), measure_episode(smooth(321, 160.0))
     for name in ("path_length", "joint_path", "jerk", "task_time", "spectral_arc_length"):
         assert twice[name] == pytest.approx(once[name], rel=0.03), name
     assert once["reversals"] == twice["reversals"] == 0.0
@@ -182,28 +182,34 @@ def test_a_smooth_reach_has_the_arc_length_of_the_literature_and_two_reaches_hav
     one = smooth(161, 80.0)
     back = np.concatenate([one.position, one.position[-1] + one.position[1:]])
     two = replace(one, position=back, actions=np.zeros((320, 3)), fresh=np.ones(320, bool))
-    value = measured(one)["spectral_arc_length"]
+    value = measure_episode(one)["spectral_arc_length"]
     assert 1.3 < value < 1.7
-    assert measured(two)["spectral_arc_length"] > value + 0.3
+    assert measure_episode(two)["spectral_arc_length"] > value + 0.3
 
 
 def test_a_place_and_a_direction_do_not_matter():
     track = drawn(5)
     random = np.random.default_rng(0)
     turn, _ = np.linalg.qr(random.normal(size=(track.position.shape[1],) * 2))
-    moved = measured(replace(track, position=track.position @ turn + 7.0, heading=track.heading + 2 * math.pi))
-    for name, value in measured(track).items():
+    moved = measure_episode(replace(track, position=track.position @ turn + 7.0, heading=track.heading + 2 * math.pi))
+    for name, value in measure_episode(track).items():
         if name not in ("turns", "reversals"):  # rotations leave rounding where nothing moved
             assert moved[name] == pytest.approx(value, rel=1e-6, abs=1e-9), name
 
 
 def test_one_step_and_nothing_told_give_what_can_be_known():
     bare = Track(10.0, np.zeros((1, 2)), np.ones(1, bool), alike=(0, 1))
-    assert measured(bare) == {"task_time": 0.1}
+    assert measure_episode(bare) == {"task_time": 0.1}
     discrete = Track(5.0, np.zeros(4, int), np.ones(4, bool))
-    assert measured(discrete) == {"task_time": 0.8}
+    assert measure_episode(discrete) == {"task_time": 0.8}
     still = Track(5.0, np.zeros((9, 2)), np.arange(9) % 3 == 0, position=np.zeros((10, 2)), alike=(0, 1), shortest=0.0)
-    assert measured(still) == {"task_time": 1.8, "path_length": 0.0, "jerk": 0.0, "action_rate": 0.0, "reversals": 0.0}
+    assert measure_episode(still) == {
+        "task_time": 1.8,
+        "path_length": 0.0,
+        "jerk": 0.0,
+        "action_rate": 0.0,
+        "reversals": 0.0,
+    }
 
 
 @pytest.mark.parametrize(("name", "unit"), [

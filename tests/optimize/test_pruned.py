@@ -36,7 +36,7 @@ TABLE = "Pruned policies, by trials"
 def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A recipe with two trials; stages run without a child of their own."""
     monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
-    monkeypatch.setattr("vlatool.optimize.pipeline.explanation_apart", lambda *_, **__: ())  # has tests of its own
+    monkeypatch.setattr("vlatool.optimize.pipeline.explanation_in_child", lambda *_, **__: ())  # has tests of its own
     monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
     path = tmp_path / "recipe.yaml"
     path.write_text(RECIPE)

@@ -70,7 +70,7 @@ def test_as_many_blocks_go_as_the_shape_says(size: int) -> None:
         ((_, options),) = [
             next(iter(stage.items())) for stage in space(blocks=size).stages(Shape(1.0, left, 10, FLOAT32))[:1]
         ]
-        assert size - Depth(**options)._goes(size) == left
+        assert size - Depth(**options)._removal_count(size) == left
 
 
 def test_only_quantization_of_the_whole_policy_that_names_no_layer_is_tried_on_pruned_ones() -> None:

@@ -89,7 +89,7 @@ def test_quantize_says_what_the_engine_did(run: Run, float_bundle: Bundle, tmp_p
 def test_quantize_survives_a_calibration(run: Run, float_bundle: Bundle, tmp_path: Path):
     line = ("quantize", "static-int8", str(float_bundle.path), "--samples", "4", "-o", str(tmp_path / "out"))
     error = refused(run("abort:run", "", *line), "abort", tmp_path / "out")
-    assert "when it ran the graph 'main' with further outputs" in error
+    assert "when it ran the graph 'main' with additional outputs" in error
 
 
 @pytest.mark.parametrize("when", ["open", "run"])

@@ -15,7 +15,7 @@ from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
 from vlatool.prune._selection import Selection, protected_parts
-from vlatool.prune.depth import PROTECTED, Depth, spread
+from vlatool.prune.depth import PROTECTED, Depth, evenly_spaced
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
@@ -91,8 +91,8 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
     assert of_parts.protects("trunk2")
     assert of_parts.protects("trunk2.blocks")
     assert not of_parts.protects("trunk3")
-    assert not of_parts.has(("trunk2.blocks",))
-    assert Selection(("trunk2.blocks",), (), PROTECTED, of_parts.parts).has(("trunk2.blocks",))
+    assert not of_parts.selects(("trunk2.blocks",))
+    assert Selection(("trunk2.blocks",), (), PROTECTED, of_parts.parts).selects(("trunk2.blocks",))
     protects = Selection((), (), PROTECTED).protects
     assert protects("model.lm_expert.layers")
     assert protects("model.vision_tower.layers")
@@ -128,7 +128,7 @@ def test_blocks_that_are_named_stay(source_bundle: Bundle, keep: object, stay: t
     (4, 1, [0]), (4, 2, [0, 3]), (5, 3, [0, 2, 4]), (16, 8, [0, 2, 4, 6, 9, 11, 13, 15]), (3, 3, [0, 1, 2]),
 ])  # fmt: skip
 def test_even_keeps_both_ends(size: int, count: int, numbers: list[int]):
-    assert spread(size, count) == numbers
+    assert evenly_spaced(size, count) == numbers
 
 
 def test_even_takes_no_run(source_bundle: Bundle):
@@ -174,8 +174,8 @@ def test_a_stack_that_graphs_share_is_cut_once(source_bundle: Bundle):
     ({"keep": "0,4"}, r"names block 4; trunk \(4\) has the blocks 0 to 3"),
     ({"keep": "-1"}, "names block -1"),
     ({"keep": "3,2,1,0"}, "names all blocks"),
-    ({"keep": "0", "blocks": 2}, "--blocks would say so again"),
-    ({"keep": "0", "ratio": 0.25, "rank": "even"}, "--ratio and --rank would"),
+    ({"keep": "0", "blocks": 2}, "--keep excludes --blocks"),
+    ({"keep": "0", "ratio": 0.25, "rank": "even"}, "--keep excludes --ratio and --rank"),
     ({"keep": "0", "include": ("*",)}, r"these differ: trunk \(4\), more \(3\)"),
     ({"rank": "even", "ratio": 0.1}, "--ratio 0.1 removes no block"),
 ])  # fmt: skip
@@ -210,7 +210,7 @@ def test_a_block_that_changes_shapes_is_named(source_bundle: Bundle):
             self.head = nn.Linear(18, 8)
 
     assert observations_for(source_bundle, 1)
-    with pytest.raises(SourceError, match=r"A block gives \[1, 17\] for \[1, 16\]"):
+    with pytest.raises(SourceError, match=r"A block maps \[1, 16\] to \[1, 17\]"):
         Depth(samples=1).change({"main": Grown().eval()}, source_bundle, Context())
 
 

@@ -16,7 +16,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.errors import RecipeError
 from vlatool.module.torch_policy import load_modules, torch_policy
-from vlatool.prune._sparse import sparse_layers
+from vlatool.prune._sparse_base import select_layers
 from vlatool.prune.gradual import Gradual
 from vlatool.prune.magnitude import Magnitude
 from vlatool.prune.structured import Structured
@@ -109,20 +109,20 @@ def test_layers_of_the_same_name_in_two_graphs_are_two(tmp_path: Path):
     source = run_transform(TorchModule(policy=write_flow(tmp_path / "flow")), None, tmp_path / "source", Context())
     modules = load_modules(source)
     modules["prefix"].body = torch.nn.Sequential(torch.nn.Linear(3, 3))
-    layers = sparse_layers(modules, source, (), ())
-    assert list(layers.chosen) == ["head.body.0", "prefix.see", "prefix.body.0"]
+    layers = select_layers(modules, source, (), ())
+    assert list(layers.prunable) == ["head.body.0", "prefix.see", "prefix.body.0"]
     assert layers.dense == ("head.body.2",), "it gives the action"
-    assert list(sparse_layers(modules, source, ("body.0",), ()).chosen) == ["head.body.0", "prefix.body.0"]
-    assert list(sparse_layers(modules, source, ("prefix.*",), ("see",)).chosen) == ["prefix.body.0"]
+    assert list(select_layers(modules, source, ("body.0",), ()).prunable) == ["head.body.0", "prefix.body.0"]
+    assert list(select_layers(modules, source, ("prefix.*",), ("see",)).prunable) == ["prefix.body.0"]
     modules["prefix"].body = modules["head"].body
-    assert list(sparse_layers(modules, source, ("body.*",), ()).chosen) == ["head.body.0", "head.body.2"], (
+    assert list(select_layers(modules, source, ("body.*",), ()).prunable) == ["head.body.0", "head.body.2"], (
         "shared ones once"
     )
 
 
 @pytest.mark.parametrize(("options", "says"), [
     ({"pattern": "2:4", "ratio": 0.7}, "The pattern 2:4 keeps half of the weights"),
-    ({"patience": 2}, "--patience would choose weights from before"),
+    ({"patience": 2}, "--patience could choose weights from before the last zeros"),
     ({"include": ("blok.*",)}, r"No layer matches 'blok.\*'"),
     ({"exclude": ("*",)}, "has no layer to prune"),
     ({"until": 0.0}, "until = 0"),

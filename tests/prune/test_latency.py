@@ -25,10 +25,10 @@ from vlatool.module.edits import Edit, apply, read_edits
 from vlatool.module.factors import Atom
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune import latency
-from vlatool.prune._clock import BoardClock, Clock
-from vlatool.prune._prices import Stack, edits_of, is_gone
-from vlatool.prune._trials import undisturbed
-from vlatool.prune._units import Group
+from vlatool.prune._latency_costs import Stack, is_removed, keep_edits
+from vlatool.prune._latency_meter import LatencyMeter, LatencyPredictor
+from vlatool.prune._trials import undisturbed_latency
+from vlatool.prune._unit_groups import UnitGroup
 from vlatool.prune.latency import LatencyPruning
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.report import Measurement
@@ -44,7 +44,7 @@ HEAD, TRUNK = 1e-2, 1e-3
 """Milliseconds for a weight, by part."""
 
 
-class Counted(Clock):
+class Counted(LatencyMeter):
     """A clock that counts weights, those of the trunk as slower."""
 
     def __init__(self, source: Bundle, *_rest: object) -> None:
@@ -70,7 +70,7 @@ def deep(policy_dir: Path, tmp_path: Path) -> Bundle:
 
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(latency, "Clock", Counted)
+    monkeypatch.setattr(latency, "LatencyMeter", Counted)
     monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
 
 
@@ -85,7 +85,7 @@ def test_the_target_is_met_and_made_again_without_measuring(
     assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
     assert json.loads(pruned.manifest.made_by["options"]["chosen"])
     exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context())
-    monkeypatch.setattr(latency, "Clock", None)
+    monkeypatch.setattr(latency, "LatencyMeter", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 
 
@@ -120,7 +120,7 @@ def test_a_latency_that_jumps_is_not_called_met(
             whole, others = super().times(pruned)
             return whole, others if self.runs == 1 else [ms * (2.0 if self.runs % 2 else 0.5) for ms in others]
 
-    monkeypatch.setattr(latency, "Clock", Jumping)
+    monkeypatch.setattr(latency, "LatencyMeter", Jumping)
     target = 0.7 * Counted(deep).ms(())
     with pytest.raises(DataError, match="was not met within 4%; measured: "):
         run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "out", Context())
@@ -135,7 +135,7 @@ def test_other_programs_that_slow_all_down_do_not_move_the_target(
             slower = (1.0, 3.0, 1.4, 2.2, 1.8)[(self.runs - 1) % 5]
             return slower * whole, [slower * ms for ms in others]
 
-    monkeypatch.setattr(latency, "Clock", Disturbed)
+    monkeypatch.setattr(latency, "LatencyMeter", Disturbed)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
     pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
@@ -151,7 +151,7 @@ def test_the_luckiest_run_of_the_whole_policy_is_not_what_it_takes(
             drift = [1.02, 0.95, 1.0, 1.01, 1.02][self.runs % 5]
             return drift * whole, [drift * ms for ms in others]
 
-    monkeypatch.setattr(latency, "Clock", Drifting)
+    monkeypatch.setattr(latency, "LatencyMeter", Drifting)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
     pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
@@ -168,7 +168,7 @@ def test_kernels_that_like_some_widths_better_do_not_end_the_search(
             kept = sum(len(edit.keep) for edit in edits)
             return super().ms(edits) * (1.06 if kept % 2 else 1.0)
 
-    monkeypatch.setattr(latency, "Clock", Choosy)
+    monkeypatch.setattr(latency, "LatencyMeter", Choosy)
     clock = Choosy(deep)
     for share in small_or_full((0.65, 0.75), (0.6, 0.65, 0.7, 0.75, 0.8)):
         target = share * clock.ms(())
@@ -178,9 +178,9 @@ def test_kernels_that_like_some_widths_better_do_not_end_the_search(
 
 
 def test_runs_that_were_held_up_say_nothing_of_the_whole_policy():
-    assert undisturbed([10.0]) == 10
-    assert undisturbed([10.0, 9.8, 10.1, 25.0, 31.0, 40.0, 18.0]) == 10
-    assert undisturbed([30.0, 10.0, 30.0]) == 10
+    assert undisturbed_latency([10.0]) == 10
+    assert undisturbed_latency([10.0, 9.8, 10.1, 25.0, 31.0, 40.0, 18.0]) == 10
+    assert undisturbed_latency([30.0, 10.0, 30.0]) == 10
 
 
 def test_one_round_that_was_held_up_is_corrected_by_the_next(
@@ -191,7 +191,7 @@ def test_one_round_that_was_held_up_is_corrected_by_the_next(
             whole, others = super().times(pruned)
             return whole, [ms * (10.0 if self.runs == 2 else 1.0) for ms in others]
 
-    monkeypatch.setattr(latency, "Clock", HeldUp)
+    monkeypatch.setattr(latency, "LatencyMeter", HeldUp)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
     pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
@@ -199,7 +199,7 @@ def test_one_round_that_was_held_up_is_corrected_by_the_next(
 
 
 def test_the_clock_runs_what_is_exported(deep: Bundle, tmp_path: Path):
-    clock = Clock(deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
+    clock = LatencyMeter(deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
     whole, (shallow,) = clock.times([(Edit("main", "blocks", "blocks", (0,)),)])
     assert whole > 0 < shallow
     exported = Bundle.open(tmp_path / "2-graphs")
@@ -210,21 +210,19 @@ def test_the_clock_runs_what_is_exported(deep: Bundle, tmp_path: Path):
 def test_the_clock_of_a_board_predicts_what_is_exported(deep: Bundle, tmp_path: Path):
     told: list[str] = []
     of = (deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context(lambda what, _share: told.append(what)))
-    clock = BoardClock(load_profile("raspberry-pi-4"), *of)
+    clock = LatencyPredictor(load_profile("raspberry-pi-4"), *of)
     whole, (shallow,) = clock.times([(Edit("main", "blocks", "blocks", (0,)),)])
     assert whole > shallow > 0
     assert whole == predictions(load_profile("raspberry-pi-4"), Bundle.open(tmp_path / "1-graphs"))[0].value
     assert clock.times([]) == (whole, []), "a prediction does not change from run to run"
     clock.times([(Edit("main", "blocks", "blocks", (number,)),) for number in range(2)])
-    assert [what for what in told if "exporting" in what] == [
-        f"exporting without some of it: {number} of 2" for number in (1, 2)
-    ]
+    assert [what for what in told if "exporting" in what] == [f"exporting a trial: {number} of 2" for number in (1, 2)]
 
 
 def test_a_board_without_ground_is_refused(deep: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     nothing = Measurement("latency_p50", float("nan"), "ms", "predicted", "jetson-thor", 0, note="no published latency")
-    monkeypatch.setattr("vlatool.prune._clock.predictions", lambda *_: [nothing])
-    clock = BoardClock(load_profile("jetson-thor"), deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
+    monkeypatch.setattr("vlatool.prune._latency_meter.predictions", lambda *_: [nothing])
+    clock = LatencyPredictor(load_profile("jetson-thor"), deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
     with pytest.raises(RecipeError, match="The latency on jetson-agx-thor cannot be predicted: no published latency"):
         clock.times([])
 
@@ -233,7 +231,7 @@ def test_a_profile_of_another_machine_is_predicted_and_this_one_measured(monkeyp
     stage, pi = LatencyPruning(target_ms=1), load_profile("raspberry-pi-5")
     assert stage.on(pi).board == "raspberry-pi-5"
     assert LatencyPruning(target_ms=1, board="pi5").on(pi).board == "pi5"
-    with pytest.raises(RecipeError, match="--board nuc and --profile raspberry-pi-5 are two boards"):
+    with pytest.raises(RecipeError, match="--board nuc and --profile raspberry-pi-5 are different boards"):
         LatencyPruning(target_ms=1, board="nuc").on(pi)
     with pytest.raises(RecipeError, match="mine is not a known profile"):
         stage.on(pi.model_copy(update={"name": "mine"}))
@@ -278,7 +276,7 @@ def test_threads_are_not_predicted(make: Callable[[], LatencyPruning]):
     says = "--threads 2 is of measurements on this machine; .*5 is predicted as a whole"
     with pytest.raises(RecipeError, match=says) as caught:
         make()
-    assert caught.value.fix.startswith("leave --threads out")
+    assert caught.value.fix.startswith("omit --threads")
 
 
 def test_the_command_line_predicts_for_a_board_in_a_child(
@@ -296,8 +294,8 @@ def test_the_command_line_predicts_for_a_board_in_a_child(
 def test_a_target_that_a_board_meets_is_refused_before_the_ranking(
     counted: None, deep: Bundle, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(latency, "BoardClock", lambda _, *of: Counted(*of))
-    monkeypatch.setattr(latency, "walks_of", None)
+    monkeypatch.setattr(latency, "LatencyPredictor", lambda _, *of: Counted(*of))
+    monkeypatch.setattr(latency, "trace_walks", None)
     stage = LatencyPruning(target_ms=1e5, board="pi5", **FINE)
     with pytest.raises(RecipeError, match=r"is predicted to take \d.* ms on pi5 already; asked for 100000 ms"):
         stage.change(load_modules(deep), deep, Context())
@@ -306,8 +304,10 @@ def test_a_target_that_a_board_meets_is_refused_before_the_ranking(
 def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     counted: None, deep: Bundle, policy_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(latency, "BoardClock", lambda profile, *of: Counted(*of) if "nuc" in profile.name else None)
-    monkeypatch.setattr(latency, "Clock", None)
+    monkeypatch.setattr(
+        latency, "LatencyPredictor", lambda profile, *of: Counted(*of) if "nuc" in profile.name else None
+    )
+    monkeypatch.setattr(latency, "LatencyMeter", None)
     target = 0.7 * Counted(deep).ms(())
     stage = build_stage("prune.latency", {"target_ms": target, "board": "nuc13", **FINE})
     pruned = run_transform(stage, deep, tmp_path / "out", Context())
@@ -318,7 +318,7 @@ def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     (told,) = predicted_for(exported)
     assert told.startswith("prune.latency chose what stays by predictions for intel-nuc-13-pro (target ")
     assert predicted_for(deep) == ()
-    monkeypatch.setattr(latency, "BoardClock", None)
+    monkeypatch.setattr(latency, "LatencyPredictor", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 
 
@@ -352,20 +352,20 @@ def trunk(importance: Sequence[float] = (1.0, 2.0, 3.0), **fields) -> Stack:
     return Stack({"main": "trunk"}, ("0", "1", "2"), list(importance), **fields)
 
 
-def group(*weights: str, keep: Sequence[int] = (0, 2)) -> Group:
+def group(*weights: str, keep: Sequence[int] = (0, 2)) -> UnitGroup:
     atoms = [Atom(0, (place,), slower=(), is_fastest=True) for place in range(len(weights))]
     members = [Member(weight, 0, atom, False, np.arange(3)) for weight, atom in zip(weights, atoms, strict=True)]
-    return Group("main", 0, 3, members, 1, np.ones(3), list(keep))
+    return UnitGroup("main", 0, 3, members, 1, np.ones(3), list(keep))
 
 
 def test_units_are_named_after_a_weight_that_stays():
     stack = trunk()
     stack.keep.remove(0)
     gone, home, both = group("trunk.0.a"), group("trunk.2.a"), group("trunk.0.a", "trunk.1.b", "head.c")
-    assert is_gone("main", "trunk.0.a", [stack])
-    assert not is_gone("main", "trunk.1.b", [stack])
-    assert not is_gone("other", "trunk.0.a", [stack])
-    assert edits_of([gone, home, both, group("trunk.1.b", keep=range(3))], [stack]) == (
+    assert is_removed("main", "trunk.0.a", [stack])
+    assert not is_removed("main", "trunk.1.b", [stack])
+    assert not is_removed("other", "trunk.0.a", [stack])
+    assert keep_edits([gone, home, both, group("trunk.1.b", keep=range(3))], [stack]) == (
         Edit("main", "trunk", "blocks", (1, 2)),
         Edit("main", "trunk.1.a", "units 0.0", (0, 2)),
         Edit("main", "trunk.0.b", "units 0.1", (0, 2)),
@@ -377,7 +377,7 @@ def test_stacks_in_blocks_are_cut_before_the_blocks_are_numbered_anew():
     inner = [Stack({"main": f"trunk.{number}.parts"}, ("0", "1"), [1.0, 2.0]) for number in range(3)]
     for stack in (outer, *inner[:2]):
         stack.keep.remove(0)
-    edits = edits_of([group("trunk.1.parts.1.weight")], [outer, *inner])
+    edits = keep_edits([group("trunk.1.parts.1.weight")], [outer, *inner])
     assert edits == (
         Edit("main", "trunk.1.parts", "blocks", (1,)),
         Edit("main", "trunk", "blocks", (1, 2)),
@@ -404,7 +404,7 @@ def test_blocks_that_have_names_and_share_units_may_go(counted: None, deep: Bund
 
 def chosen(module: nn.Module, source: Bundle, **options: object) -> list[str]:
     stage = LatencyPruning(target_ms=1, samples=2, **options)
-    return [stack.places["main"] for stack in stage.stacks({"main": module}, source)]
+    return [stack.lists["main"] for stack in stage.stacks({"main": module}, source)]
 
 
 @pytest.mark.parametrize(("options", "names"), [

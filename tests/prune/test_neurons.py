@@ -81,8 +81,13 @@ def test_other_weights_take_the_structure_that_is_left(pruned: Bundle, tmp_path:
 
 def test_the_share_is_rounded_to_what_vector_units_want():
     layer, after = nn.Linear(4, 30), nn.Linear(30, 2)
-    assert [len(Neurons(ratio=ratio)._kept(layer, after)) for ratio in (0.01, 0.25, 0.5, 0.99)] == [30, 24, 16, 8]
-    assert len(Neurons(ratio=0.5, multiple=1)._kept(layer, after)) == 15
+    assert [len(Neurons(ratio=ratio)._kept_neurons(layer, after)) for ratio in (0.01, 0.25, 0.5, 0.99)] == [
+        30,
+        24,
+        16,
+        8,
+    ]
+    assert len(Neurons(ratio=0.5, multiple=1)._kept_neurons(layer, after)) == 15
 
 
 def test_layers_are_hidden_where_nothing_else_reads_them():

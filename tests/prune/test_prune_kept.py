@@ -11,7 +11,7 @@ from _recurrent import recorded, recurrent_bundle
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.module.torch_policy import load_modules, torch_policy
-from vlatool.prune._ranking import Ranking
+from vlatool.prune._block_ranking import BlockRanking
 from vlatool.prune.structured import Structured
 from vlatool.prune.wanda import Wanda
 from vlatool.stage.base import Context
@@ -78,7 +78,7 @@ class Block(torch.nn.Module):
 @pytest.mark.parametrize("rank", ["errors", "gate", "cosine"])
 def test_blocks_that_read_it_matter(tmp_path: Path, rank: str, keeps: int):
     source = recurrent_bundle(tmp_path / "sum", "sum")
-    ranking = Ranking({"main": Blocks(keeps).eval()}, source, 16)
+    ranking = BlockRanking({"main": Blocks(keeps).eval()}, source, 16)
     places = [("main", "blocks", number) for number in range(2)]
     scores = getattr(ranking, rank)(places, set())
     assert scores[places[keeps]] > 3 * scores[places[1 - keeps]]

@@ -9,7 +9,7 @@ from _full import small_or_full
 from _pruned import check_pruned
 from _random_modules import IMAGES, SEQUENCES, RandomModule, chosen
 
-from vlatool.prune._units import Rank
+from vlatool.prune._unit_groups import Rank
 
 SEEDS = small_or_full((0, 125, 174, 316), range(1000))
 """Of the modules; the few are small ones, of parts that are joined, grown, padded and skipped."""

@@ -21,7 +21,7 @@ from vlatool.gate.config import Gate
 from vlatool.gate.same import check
 from vlatool.module import sharded_weights, stage
 from vlatool.module.torch_policy import load_modules, torch_policy
-from vlatool.prune.steps import Steps, fewer
+from vlatool.prune.steps import Steps, with_fewer_steps
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
@@ -131,7 +131,7 @@ def test_what_many_steps_reached_is_learnt(one: Bundle, source: Bundle, tmp_path
 ])  # fmt: skip
 def test_times_and_sizes_span_the_same(schedule, count: int, wanted):
     step = ProgramStep("head", {"t": "t", "dt": "dt"}, {"x": "x"}, 4, {}, schedule)
-    made = fewer(step, count)
+    made = with_fewer_steps(step, count)
     assert made.repeat == count
     assert list(made.schedule) == list(wanted)
     for name, numbers in wanted.items():
@@ -140,17 +140,17 @@ def test_times_and_sizes_span_the_same(schedule, count: int, wanted):
 
 
 @pytest.mark.parametrize(("schedule", "to", "says"), [
-    ({"t": [1.0, 0.75, 0.5, 0.25]}, 2, r"does not say how large its steps are: .* \(t: -0\.25\)"),
-    ({"t": [1.0, 0.9, 0.5, 0.25], "dt": [-0.25] * 4}, 2, "The schedule of 't' is neither one number nor evenly spaced"),
-    ({"t": [1.0, 0.75, 0.5, 0.25], "dt": [-0.1] * 4}, 2, "does not say how large its steps are"),
-    ({"dt": [-0.25] * 4}, 2, r"does not say how large its steps are: .* \(no times\)"),
+    ({"t": [1.0, 0.75, 0.5, 0.25]}, 2, r"has no schedule of the step size, .* \(t: -0\.25\)"),
+    ({"t": [1.0, 0.9, 0.5, 0.25], "dt": [-0.25] * 4}, 2, "The schedule of 't' is neither constant nor evenly spaced"),
+    ({"t": [1.0, 0.75, 0.5, 0.25], "dt": [-0.1] * 4}, 2, "has no schedule of the step size"),
+    ({"dt": [-0.25] * 4}, 2, r"has no schedule of the step size, .* \(no times\)"),
     ({"t": [1.0, 0.75, 0.5, 0.25], "dt": [-0.25] * 4}, 4, "repeats 'head' 4 times; --to is 4"),
-    ({"t": [0, 1, 2, 3], "dt": [1] * 4}, 3, "whole numbers"),
+    ({"t": [0, 1, 2, 3], "dt": [1] * 4}, 3, "has integers"),
 ])  # fmt: skip
 def test_what_cannot_have_fewer_steps_is_refused(schedule, to: int, says: str):
     step = ProgramStep("head", {name: name for name in schedule}, {"x": "x"}, 4, {}, schedule)
     with pytest.raises(RecipeError, match=says):
-        fewer(step, to)
+        with_fewer_steps(step, to)
 
 
 def test_a_policy_without_repeats_is_refused(source_bundle: Bundle, tmp_path: Path):

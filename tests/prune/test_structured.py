@@ -25,7 +25,7 @@ from vlatool.module.edits import read_edits
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.module.unit_removal import remove_units, trace_module
 from vlatool.prune._selection import Selection
-from vlatool.prune._units import groups_of, rank_units
+from vlatool.prune._unit_groups import find_groups, rank_units
 from vlatool.prune.structured import Structured
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
@@ -127,7 +127,7 @@ def test_it_is_trained_further(pruned: Bundle, source_bundle: Bundle, tmp_path: 
 
 @pytest.mark.parametrize(("options", "says"), [
     ({"include": ("blok*",)}, r"No weight that can be pruned matches 'blok\*'"),
-    ({"exclude": ("*",)}, "has no heads, neurons or channels that could go"),
+    ({"exclude": ("*",)}, "has no heads, neurons or channels that can be removed"),
 ])  # fmt: skip
 def test_wrong_options_are_told(source_bundle: Bundle, tmp_path: Path, options: dict[str, object], says: str):
     stage = build_stage("prune.structured", {"rank": "magnitude", **options})
@@ -163,9 +163,9 @@ def test_a_step_that_is_too_much_is_put_back_where_nearly_enough_is_gone(ratio: 
     """Each step takes a quarter of 96 in 100: 24 are nearly 25 enough, 48 are nearly twice of it."""
     module = nn.Sequential(nn.Linear(3, 16, bias=False), nn.Linear(16, 3, bias=False), nn.Linear(3, 1), nn.Linear(1, 1))
     walks = {"main": Walk(trace_module(module, [torch.randn(1, 3)]))}
-    groups = groups_of(walks, Selection(("0.weight",), ()), 4, "steps")
+    groups = find_groups(walks, Selection(("0.weight",), ()), 4, "steps")
     Structured(ratio=ratio, multiple=4).choose(walks, groups, {"main": 1}, Context())
-    assert groups[0].stays == stays
+    assert groups[0].remaining == stays
 
 
 BLOCKED = """
@@ -257,7 +257,7 @@ def test_what_is_said_of_experts_and_groups_is_what_is_reached(
     walks, whole = {"main": Walk(trace_module(module, [feed]))}, counted(module, [feed])
     said = {}
     for ratio in (nearly, 0.45, 0.9):
-        groups = groups_of(walks, Selection((), ()), 8, make.__name__)
+        groups = find_groups(walks, Selection((), ()), 8, make.__name__)
         rank_units(groups, "random", {"main": module}, source=None, samples=0)  # type: ignore[arg-type]
         done = Structured(ratio=ratio, multiple=8).choose(walks, groups, {"main": 1}, Context())
         left = counted(remove_units(copy.deepcopy(module), [feed], done.edits), [feed])

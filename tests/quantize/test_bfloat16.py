@@ -11,8 +11,8 @@ from _arithmetic import computes_bfloat16
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, GraphError
-from vlatool.quantize import _conv1x1
 from vlatool.quantize.bfloat16 import Bfloat16
+from vlatool.quantize.int8 import convolutions
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 
@@ -66,7 +66,7 @@ def test_products_of_many_rows_may_be_convolutions(
     operators: Callable[[Bundle], dict[str, int]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(_conv1x1, "FEWEST", 4)
+    monkeypatch.setattr(convolutions, "MIN_ROWS", 4)
     written = quantized(Bfloat16(convolutions=True))
     assert operators(written)["Conv"] > operators(halved)["Conv"]
     assert drift(written, halved) < drift(halved)

@@ -12,9 +12,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.errors import DataError, GraphError, RecipeError
 from vlatool.graph.files import load, save
-from vlatool.quantize._float16_graph import around, look_at_weights, phase_nodes, to_float16
-from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize.float16 import Float16
+from vlatool.quantize.floats.float16_graph import nodes_touching, phase_nodes, to_float16, weight_losses
+from vlatool.quantize.floats.overflow import find_overflows
 from vlatool.sources.onnx import OnnxFile
 from vlatool.stage.base import Context
 
@@ -152,7 +152,7 @@ def test_large_values_and_outputs_of_kept_nodes_pass_in_float32():
     x = np.full((2, 4), 3, np.float32)
     wanted = run(model, x)
     assert not np.isfinite(run(to_float16(model_of(nodes, constants, ("y", "z")), set()), x)[1]).all()
-    kept = around(model, ["l"])
+    kept = nodes_touching(model, ["l"])
     assert kept == {"l/Mul", "y/Mul", "z/Abs"}
     converted = to_float16(model, kept)
     for got, value in zip(run(converted, x), wanted, strict=True):
@@ -164,16 +164,16 @@ def test_weights_beyond_float16_keep_their_nodes_and_small_ones_are_counted():
     w = np.eye(4, dtype=np.float32)
     w[0, 0], w[1, 2], w[2, 3] = 1e5, 1e-6, 1e-9
     model = model_of([node("MatMul", "x w", "m"), node("Add", "m s", "y")], {"w": w, "s": np.float32([1, 0, 1e-6, 0])})
-    found = look_at_weights(model, set())
-    assert found.beyond == ("m/MatMul",)
+    found = weight_losses(model, set())
+    assert found.overflowing == ("m/MatMul",)
     assert found.subnormal == 1
-    assert look_at_weights(model, {"m/MatMul", "y/Add"}).subnormal == 0
+    assert weight_losses(model, {"m/MatMul", "y/Add"}).subnormal == 0
 
 
 def test_infinite_constants_are_no_reason_to_stay():
     mask = np.float32([0, -np.inf, 0, 0])
     model = model_of([node("Add", "x mask", "m"), node("Softmax", "m", "y")], {"mask": mask})
-    assert look_at_weights(model, set()).beyond == ()
+    assert weight_losses(model, set()).overflowing == ()
     (got,) = run(to_float16(model, set()), np.zeros((2, 4), np.float32))
     np.testing.assert_allclose(got, np.float32([[1 / 3, 0, 1 / 3, 1 / 3]] * 2), atol=1e-3)
 
@@ -205,7 +205,7 @@ def test_values_beyond_float16_are_named_and_stay_in_float32(float_bundle, copie
     bundle = resealed(bundle)
     told: list[str] = []
     observations = recorded_observations(bundle, 4)
-    found = find_beyond(bundle, ["main"], observations, 65504.0, Context())["main"]
+    found = find_overflows(bundle, ["main"], observations, 65504.0, Context())["main"]
     assert len(found) >= 1
     assert {each.sample for each in found.values()} == {0}
     out = bundle.path.with_name("half")
@@ -225,7 +225,7 @@ def test_a_sample_that_does_not_fit_is_named(float_bundle):
     observations = list(recorded_observations(float_bundle, 2))
     observations[1]["proprio"] = np.zeros(5, np.float32)
     with pytest.raises(DataError, match="Calibration sample 1"):
-        find_beyond(float_bundle, ["main"], observations, 1.0, Context())
+        find_overflows(float_bundle, ["main"], observations, 1.0, Context())
 
 
 def test_the_calibration_file_is_an_input(tmp_path: Path):
@@ -331,5 +331,5 @@ def test_what_still_moves_is_told():
         "kept": 0, "subnormal_weights": 0, "beyond": [], "moved": {"main": 0.3, "other": 0.001},
     }}))  # fmt: skip
     lines = Float16().lines(made)
-    assert any("main: what it gives moves by up to 0.3" in line for line in lines)
+    assert any("main: its outputs change by up to 0.3" in line for line in lines)
     assert not any("other" in line for line in lines)

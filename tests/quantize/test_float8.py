@@ -9,8 +9,8 @@ from onnx import TensorProto, helper, numpy_helper
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import DataError, GraphError, RecipeError
 from vlatool.graph.layers import find_layers
-from vlatool.quantize._float8_qdq import Float8Writer, scale_of, to_float8
 from vlatool.quantize.float8 import Float8
+from vlatool.quantize.floats.float8_qdq import Float8Writer, scale_of, to_float8
 from vlatool.stage.base import Context
 
 E4M3 = TensorProto.FLOAT8E4M3FN

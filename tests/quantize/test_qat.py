@@ -21,8 +21,15 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.hardware.profile import load_profile
 from vlatool.module.to_onnx import quiet_exporter
 from vlatool.module.torch_policy import load_modules, torch_policy
-from vlatool.quantize._blocks import METHODS, Format, Scratch, dequantize, planes_of_rows, quantize_planes
 from vlatool.quantize.qat import Qat
+from vlatool.quantize.streamed._block_quantization import (
+    METHODS,
+    BlockFormat,
+    Scratch,
+    dequantize,
+    planes_from_rows,
+    quantize_planes,
+)
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
@@ -77,9 +84,9 @@ def test_int8_weights_lie_on_the_grid_of_static_int8():
 def test_int4_blocks_lie_on_the_grid_of_weight_only():
     weight = torch.randn(6, 64) * torch.logspace(-2, 1, 6)[:, None]
     weight[1, :32] = weight[1, :32].abs()
-    planes = planes_of_rows(weight.reshape(-1, 32).T.numpy().copy(), Scratch())
-    stored = quantize_planes(planes, Format(), METHODS["rtn"], Scratch())
-    meant = dequantize(stored.codes, stored.scale, stored.zero, Format()).reshape(6, 64)
+    planes = planes_from_rows(weight.reshape(-1, 32).T.numpy().copy(), Scratch())
+    stored = quantize_planes(planes, BlockFormat(), METHODS["rtn"], Scratch())
+    meant = dequantize(stored.codes, stored.scale, stored.zero, BlockFormat()).reshape(6, 64)
     assert np.allclose(in_blocks(weight).numpy(), meant, rtol=1e-5, atol=1e-6)
     assert in_blocks(torch.randn(3, 40)).shape == (3, 40)
 

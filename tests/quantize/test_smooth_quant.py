@@ -12,8 +12,8 @@ from vlatool.bundle.manifest import Graph
 from vlatool.errors import BundleError, DataError, GraphError, RecipeError
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import find_layers
-from vlatool.quantize._smooth_groups import find_groups
-from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
+from vlatool.quantize.int8.smoothing_groups import find_groups
+from vlatool.quantize.int8.smoothing_scales import PeakExcess, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.quantize.smooth_quant import SmoothQuant, _Writer
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage.build import build_stage
@@ -212,10 +212,10 @@ def test_ranges_that_differ_between_halves_hold_back():
     random = np.random.default_rng(0)
     peaks, w = np.exp(random.normal(size=64)), random.normal(size=(64, 16))
     bold, _ = best_alpha(peaks, [w])
-    careful, _ = best_alpha(peaks, [w], Unseen.between(peaks, peaks * 0.6, 4))
+    careful, _ = best_alpha(peaks, [w], PeakExcess.between(peaks, peaks * 0.6, 4))
     assert bold is not None
     assert careful is None or careful < bold
-    assert Unseen.between(np.zeros(2), np.zeros(2), 1) == Unseen(0.0, 1.0)
+    assert PeakExcess.between(np.zeros(2), np.zeros(2), 1) == PeakExcess(0.0, 1.0)
 
 
 @pytest.mark.parametrize("options", [{}, {"alpha": "auto"}, {"insert": True}], ids=str)
@@ -230,7 +230,7 @@ def test_the_policy_computes_the_same(quantized, drift, float_bundle, options):
     how = {note["value"]: note["how"] for note in report(bundle)}
     assert list(how.values()).count("folded") >= 2
     assert ("inserted" in how.values()) == ("insert" in options)
-    assert f"{list(how.values()).count('folded')} activations folded" in SmoothQuant().lines(bundle)[0]
+    assert f"{list(how.values()).count('folded')} scales folded" in SmoothQuant().lines(bundle)[0]
 
 
 def test_int8_of_a_policy_with_outliers_gains(quantized, drift, float_bundle, copied, resealed):
@@ -294,6 +294,6 @@ def test_what_it_needs(float_bundle, copied, tmp_path: Path):
 
 def test_a_changed_action_is_refused(quantized, monkeypatch):
     monkeypatch.setattr(_Writer, "_multiply", lambda *_: None)
-    monkeypatch.setattr("vlatool.quantize.smooth_quant.SAME", -1.0)
+    monkeypatch.setattr("vlatool.quantize.smooth_quant.MAX_CHANGE", -1.0)
     with pytest.raises(GraphError, match="changed the golden action"):
         quantized(SmoothQuant(samples=8))

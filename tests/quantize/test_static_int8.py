@@ -8,8 +8,8 @@ from _arithmetic import computes_bfloat16, exact, full_range_or_less
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import DataError, GraphError, MissingExtra, RecipeError
-from vlatool.quantize import _conv1x1
 from vlatool.quantize.bfloat16 import Bfloat16
+from vlatool.quantize.int8 import convolutions
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.stage.build import build_stage
@@ -202,7 +202,7 @@ def test_where_openvino_saturates_the_stage_says_so_and_the_bundle_is_refused(qu
 
 
 def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operators, monkeypatch):
-    monkeypatch.setattr(_conv1x1, "FEWEST", 4)
+    monkeypatch.setattr(convolutions, "MIN_ROWS", 4)
     options = {"layout": "openvino", "samples": 8, **full_range_or_less()}
     plain = quantized(StaticInt8(**options, activations="uint8"))
     written = quantized(StaticInt8(**options, convolutions=True))
@@ -213,7 +213,7 @@ def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operato
 
 
 def test_convolutions_are_full_range_or_less():
-    with pytest.raises(RecipeError, match="The layout ort has no use for convolutions") as caught:
+    with pytest.raises(RecipeError, match="The layout ort does not use convolutions") as caught:
         StaticInt8(convolutions=True).check(None, None)
     assert caught.value.fix == "use layout openvino"
 

@@ -20,7 +20,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.cli.inspect import describe
 from vlatool.data import synthetic_observations
 from vlatool.errors import BundleError, DataError, GraphError, OutputError, RecipeError, SourceError
-from vlatool.quantize.weight_only import LOSSES, WEIGHTS, WeightOnly
+from vlatool.quantize.weight_only import LOSS_REPORT, WEIGHTS_FILE, WeightOnly
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.samples._language import DecoderShape
@@ -36,7 +36,7 @@ TOKENS = 6
 class Unquantized(WeightOnly):
     """Streams every tensor and quantizes none."""
 
-    def selected(self, names, bundle, ops=()):
+    def select_nodes(self, names, bundle, ops=()):
         return set()
 
 
@@ -84,7 +84,7 @@ def actions(bundle: Bundle) -> np.ndarray:
 
 
 def losses(bundle: Bundle) -> dict:
-    return json.loads((bundle.path / LOSSES).read_text())
+    return json.loads((bundle.path / LOSS_REPORT).read_text())
 
 
 def kinds(bundle: Bundle) -> list[str]:
@@ -194,7 +194,7 @@ def test_both_layouts_mean_the_same(float_bundle, quantized, drift, options):
     shares = [each.manifest.graphs["main"].precision for each in (blocks, standard)]
     assert shares[0] == shares[1]
     assert shares[0][f"int{options.get('bits', 4)} weights"] > 0.5
-    beside = f" MB + {standard.manifest.files[WEIGHTS].bytes / 1e6:.2f} MB in {WEIGHTS}, opset 21, "
+    beside = f" MB + {standard.manifest.files[WEIGHTS_FILE].bytes / 1e6:.2f} MB in {WEIGHTS_FILE}, opset 21, "
     assert any(beside in line for line in describe(standard))
     with pytest.raises(BundleError, match=r"\(weights\) already"):
         WeightOnly().check(standard, None)
@@ -290,8 +290,8 @@ def test_verification_by_layers_runs_nothing(llama, llama_int4, tmp_path):
     assert made.manifest.golden == ""
     assert Bundle.open(made.path) == made
     wanted = llama_int4.manifest.files
-    assert {name: made.manifest.files[name] for name in (WEIGHTS, "graphs/main.onnx")} == {
-        name: wanted[name] for name in (WEIGHTS, "graphs/main.onnx")
+    assert {name: made.manifest.files[name] for name in (WEIGHTS_FILE, "graphs/main.onnx")} == {
+        name: wanted[name] for name in (WEIGHTS_FILE, "graphs/main.onnx")
     }
     np.testing.assert_array_equal(actions(made), actions(llama_int4))
 

@@ -12,7 +12,7 @@ import pytest
 from onnx import numpy_helper
 
 from vlatool.runtime.engine import engine_class
-from vlatool.weights.pairs import fit, neighbours
+from vlatool.weights.pairs import neighbours, pairs_fit
 
 PRODUCT = """<ir_version: 10, opset_import: ["" : 20, "com.microsoft" : 1]>
 g (uint8[{rows},{inner}] x) => (float[{rows},{columns}] y) {{
@@ -45,7 +45,7 @@ def extreme(kind: str, shape: tuple[int, ...], axis: int, seed: int) -> np.ndarr
             one, other = codes.ravel()[first].astype(int), codes.ravel()[second].astype(int)
             excess = np.maximum(np.abs(one + other) - 127, 0) * np.sign(one + other)
             codes.ravel()[second.ravel()] = (other - excess).clip(-127, 127).astype(np.int8).ravel()
-    assert fit(codes, kind, axis)
+    assert pairs_fit(codes, kind, axis)
     return codes
 
 
@@ -93,7 +93,7 @@ def test_openvino_convolves_them_exactly(channels: int, size: int, tmp_path: Pat
 def test_convolutions_add_up_the_channels_of_a_position_first(engine: str, channels: int, size: int, tmp_path) -> None:
     row = np.resize(np.array(MEETS, np.int8), (size, size, channels))
     codes = np.repeat(row.transpose(2, 0, 1)[None], 8, axis=0)
-    assert fit(codes, "Conv", 0)
+    assert pairs_fit(codes, "Conv", 0)
     opened = session(CONVOLUTION.format(inner=channels, columns=8, rest=QUANTIZED), {"w": codes}, tmp_path, engine)
     found = opened.run({"x": np.full((1, channels, 9, 9), 255, np.float32)})["y"]
     assert not found.any()

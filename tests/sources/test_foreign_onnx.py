@@ -83,7 +83,9 @@ def test_int8_leaves_what_it_does_not_reach_and_counts_it(tmp_path: Path, name: 
 @pytest.mark.parametrize(("name", "gone"), [("bfloat16_inside", "bfloat16"), ("double_throughout", "float64")])
 def test_another_float_is_told(tmp_path: Path, name: str, gone: str) -> None:
     _, _, context = made(name, tmp_path)
-    assert f"layers compute in {gone}; the graph is written in float32, in which all stages begin" in context.messages
+    assert (
+        f"layers compute in {gone}; the graph is converted to float32, which all stages start from" in context.messages
+    )
 
 
 def test_names_of_all_kinds_stay(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from vlatool.evaluate.recorded import Recorded
 from vlatool.files.blob_store import FILES
 from vlatool.files.locks import acquire, release
 from vlatool.files.resumable_work import work_directory
-from vlatool.graph.stored import LAYOUT, write_workload
 from vlatool.graph.workload import workload
+from vlatool.graph.workload_file import LAYOUT_VERSION, write_workload
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.stage import cache as cache_module
 from vlatool.stage.base import Context
@@ -303,7 +303,7 @@ def test_unfinished_work_is_an_entry_that_its_lock_protects(cache: Path):
 def test_a_count_of_an_earlier_layout_is_vlatools_too(cache, float_bundle, change, ours) -> None:
     file = cache / "workloads" / f"{'1' * 32}.json"
     write_workload(file, workload(float_bundle))
-    old, new = (part.replace("LAYOUT", str(LAYOUT)) for part in change)
+    old, new = (part.replace("LAYOUT", str(LAYOUT_VERSION)) for part in change)
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new) if old else file.read_text())
     held = contents(cache)

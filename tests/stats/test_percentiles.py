@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from vlatool.stats.percentiles import (
+    effective_calls,
     effective_sample_size,
-    exceeding,
     floor,
-    independent,
     intraclass,
     percentile,
     proven_above,
+    required_exceedances,
 )
 
 
@@ -43,7 +43,7 @@ def test_how_many_may_exceed_follows_from_the_exact_binomial(count: int, share: 
         if tail > Fraction("0.01"):
             break
         most = exceed
-    assert exceeding(count, share) == most
+    assert required_exceedances(count, share) == most
 
 
 def test_a_percentile_by_hand() -> None:
@@ -88,24 +88,24 @@ def test_the_bound_holds_whatever_the_shape(make, truth: float) -> None:
 
 def test_calls_that_follow_each_other_are_worth_less() -> None:
     random = np.random.default_rng(3)
-    assert independent(random.normal(size=4000)) == pytest.approx(4000, rel=0.06)
-    assert independent(autoregressive(random, 4000, 0.7)) == pytest.approx(4000 * 0.3 / 1.7, rel=0.15)
-    assert independent(np.ones(50)) == 50
-    assert independent(np.tile([1.0, 2.0], 50)) == 100, "turns are no less than independent"
-    assert independent(np.array([1.0, 2.0])) == 2
+    assert effective_calls(random.normal(size=4000)) == pytest.approx(4000, rel=0.06)
+    assert effective_calls(autoregressive(random, 4000, 0.7)) == pytest.approx(4000 * 0.3 / 1.7, rel=0.15)
+    assert effective_calls(np.ones(50)) == 50
+    assert effective_calls(np.tile([1.0, 2.0], 50)) == 100, "turns are no less than independent"
+    assert effective_calls(np.array([1.0, 2.0])) == 2
 
 
 def test_one_long_stall_does_not_hide_that_calls_follow_each_other() -> None:
     series = autoregressive(np.random.default_rng(4), 2000, 0.7)
     stalled = series.copy()
     stalled[1000] = 1e6
-    assert independent(stalled) == pytest.approx(independent(series), rel=0.05)
+    assert effective_calls(stalled) == pytest.approx(effective_calls(series), rel=0.05)
 
 
 def test_equal_calls_share_a_rank() -> None:
     coarse = np.round(autoregressive(np.random.default_rng(5), 2000, 0.7), 1)
     follow = np.corrcoef(*(ranks := midranks(coarse), np.roll(ranks, -1)))[0, 1]
-    assert independent(coarse) == pytest.approx(2000 * (1 - follow) / (1 + follow), rel=0.01)
+    assert effective_calls(coarse) == pytest.approx(2000 * (1 - follow) / (1 + follow), rel=0.01)
 
 
 def midranks(series: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from vlatool.stats.sequential import INTERIM_ANALYSES, Decision, jointly, judged
+from vlatool.stats.sequential import INTERIM_ANALYSES, Decision, judge, judge_jointly
 
 Source = Callable[[int], float]
 
@@ -20,7 +20,7 @@ def sequential(
     measure: Source, margin: float, interim_analyses: Sequence[int] = INTERIM_ANALYSES
 ) -> tuple[Decision, list[float]]:
     """One statistic alone: its decision, and the log ratio of every process."""
-    decisions, processes = jointly(lambda number: (measure(number),), 1, margin, interim_analyses)
+    decisions, processes = judge_jointly(lambda number: (measure(number),), 1, margin, interim_analyses)
     return decisions[0], [ratios[0] for ratios in processes]
 
 
@@ -56,19 +56,19 @@ def test_no_more_processes_are_measured_than_needed() -> None:
 
 def test_a_decision_by_hand() -> None:
     ratios = [0.01 * number for number in range(1, 11)]
-    found = judged(ratios, 0.05)
+    found = judge(ratios, 0.05)
     averages = sorted((ratios[i] + ratios[j]) / 2 for i in range(10) for j in range(i, 10))
     assert found.low == pytest.approx(math.exp(averages[2]))
     assert found.high == pytest.approx(math.exp(averages[-3]))
     assert found.ratio == pytest.approx(math.exp(0.055))
     assert found.spread == pytest.approx(np.std(ratios, ddof=1))
     assert found.verdict == "inconclusive"
-    assert judged(ratios, 0.2).verdict == "pass"
-    assert judged(ratios, 0.005).verdict == "fail"
+    assert judge(ratios, 0.2).verdict == "pass"
+    assert judge(ratios, 0.005).verdict == "fail"
 
 
 def test_the_same_ratio_every_time_is_decided_exactly() -> None:
-    same = judged([math.log(1.02)] * 10, 0.05)
+    same = judge([math.log(1.02)] * 10, 0.05)
     assert (same.verdict, same.spread) == ("pass", 0)
     assert same.detectable == pytest.approx(0.05)
     assert same.wanted == 0
@@ -79,7 +79,7 @@ def test_what_it_could_have_found_is_found_95_times_in_100(processes: int) -> No
     random = np.random.default_rng(5)
     slowdown = Decision("pass", 1.0, 0.98, 1.02, 0.05, processes, 0.01).detectable
     runs = [math.log1p(slowdown) + 0.01 * random.normal(size=processes) for _ in range(400)]
-    assert 368 < sum(judged(run, 0.05).verdict == "fail" for run in runs) < 394
+    assert 368 < sum(judge(run, 0.05).verdict == "fail" for run in runs) < 394
 
 
 def test_what_could_be_found_narrows_with_processes_and_widens_with_the_spread() -> None:
@@ -104,27 +104,27 @@ def test_interim_analyses_that_decide_nothing_are_refused(interim_analyses: tupl
 @pytest.mark.parametrize("margin", [-1, -2, math.nan])
 def test_a_margin_that_is_none_is_refused(margin: float) -> None:
     with pytest.raises(ValueError, match="the margin is"):
-        judged([0.0] * 10, margin)
+        judge([0.0] * 10, margin)
 
 
 def test_one_statistic_that_fails_ends_it_and_all_must_pass() -> None:
     slower, same = noisy(0.3, 1), noisy(0.0, 2)
-    decisions, found = jointly(lambda number: (same(number), slower(number)), 2, 0.05)
+    decisions, found = judge_jointly(lambda number: (same(number), slower(number)), 2, 0.05)
     assert [decision.verdict for decision in decisions] == ["pass", "fail"]
     assert len(found) == 10
-    decisions, _ = jointly(lambda number: (same(number), same(number)), 2, 0.05)
+    decisions, _ = judge_jointly(lambda number: (same(number), same(number)), 2, 0.05)
     assert {decision.verdict for decision in decisions} == {"pass"}
     at = noisy(math.log(1.05), 5)
-    open_, _ = jointly(lambda number: (at(number), same(number)), 2, 0.05)
+    open_, _ = judge_jointly(lambda number: (at(number), same(number)), 2, 0.05)
     assert open_[0].verdict == "inconclusive"
 
 
 def test_statistics_share_the_error_of_a_failure_alone() -> None:
-    alone, shared = (judged([0.01 * number for number in range(10)], 0.05, sharing=sharing) for sharing in (1, 2))
+    alone, shared = (judge([0.01 * number for number in range(10)], 0.05, sharing=sharing) for sharing in (1, 2))
     assert shared.low < alone.low
     assert (shared.high, shared.ratio) == (alone.high, alone.ratio)
     with pytest.raises(ValueError, match="ascending numbers from 10"):
-        jointly(lambda _: (0.0, 0.0), 2, 0.05, (9, 20, 40))
+        judge_jointly(lambda _: (0.0, 0.0), 2, 0.05, (9, 20, 40))
 
 
 @pytest.mark.parametrize("tail", ["normal", "stalls"])
@@ -138,5 +138,5 @@ def test_equal_bundles_fail_in_fewer_than_one_in_a_hundred_gates(tail: str) -> N
             two += random.choice([-1, 1]) * random.exponential(0.5)
         return float(one), float(0.8 * one + 0.6 * two)
 
-    verdicts = [{each.verdict for each in jointly(measure, 2, 0.05)[0]} for _ in range(300)]
+    verdicts = [{each.verdict for each in judge_jointly(measure, 2, 0.05)[0]} for _ in range(300)]
     assert sum("fail" in each for each in verdicts) <= 3

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from vlatool.stats.signed_rank import _rank, fewest, hodges_lehmann, lower_bound, upper_bound, walsh
+from vlatool.stats.signed_rank import _rank, hodges_lehmann, lower_bound, min_differences, upper_bound, walsh
 
 
 def test_the_walsh_averages_by_hand() -> None:
@@ -48,7 +48,7 @@ def test_the_bounds_mirror_each_other() -> None:
 
 @pytest.mark.parametrize(("alpha", "count"), [(0.5, 1), (0.25, 2), (0.01, 7), (0.01 / 3, 9)])
 def test_too_few_pairs_have_no_bound(alpha: float, count: int) -> None:
-    assert fewest(alpha) == count
+    assert min_differences(alpha) == count
     assert math.isfinite(lower_bound(np.ones(count), alpha))
     assert lower_bound(np.ones(count - 1), alpha) == -math.inf if count > 1 else True
 
@@ -56,7 +56,7 @@ def test_too_few_pairs_have_no_bound(alpha: float, count: int) -> None:
 @pytest.mark.parametrize("alpha", [0, 1, -0.1])
 def test_an_impossible_error_is_refused(alpha: float) -> None:
     with pytest.raises(ValueError, match="alpha is"):
-        fewest(alpha)
+        min_differences(alpha)
 
 
 @pytest.mark.parametrize("values", [[], [1.0, math.inf], [math.nan]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vlatool.stats.intervals import sign_test, wilson
-from vlatool.stats.starts import distinct, independent, reduced, too_few, wilson_of
+from vlatool.stats.starts import distinct_starts, has_too_few_starts, independent_starts, reduce_counts, wilson_of
 from vlatool.stats.success_sequential import exact_drop, plan
 
 
@@ -22,7 +22,7 @@ from vlatool.stats.success_sequential import exact_drop, plan
     ],
 )
 def test_episodes_count_by_how_often_their_start_occurs(starts, number: int, size: int, few: bool) -> None:
-    assert (distinct(starts), independent(starts), too_few(starts)) == (number, size, few)
+    assert (distinct_starts(starts), independent_starts(starts), has_too_few_starts(starts)) == (number, size, few)
 
 
 def test_intervals_are_those_of_the_independent_episodes() -> None:
@@ -35,9 +35,9 @@ def test_intervals_are_those_of_the_independent_episodes() -> None:
 
 
 def test_what_is_left_of_an_episode_favours_no_side() -> None:
-    least, largest = reduced(10, 10, 300, 3)
+    least, largest = reduce_counts(10, 10, 300, 3)
     assert (least, largest) == ((0, 1, 3), (1, 0, 3))
-    assert all(sum(counts[:2]) <= 3 for counts in reduced(200, 100, 300, 2))
+    assert all(sum(counts[:2]) <= 3 for counts in reduce_counts(200, 100, 300, 2))
 
 
 def test_repeated_pairs_fail_no_more_often_than_they_may() -> None:
@@ -48,7 +48,7 @@ def test_repeated_pairs_fail_no_more_often_than_they_may() -> None:
     for _ in range(60):
         outcome = random.choice([-1, 0, 1], size=40, p=[0.05, 0.9, 0.05])[starts]
         lost, won = int((outcome > 0).sum()), int((outcome < 0).sum())
-        wrong += exact_drop(lost, won, 400, size=independent(starts.tolist()))[1] > 0
+        wrong += exact_drop(lost, won, 400, size=independent_starts(starts.tolist()))[1] > 0
         naive += exact_drop(lost, won, 400)[1] > 0
     assert wrong <= 4, "2.5 % of 60, and chance"
     assert naive > 12, "the interval of as many independent episodes"

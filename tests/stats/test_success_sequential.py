@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import binom, multinomial, norm
 
 from vlatool.stats.intervals import paired_drop
-from vlatool.stats.success_sequential import Decision, Plan, exact_drop, exact_p, plan, spent_in_turns
+from vlatool.stats.success_sequential import Decision, Plan, exact_drop, exact_p, plan, spending_levels
 
 RUNS = 10_000
 
@@ -202,7 +202,7 @@ def test_the_level_of_one_analysis_holds_whatever_the_discordance(drop: float) -
 @pytest.mark.parametrize("alpha", [0.01, 0.025, 0.1])
 def test_the_levels_of_two_analyses_spend_the_error(alpha: float) -> None:
     """By one integral over the first score, instead of a recursion over sums."""
-    first, second = (float(norm.isf(level)) for level in spent_in_turns((0.4, 1.0), alpha))
+    first, second = (float(norm.isf(level)) for level in spending_levels((0.4, 1.0), alpha))
     assert norm.sf(first) == pytest.approx(0.4 * alpha, rel=1e-6)
 
     def late(score: float) -> float:
@@ -213,20 +213,20 @@ def test_the_levels_of_two_analyses_spend_the_error(alpha: float) -> None:
 
 def test_the_levels_of_ten_analyses_spend_the_error_in_proportion() -> None:
     times = tuple(number / 10 for number in range(1, 11))
-    bounds = norm.isf(spent_in_turns(times, 0.025))
+    bounds = norm.isf(spending_levels(times, 0.025))
     sums = np.random.default_rng(0).normal(size=(400_000, 10), scale=math.sqrt(0.1)).cumsum(axis=1)
     crossed = np.logical_or.accumulate(sums / np.sqrt(times) >= bounds, axis=1).mean(axis=0)
     assert crossed == pytest.approx(0.025 * np.array(times), rel=0.06)
 
 
 def test_one_analysis_spends_it_all() -> None:
-    assert spent_in_turns((1.0,), 0.025) == pytest.approx((0.025,), rel=1e-8)
+    assert spending_levels((1.0,), 0.025) == pytest.approx((0.025,), rel=1e-8)
     assert len(plan(0.03, 100, analyses=1).levels) == 1
 
 
 def test_it_answers_the_same_every_time() -> None:
     first = plan(0.03, 1000).judge(12, 7, 500)
-    spent_in_turns.cache_clear()
+    spending_levels.cache_clear()
     assert plan(0.03, 1000).judge(12, 7, 500) == first
     one, two = (played(plan(0.03, 300), [(0.03, 0.02)], 500, seed=4) for _ in range(2))
     assert (one.verdicts == two.verdicts).all()

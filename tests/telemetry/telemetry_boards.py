@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vlatool.telemetry import Absent, Reader, Reading, Recorded
+from vlatool.telemetry import Absent, Reader, Reading, Summary
 
 Files = Mapping[str, Any]
 HWMON = "sys/class/hwmon"
@@ -170,7 +170,7 @@ def reason(found: Reader | Absent) -> str:
     return found.reason
 
 
-def reasons(found: Recorded) -> dict[str, str]:
+def reasons(found: Summary) -> dict[str, str]:
     return {one.reader: one.reason for one in found.unmeasured}
 
 

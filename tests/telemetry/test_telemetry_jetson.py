@@ -198,7 +198,7 @@ def test_a_gpu_that_is_powered_off_gives_its_clock_alone(tmp_path: Path) -> None
     found = DevfreqReader.open(root)
     unreadable(root, "sys/class/devfreq/17000000.gpu/device/load")
     assert [*read(found)] == ["devfreq.gpu.clock"]
-    assert "no Jetson" in reason(DevfreqReader.open(tmp_path / "none"))
+    assert "not a Jetson" in reason(DevfreqReader.open(tmp_path / "none"))
 
 
 def test_overcurrent_events_are_throttle_counters(tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_overcurrent_events_are_throttle_counters(tmp_path: Path) -> None:
     assert read(found) == {"overcurrent.oc1": 0, "overcurrent.oc2": 0, "overcurrent.oc3": 2}
     assert isinstance(found, OvercurrentReader)
     assert {(one.kind, one.unit) for one in found.read()} == {("counter", "throttle")}
-    assert "no Jetson" in reason(OvercurrentReader.open(tmp_path / "none"))
+    assert "not a Jetson" in reason(OvercurrentReader.open(tmp_path / "none"))
 
 
 def test_a_line_of_jetpack_4_without_date_and_without_milliwatts() -> None:
@@ -275,7 +275,7 @@ def test_tegrastats_is_asked_for_one_line_and_may_fall_silent() -> None:
     assert read(found)["tegrastats.VDD_IN"] == 16.321
     answers.clear()
     assert read(found) == {}
-    assert "no line" in reason(TegrastatsReader.open(run=commands({})))
+    assert "prints nothing" in reason(TegrastatsReader.open(run=commands({})))
 
 
 @pytest.mark.parametrize(
@@ -305,4 +305,4 @@ def test_the_power_mode_is_a_number_with_its_name() -> None:
 def test_a_copied_tree_runs_no_command_here(tmp_path: Path) -> None:
     root = write(tmp_path, VM)
     assert "no mode" in reason(NvpmodelReader.open(root))
-    assert "no line" in reason(TegrastatsReader.open(root))
+    assert "prints nothing" in reason(TegrastatsReader.open(root))

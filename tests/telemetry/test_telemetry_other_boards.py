@@ -142,18 +142,18 @@ def test_a_processor_without_throttle_counters_says_so(tmp_path: Path) -> None:
     ],
 )
 def test_throttle_bits(text: str, bits: int | None) -> None:
-    assert vcgencmd.throttled(text) == bits
+    assert vcgencmd.parse_throttling(text) == bits
 
 
 @pytest.mark.parametrize(
     ("text", "degrees"), [("temp=48.0'C\n", 48.0), ("temp=-3.2'C", -3.2), ("temp=nan'C", None), ("", None)]
 )
 def test_temperatures_of_vcgencmd(text: str, degrees: float | None) -> None:
-    assert vcgencmd.temperature(text) == degrees
+    assert vcgencmd.parse_temperature(text) == degrees
 
 
 def test_the_rails_of_a_pi_5_are_paired_by_name_and_not_by_number() -> None:
-    watts = vcgencmd.pmic_watts(PI5_PMIC)
+    watts = vcgencmd.parse_pmic_watts(PI5_PMIC)
     assert [*watts] == ["3V7_WL_SW", "3V3_SYS", "VDD_CORE", "0V8_AON", "3V3_DAC"]
     assert sum(watts.values()) == pytest.approx(PI5_WATTS)
     assert watts["VDD_CORE"] == pytest.approx(1.11625 * 0.7494498)
@@ -170,7 +170,7 @@ def test_the_rails_of_a_pi_5_are_paired_by_name_and_not_by_number() -> None:
     ],
 )
 def test_no_rail_is_made_up(text: str) -> None:
-    assert vcgencmd.pmic_watts(text) == {}
+    assert vcgencmd.parse_pmic_watts(text) == {}
 
 
 def test_a_pi_5_has_rails_and_a_labelled_sum() -> None:

@@ -70,7 +70,7 @@ def test_psutil_is_asked_where_there_is_no_proc(monkeypatch: pytest.MonkeyPatch)
             return SimpleNamespace(involuntary=4)
 
     monkeypatch.setattr(process, "read_text", lambda root, path: None)
-    monkeypatch.setattr(process, "listed", lambda root, folder, pattern: [])
+    monkeypatch.setattr(process, "find", lambda root, folder, pattern: [])
     monkeypatch.setitem(sys.modules, "psutil", SimpleNamespace(Process=Process))
     found = ProcessReader.open()
     assert read(found) == {"process.cpu": 2.0, "process.memory": 2.0, "process.involuntary_switches": 4}

@@ -19,7 +19,7 @@ from telemetry_boards import (
 
 from vlatool import registry
 from vlatool.telemetry import Absent, Reader, Reading, Recorder, collect, open_all, recorder, summarise
-from vlatool.telemetry._reading import counter, gauge, listed, run_command
+from vlatool.telemetry._reading import counter, find, gauge, run_command
 from vlatool.telemetry._summary import difference
 
 
@@ -158,7 +158,7 @@ def test_a_counter_that_goes_back_is_unmeasured() -> None:
 def test_a_counter_that_was_read_once_is_unmeasured() -> None:
     found = summarise(collect(energy("rapl.package-0", None, (0, 50))))
     assert found.counters == {}
-    assert "read once" in reasons(found)["rapl.package-0"]
+    assert "read only once" in reasons(found)["rapl.package-0"]
 
 
 def throttle(kind: str, *values: float) -> Iterable[tuple[float, Reading]]:
@@ -289,8 +289,8 @@ def test_this_machine_can_be_recorded_whatever_it_has() -> None:
 def test_entries_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for name in ("zone10", "zone9", "zone1"):
         (tmp_path / "a" / name).mkdir(parents=True)
-    assert listed(tmp_path, "a", "zone*") == ["a/zone1", "a/zone9", "a/zone10"]
-    assert listed(tmp_path, "none", "*") == []
+    assert find(tmp_path, "a", "zone*") == ["a/zone1", "a/zone9", "a/zone10"]
+    assert find(tmp_path, "none", "*") == []
 
 
 def test_commands_that_fail_or_hang_give_none(monkeypatch: pytest.MonkeyPatch) -> None:

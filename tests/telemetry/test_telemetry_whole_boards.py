@@ -25,12 +25,12 @@ from telemetry_boards import (
     write,
 )
 
-from vlatool.telemetry import Recorded, Recorder, open_all
+from vlatool.telemetry import Recorder, Summary, open_all
 
 ANSWERS = {"-q": "NV Power Mode: 25W\n1\n"}
 
 
-def recorded_between(root: Path, later: dict[str, Any], answers: dict[str, str | None] | None = None) -> Recorded:
+def recorded_between(root: Path, later: dict[str, Any], answers: dict[str, str | None] | None = None) -> Summary:
     """Record a board for ten seconds, during which its files change."""
     clock = Clock()
     with Recorder(

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from vlatool.prune._sparse import least
+from vlatool.prune._sparse_base import smallest_mask
 from vlatool.training.constraint import GrowingZeros
 from vlatool.training.loop import Settings, Trainer
 
@@ -24,7 +24,7 @@ def net() -> nn.Module:
 def trainer_of(folder: Path) -> tuple[nn.Module, Trainer]:
     module = net()
     zeros = GrowingZeros(
-        [module[0].weight], lambda sizes, share: least(sizes, "unstructured", share, rows=False), SHARES
+        [module[0].weight], lambda sizes, share: smallest_mask(sizes, "unstructured", share, rows=False), SHARES
     )
     return module, Trainer({"main": module}, Settings(30, 0.03, average=0.9), folder, constraint=zeros)
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from vlatool.graph.qdq import quantize_weight
-from vlatool.weights.pairs import fit, largest_sums, neighbours
+from vlatool.weights.pairs import largest_sums, neighbours, pairs_fit
 
 SHAPES = [
     ("MatMul", (7, 5), 1), ("MatMul", (64, 16), 1), ("MatMul", (3, 8, 4), 2), ("MatMul", (1, 6), 1),
@@ -26,7 +26,7 @@ def test_no_pair_of_a_fitted_weight_leaves_16_bits(kind, shape, axis, seed):
     assert sums.shape == (shape[axis],)
     for scaled_axis in (axis, None):
         codes, _ = quantize_weight(weight, scaled_axis, "w", sums=sums)
-        assert fit(codes, kind, axis)
+        assert pairs_fit(codes, kind, axis)
         assert largest_product(codes, kind, axis) <= 2**15 - 1
 
 
@@ -37,27 +37,27 @@ def test_no_pair_of_a_fitted_weight_leaves_16_bits(kind, shape, axis, seed):
 def test_two_neighbours_fit_as_long_as_their_sum_is_an_int8(first, second, right):
     codes = np.zeros((4, 3), np.int8)
     codes[2:, 1] = first, second
-    assert fit(codes, "MatMul", 1) is right
+    assert pairs_fit(codes, "MatMul", 1) is right
     apart = np.zeros((4, 3), np.int8)
     apart[1:3, 1] = first, second
-    assert fit(apart, "MatMul", 1)
+    assert pairs_fit(apart, "MatMul", 1)
 
 
 def test_channels_are_neighbours_of_a_convolution_and_kernel_positions_are_not():
     codes = np.zeros((1, 2, 1, 3), np.int8)
     codes[0, 0] = 127
-    assert fit(codes, "Conv", 0)
+    assert pairs_fit(codes, "Conv", 0)
     codes[0, 1, 0, 2] = 1
-    assert not fit(codes, "Conv", 0)
+    assert not pairs_fit(codes, "Conv", 0)
 
 
 def test_an_odd_number_of_channels_is_looked_at_as_it_is_and_padded():
     meets_the_next_position = np.zeros((1, 3, 1, 2), np.int8)
     meets_the_next_position[0, 2, 0, 0] = meets_the_next_position[0, 0, 0, 1] = 127
-    assert not fit(meets_the_next_position, "Conv", 0)
+    assert not pairs_fit(meets_the_next_position, "Conv", 0)
     within_the_second_position = np.zeros((1, 3, 1, 2), np.int8)
     within_the_second_position[0, 0, 0, 1] = within_the_second_position[0, 1, 0, 1] = 127
-    assert not fit(within_the_second_position, "Conv", 0)
+    assert not pairs_fit(within_the_second_position, "Conv", 0)
 
 
 def test_steps_are_a_third_larger_than_those_of_8_bits_and_not_twice_as_large():

@@ -12,7 +12,7 @@ from vlatool.measures.motion import RATIO, STEPS_RATIO
 from vlatool.measures.success import DISTURBED_DROP, SUCCESS, SUCCESS_DISTURBED, SUCCESS_DROP
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import wilson
-from vlatool.stats.starts import independent
+from vlatool.stats.starts import independent_starts
 from vlatool.stats.success_sequential import exact_drop
 
 Played = Sequence[Outcome]
@@ -114,7 +114,7 @@ def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measur
         names = series.DISTURBED_BASELINE.name(kind), series.DISTURBED_SUCCESS.name(kind)
         pairs = list(zip(*(row.raw[name] for name in names), strict=True))
         lost, won = sum(before > after for before, after in pairs), sum(before < after for before, after in pairs)
-        size = independent(row.raw.get(series.START) or range(len(pairs)))
+        size = independent_starts(row.raw.get(series.START) or range(len(pairs)))
         drop, low, high = exact_drop(lost, won, len(pairs), confidence, size)
         drops[kind] = DISTURBED_DROP.measurement(
             drop, samples=len(pairs), low=low, high=high, confidence=confidence, note=kind

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from vlatool.motion.measure import FEWEST
+from vlatool.motion.measure import MIN_PAIRS
+from vlatool.stats.starts import MIN_DISTINCT_STARTS
 
 KNOWN = 0.9
 """Share of the episodes in which both succeed that must tell a metric of both, or nothing is claimed of it."""
@@ -16,9 +17,9 @@ class Cause(Enum):
 
     RARELY_KNOWN = f"known of both in {{count}} of {{of}} common successes, and it takes {KNOWN:.0%}"
     MISSING_MORE_OFTEN = "missing in {count} common successes where the baseline has it, the other way round in {of}"
-    FEW_STARTS = f"{{count}} distinct starts, and it takes {FEWEST}"
-    REPEATED_STARTS = f"{{of}} episodes of {{count}} distinct starts decide nothing (from {FEWEST})"
-    FEW_PAIRS = f"{{count}} pairs, and it takes {FEWEST}"
+    FEW_STARTS = f"{{count}} distinct starts, and it takes {MIN_PAIRS}"
+    REPEATED_STARTS = f"{{of}} episodes of {{count}} distinct starts decide nothing (from {MIN_DISTINCT_STARTS})"
+    FEW_PAIRS = f"{{count}} pairs, and it takes {MIN_PAIRS}"
     ZEROS = "too few pairs in which the baseline's is not 0"
 
 

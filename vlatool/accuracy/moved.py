@@ -14,10 +14,10 @@ from vlatool.accuracy.doubt import KNOWN, Cause, Doubt
 from vlatool.measures import Quantity, series, tables
 from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
 from vlatool.measures.success import WORST_TASK_DROP
-from vlatool.motion.measure import FEWEST, metrics, ratio_of
+from vlatool.motion.measure import MIN_PAIRS, metrics, ratio_of
 from vlatool.report import NO_INTERVAL, Measurement, Row
 from vlatool.stats.intervals import sign_test
-from vlatool.stats.starts import distinct, independent
+from vlatool.stats.starts import distinct_starts, independent_starts
 from vlatool.stats.success_sequential import exact_drop
 
 Array = NDArray[np.float64]
@@ -110,7 +110,7 @@ def _ratio(
     value, low, high = ratio
     what, *remarks = note
     if doubt or not np.isfinite(high):
-        doubt = doubt or Doubt(Cause.FEW_PAIRS if count < FEWEST else Cause.ZEROS, count)
+        doubt = doubt or Doubt(Cause.FEW_PAIRS if count < MIN_PAIRS else Cause.ZEROS, count)
         low = high = None
         remarks.insert(0, f"{NO_INTERVAL}{doubt}")
     words = "; ".join((what, *remarks))
@@ -141,8 +141,8 @@ class _Pairs:
                 continue
             counted, *unknown = self._counted(known)
             note = (f"of the means of {counted}", *unknown, *self._worst_of(own, base, known))
-            starts = distinct(self._starts[known].tolist())
-            few = Doubt(Cause.FEW_STARTS, starts) if starts < min(FEWEST, known.sum()) else None
+            starts = distinct_starts(self._starts[known].tolist())
+            few = Doubt(Cause.FEW_STARTS, starts) if starts < min(MIN_PAIRS, known.sum()) else None
             doubt = self.doubt(name) or few
             yield name, _ratio(RATIO.quantity(name), ratio, int(known.sum()), note, self._confidence, doubt)
 
@@ -179,7 +179,7 @@ class _Pairs:
             own, base, known = self._values(name)
             if known.any() and not base[known].any():
                 starts = self._starts[known]
-                yield name, (distinct(starts[own[known] > 0].tolist()), distinct(starts.tolist()))
+                yield name, (distinct_starts(starts[own[known] > 0].tolist()), distinct_starts(starts.tolist()))
 
     def added_motion(self) -> Iterator[Measurement]:
         """Yield the mean of each of these metrics that the variant has something of."""
@@ -242,12 +242,12 @@ class _Pairs:
         return sorted(records, key=lambda record: -record["drop"])[:LONGEST] if len(records) > 1 else []
 
     def _ratios_of(self, chosen: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return metric -> ratio among some episodes; nothing where both succeed in fewer than ``FEWEST`` of them."""
+        """Return metric -> ratio among some episodes; nothing where both succeed in fewer than ``MIN_PAIRS``."""
         ratios: dict[str, Any] = {}
         for name in self._metrics:
             own, base, known = self._values(name)
             known = known & chosen
-            enough = known.sum() >= FEWEST and (own[known].any() or base[known].any())
+            enough = known.sum() >= MIN_PAIRS and (own[known].any() or base[known].any())
             if enough and (ratio := self._ratio_of(own, base, known)):
                 ratios[f"{name.replace('_', ' ')}, x"] = round(ratio[0], 3)
         return ratios
@@ -257,7 +257,7 @@ class _Pairs:
         ratios = []
         for place, name in enumerate(self._names.get(series.TASK, ())):
             chosen = known & (self._places[series.TASK] == place)
-            if chosen.sum() >= FEWEST and base[chosen].mean() > 0:
+            if chosen.sum() >= MIN_PAIRS and base[chosen].mean() > 0:
                 ratios.append((float(own[chosen].mean() / base[chosen].mean()), name))
         if len(ratios) > 1:
             yield f"most in {max(ratios)[1]}: {max(ratios)[0]:.3g}x"
@@ -265,7 +265,7 @@ class _Pairs:
     def _drop(self, chosen: NDArray[np.bool_], confidence: float) -> tuple[tuple[float, float, float], int]:
         before, after = (won[chosen] for won in self._wins)
         lost, won = int((before & ~after).sum()), int((after & ~before).sum())
-        size = independent(self._starts[chosen].tolist())
+        size = independent_starts(self._starts[chosen].tolist())
         return exact_drop(lost, won, len(before), confidence, size), len(before)
 
     def _values(self, name: str) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -17,7 +17,7 @@ from vlatool.measures.success import MCNEMAR_P, SUCCESS, SUCCESS_CHANCE, SUCCESS
 from vlatool.motion.measure import metrics
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import mcnemar_exact
-from vlatool.stats.starts import distinct, independent, too_few, wilson_of
+from vlatool.stats.starts import distinct_starts, has_too_few_starts, independent_starts, wilson_of
 from vlatool.stats.success_sequential import exact_drop
 
 CLOCK = "time"
@@ -95,7 +95,7 @@ def _numbered(starts: Sequence[Hashable]) -> list[float]:
 
 
 def _starts(starts: Sequence[Hashable]) -> str:
-    count, worth = distinct(starts), independent(starts)
+    count, worth = distinct_starts(starts), independent_starts(starts)
     return f"{count} distinct starts" + (f", worth {worth} episodes" if worth < len(starts) else "")
 
 
@@ -106,7 +106,7 @@ def few_starts(row: Row) -> Doubt | None:
         row: Of ``success_row``.
     """
     starts = row.raw.get(series.START, [])
-    return Doubt(Cause.REPEATED_STARTS, distinct(starts), len(starts)) if too_few(starts) else None
+    return Doubt(Cause.REPEATED_STARTS, distinct_starts(starts), len(starts)) if has_too_few_starts(starts) else None
 
 
 def repeated_starts(row: Row) -> tuple[str, ...]:
@@ -116,11 +116,12 @@ def repeated_starts(row: Row) -> tuple[str, ...]:
         row: Of ``success_row``.
     """
     starts = row.raw.get(series.START, [])
-    if distinct(starts) == len(starts):
+    count, size = distinct_starts(starts), independent_starts(starts)
+    if count == len(starts):
         return ()
     return (
-        f"the {len(starts)} episodes have {distinct(starts)} distinct first observations, so that they count as "
-        f"{independent(starts)}: let reset(seed=...) draw each episode anew, and show it in the first observation",
+        f"the {len(starts)} episodes have {count} distinct first observations, so that they count as "
+        f"{size}: let reset(seed=...) draw each episode anew, and show it in the first observation",
     )
 
 
@@ -158,7 +159,7 @@ def _table(column: str, outcomes: Sequence[Outcome], key: Callable[[Outcome], st
         low, high = wilson_of(wins, starts)
         steps = sum(outcome.steps for outcome in own) / len(own)
         cells = {column: value, "success": round(wins / len(own), 4), "low": round(low, 4), "high": round(high, 4)}
-        cells |= {"episodes": len(own), "distinct starts": distinct(starts), "mean steps": round(steps, 1)}
+        cells |= {"episodes": len(own), "distinct starts": distinct_starts(starts), "mean steps": round(steps, 1)}
         table.append(cells)
     return table
 
@@ -186,7 +187,7 @@ def compare_success(baseline: Row, row: Row) -> Row:
     lost = sum(before > after for before, after in pairs)
     won = sum(before < after for before, after in pairs)
     starts = baseline.raw[series.START]
-    size = independent(starts)
+    size = independent_starts(starts)
     drop, low, high = exact_drop(lost, won, len(pairs), size=size)
     p = mcnemar_exact(*(count * size // len(pairs) for count in (lost, won)))
     test = MCNEMAR_P.measurement(p, samples=len(pairs), note="exact, two-sided")

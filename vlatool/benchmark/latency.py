@@ -17,7 +17,7 @@ from vlatool.bundle.module_bundle import export_command
 from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
-from vlatool.graph.workload import WORK, Workload, whole_work, workload
+from vlatool.graph.workload import WORKLOAD_TABLE, Workload, summarize_workload, workload
 from vlatool.graph.zeros import zero_share
 from vlatool.machine.host import fingerprint
 from vlatool.measurement import agent
@@ -207,7 +207,7 @@ class Latency(Measure):
             work = _work(bundle)
             numbers += _arithmetic(work, policy)
             details = tables(run, policy, not others)
-            details |= {WORK: [{**whole_work(work), "engine": policy.engine}]} if work else {}
+            details |= {WORKLOAD_TABLE: [{**summarize_workload(work), "engine": policy.engine}]} if work else {}
             if policy is reference and (lines := run.log.strip().splitlines()):
                 details[titles.LOG] = [{"line": line} for line in lines[-LOG_LINES:]]
             role = "baseline" if policy is reference and others else "subject"

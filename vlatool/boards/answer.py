@@ -16,13 +16,13 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, OutputError, SourceError, UsageError, fix_for, suggest
 from vlatool.export.onnx import ExportOnnx
 from vlatool.files.ownership import add_to_ledger
-from vlatool.graph.stored import digest, read_workload, refuse_other, write_workload
 from vlatool.graph.workload import PRECISIONS, Workload, workload
+from vlatool.graph.workload_file import digest, read_workload, refuse_foreign_file, write_workload
 from vlatool.hardware.platforms import load_platform
-from vlatool.hardware.profile import Profile, load_profile, names
-from vlatool.latency_model.board import Candidate, engine_for, outcomes, quantized_as
-from vlatool.latency_model.measured import measured_questions
-from vlatool.latency_model.model import LatencyModel, shipped
+from vlatool.hardware.profile import Profile, load_profile, profile_names
+from vlatool.latency_model.board import Candidate, engine_for, outcomes, stored_quantization
+from vlatool.latency_model.board_measurements import measured_questions
+from vlatool.latency_model.model import LatencyModel, load_model
 from vlatool.machine.host import cache_directory
 from vlatool.module.description import read_location
 from vlatool.module.edits import is_changed
@@ -74,14 +74,14 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
             watts=asked.watts or sheet.compute_watts,
             battery_wh=asked.battery_wh or sheet.battery_wh,
         )
-    boards = [load_profile(name) for name in (asked.boards or names())]
+    boards = [load_profile(name) for name in (asked.boards or profile_names())]
     bundle = opened(source, context)
     load = counted(bundle, context)
     spec = bundle.manifest.spec
     asked = replace(asked, execute=spec.executed)
     if asked.hz is None and asked.latency_ms is None:
         asked = replace(asked, hz=spec.control_hz)
-    model = shipped().conditioned(measured_questions(calibration))
+    model = load_model().condition(measured_questions(calibration))
     owned = [board for board in boards if board.price_usd_per_hour is None]
     rented = [board for board in boards if board.price_usd_per_hour is not None]
     context.progress("predicting", None)
@@ -166,7 +166,7 @@ def carry_count(source: str, context: Context) -> Path:
             "put the code beside policy.yaml, or leave --carry-count out: the count is in the cache",
         )
     file = origin_of(bundle).folder / CARRIED
-    refuse_other(file)
+    refuse_foreign_file(file)
     load = counted(bundle, context)
     try:
         write_workload(file, load, digest(bundle))
@@ -210,14 +210,14 @@ def simulated(
     bundle = opened(source, context)
     spec, load = bundle.manifest.spec, counted(bundle, context)
     candidate = asked if engine or precision else replace(asked, engine=_engine_of(bundle, profile, load))
-    model = shipped().conditioned(measured_questions())
+    model = load_model().condition(measured_questions())
     outcome = outcomes([candidate], load, model)[0]
     if not outcome.latency.known:
         raise DataError(f"{source} on {board}: {outcome.latency.why}.", _fix_of(load))
     phases = bounds(outcome, model.shares)
     return {
         "source": source, "profile": board, "mode": name, "engine": candidate.engine,
-        "precision": precision or quantized_as(load) or "float32", "origin": "predicted",
+        "precision": precision or stored_quantization(load) or "float32", "origin": "predicted",
         "latency_ms": [outcome.latency.ms, outcome.latency.low, outcome.latency.high],
         "regime": outcome.latency.regime, "memory_mb": outcome.memory_mb, "watts": outcome.watts,
         "joules": outcome.joules, "execute": spec.executed, "control_hz": spec.control_hz,
@@ -240,7 +240,7 @@ def _engine_of(bundle: Bundle, profile: Profile, load: Workload) -> str:
     if engine := engine_for(profile, load, bundle.manifest.engine):
         return engine
     raise DataError(
-        f"No engine of {profile.name} runs {bundle.path}, whose graphs are {quantized_as(load)}; it has "
+        f"No engine of {profile.name} runs {bundle.path}, whose graphs are {stored_quantization(load)}; it has "
         f"{', '.join(profile.engines)}.",
         "quantize for the board: vlatool quantize SOURCE --profile BOARD; or name another --profile",
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from vlatool.errors import ProfileError
 from vlatool.graph.workload import Workload
 from vlatool.hardware.profile import Profile
-from vlatool.latency_model.board import Candidate, Outcome, candidates, outcomes, power_limit, quantized_as
+from vlatool.latency_model.board import Candidate, Outcome, candidates, outcomes, power_limit, stored_quantization
 from vlatool.latency_model.model import LatencyModel
 
 STATES = ("fits", "may fit", "unknown", "no")
@@ -131,9 +131,9 @@ def _before(board: Profile, load: Workload, wants: Wants) -> tuple[str, list[Can
             return f"its lowest power mode takes up to {least:g} W, more than {wants.watts:g} W", []
     ways = candidates(board, load, modes)
     if not ways:
-        return f"no engine of it runs this bundle, whose graphs are {quantized_as(load)}", []
+        return f"no engine of it runs this bundle, whose graphs are {stored_quantization(load)}", []
     if wants.precisions:
-        stored = quantized_as(load)
+        stored = stored_quantization(load)
         ways = [way for way in ways if (way.precision or stored) in wants.precisions]
         if not ways:
             return f"it has no engine for {' or '.join(wants.precisions)}", []

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from vlatool.graph.workload import GraphWorkload, Workload
-from vlatool.latency_model.board import Candidate, Outcome, Phase, at, outcomes, quantized_as
+from vlatool.latency_model.board import Candidate, Outcome, Phase, outcomes, rescale, stored_quantization
 from vlatool.latency_model.features import Shares, roofline_parts
 from vlatool.latency_model.model import LatencyModel, part_of
 
@@ -74,8 +74,8 @@ def parts_of(phase: Phase, graph: GraphWorkload, shares: Mapping[str, Shares]) -
 def changes(candidate: Candidate, load: Workload, model: LatencyModel) -> list[Change]:
     """Predict what the usual changes would give: other precisions, fewer steps, smaller images, pruning."""
     asked: list[tuple[str, Candidate, Workload]] = []
-    now = candidate.precision or quantized_as(load) or "float32"
-    whole = not quantized_as(load)
+    now = candidate.precision or stored_quantization(load) or "float32"
+    whole = not stored_quantization(load)
     asked += [
         (f"{precision} in the place of {now}", replace(candidate, precision=precision), load)
         for precision in candidate.figures.dtypes
@@ -83,13 +83,13 @@ def changes(candidate: Candidate, load: Workload, model: LatencyModel) -> list[C
     ]
     for name, runs in load.runs.items():
         if runs > 1:
-            fewer = at(load, {}, {name: math.ceil(runs / 2)})
+            fewer = rescale(load, {}, {name: math.ceil(runs / 2)})
             asked.append((f"{name}: {math.ceil(runs / 2)} steps in the place of {runs}", candidate, fewer))
     name = widest(load)
-    images = {name: (SMALLER, 1.0, SMALLER)}
-    asked.append((f"images of 0.7 of the side, where {name} works on image tokens alone", candidate, at(load, images)))
+    images = rescale(load, {name: (SMALLER, 1.0, SMALLER)})
+    asked.append((f"images of 0.7 of the side, where {name} works on image tokens alone", candidate, images))
     pruned = dict.fromkeys(load.graphs, (PRUNED, PRUNED, math.sqrt(PRUNED)))
-    asked.append(("30 % of each layer pruned, whole channels", candidate, at(load, pruned)))
+    asked.append(("30 % of each layer pruned, whole channels", candidate, rescale(load, pruned)))
     return [Change(title, outcomes([way], changed, model)[0]) for title, way, changed in asked]
 
 

@@ -17,8 +17,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
-from vlatool.graph.stored import from_values, to_values
-from vlatool.graph.workload import GraphWorkload, Tally, Workload, part_named
+from vlatool.graph.workload import GraphWorkload, Tally, Workload, part_of
+from vlatool.graph.workload_file import from_values, to_values
 from vlatool.module.fake_weights import meta_float32_modules, run_on_fake_tensors
 from vlatool.user_code import children
 
@@ -115,7 +115,7 @@ class _Seen:
 
     def product(self, macs: int, written: int, weights: int, groups: int = 1, weight: Hashable = "") -> None:
         self.macs += macs
-        self.tally.layer(macs, written, weights, groups, self.inside[-1] if self.inside else "", weight)
+        self.tally.add_layer(macs, written, weights, groups, self.inside[-1] if self.inside else "", weight)
 
     def keep(self, tensor: Any) -> None:
         size = tensor.numel() * tensor.element_size()
@@ -133,7 +133,7 @@ def _stored(module: Any) -> int:
 
 
 def _where(module: Any, parts: Mapping[str, Sequence[str]]) -> dict[int, str]:
-    return {id(part): part_named(name, parts) for name, part in module.named_modules()} if parts else {}
+    return {id(part): part_of(name, parts) for name, part in module.named_modules()} if parts else {}
 
 
 @contextlib.contextmanager
@@ -191,7 +191,7 @@ def _count(torch: Any, seen: _Seen, name: str, args: Any, output: Any) -> None:
         seen.product(scores * query.shape[-1], scores, 0)
         seen.product(scores * value.shape[-1], math.prod(query.shape[:-1]) * value.shape[-1], 0)
     elif name == "cat":
-        seen.tally.concat(concatenates=True)
+        seen.tally.add_concat(concatenates=True)
 
 
 def _weights(torch: Any, tensor: Any) -> int:

@@ -23,10 +23,10 @@ CompletionItem: Any = importlib.import_module(f"{_CLICK}.shell_completion").Comp
 
 def profiles(incomplete: str) -> list[str]:
     """Return names of profiles, or YAML files and folders."""
-    from vlatool.hardware.profile import SUFFIXES, names
+    from vlatool.hardware.profile import SUFFIXES, profile_names
 
     files = _paths(incomplete, lambda path: path.endswith(tuple(SUFFIXES))) if os.sep in incomplete else []
-    return [*_starting(names(), incomplete), *files]
+    return [*_starting(profile_names(), incomplete), *files]
 
 
 def platforms(incomplete: str) -> list[str]:

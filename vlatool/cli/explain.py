@@ -32,10 +32,10 @@ def explain(
 ) -> None:
     """Show which layers cost the accuracy, where the time goes, what fell back, and what to do about it."""
     from vlatool.explain import Options
-    from vlatool.explain.apart import explain_apart
+    from vlatool.explain.child_process import explain_in_child
 
     refuse_existing(output, force, bundle, baseline, data)
     with progress() as context:
         options = Options(baseline, data, samples, threads=threads, suggest=suggest, seconds=seconds)
-        report = explain_apart(Bundle.open(bundle), options, context)
+        report = explain_in_child(Bundle.open(bundle), options, context)
     show(report, as_json=as_json, out=output, force=force)

@@ -154,7 +154,7 @@ def score(
 ) -> None:
     """Predict every row of a file of published latencies, and print error and interval coverage."""
     from vlatool.latency_model.refit import refit_points
-    from vlatool.latency_model.score import lines, score_points
+    from vlatool.latency_model.score import score_points, summary_lines
 
     if refit is None:
         found = score_points(points, held_out, seed)
@@ -168,7 +168,7 @@ def score(
         document(found)
         return
     for table in tables:
-        for line in lines(table):
+        for line in summary_lines(table):
             typer.echo(line)
 
 

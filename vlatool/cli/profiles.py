@@ -21,9 +21,9 @@ app = typer.Typer(
 @app.command("list")
 def list_profiles(as_json: AsJson = False) -> None:
     """List the profiles."""
-    from vlatool.hardware.profile import load_profile, names
+    from vlatool.hardware.profile import load_profile, profile_names
 
-    profiles = [load_profile(name) for name in names()]
+    profiles = [load_profile(name) for name in profile_names()]
     if as_json:
         document([profile.model_dump(mode="json") for profile in profiles])
         return
@@ -147,17 +147,17 @@ def calibrate_profile(
     from vlatool.bundle.bundle import Bundle
     from vlatool.graph.workload import workload
     from vlatool.hardware.profile import load_profile
-    from vlatool.latency_model.measured import calibrations, elsewhere, measured_in, store
+    from vlatool.latency_model.board_measurements import calibrations, foreign_host, report_measurements, store
 
     load = workload(Bundle.open(bundle)) if bundle else None
     profile = load_profile(name)
-    measured = measured_in(report, profile, mode, load)
+    measured = report_measurements(report, profile, mode, load)
     file = store(measured)
     if as_json:
         document({"kept_in": str(file), "measured": [asdict(point) for point in measured]})
     for point in [] if as_json else measured:
         typer.echo(f"{point.profile}, {point.mode}, {point.engine}, {point.precision}: {point.ms:.4g} ms measured")
-    if made_on := elsewhere(report, profile):
+    if made_on := foreign_host(report, profile):
         typer.echo(f"warning: the report was made on {made_on}, which {name} does not name in model_strings", err=True)
     if not as_json:
         typer.echo(f"kept in {file}; remove the file to forget it, or set VLATOOL_CALIBRATIONS (now {calibrations()})")

@@ -15,7 +15,7 @@ from vlatool.errors import DataError, UsageError
 from vlatool.files.messages import to_json
 
 if TYPE_CHECKING:
-    from vlatool.telemetry import Recorded
+    from vlatool.telemetry import Summary
 
 LONGEST_S = 86_400.0
 
@@ -46,7 +46,7 @@ def telemetry(
         typer.echo(line)
 
 
-def lines(recorded: Recorded) -> Iterator[str]:
+def lines(recorded: Summary) -> Iterator[str]:
     """Return what a person reads: energy first, then every reading, then what is unmeasured and why."""
     for energy in recorded.energy:
         power = f"{energy.mean_w:.3g} W, {energy.joules:.3g} J in {energy.seconds:.1f} s"

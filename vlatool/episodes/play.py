@@ -33,7 +33,7 @@ from vlatool.errors import DataError, require
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
 from vlatool.module.factory import call_factory
-from vlatool.motion.measure import measured
+from vlatool.motion.measure import measure_episode
 from vlatool.runtime.control import build_controller
 from vlatool.runtime.interface import Array, Controller
 from vlatool.runtime.policy import FIRST_RUN_S, BundlePolicy
@@ -285,7 +285,7 @@ def _episode(
                 track = body.track()
                 series = series_of(track, spec.action) if job.show else {}
                 won = success.at_the_end(task, seed)
-                return Outcome(task, seed, won, step, instruction, measured(track), body.refused, series, start)
+                return Outcome(task, seed, won, step, instruction, measure_episode(track), body.refused, series, start)
         raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.",
                         "let step() return truncated=True after as many steps as an episode may take")  # fmt: skip
 

@@ -11,7 +11,7 @@ from vlatool.measures import series
 from vlatool.measures.success import SUCCESS_DROP
 from vlatool.report import Row
 from vlatool.stage.base import Context
-from vlatool.stats.starts import distinct, independent, too_few
+from vlatool.stats.starts import distinct_starts, has_too_few_starts, independent_starts
 from vlatool.stats.success_sequential import GO_ON, Decision, plan
 
 Play = Callable[[list[EpisodesJob]], list[Outcome]]
@@ -47,8 +47,8 @@ def played_until(
         lost = sum(one.success and not two.success for one, two in pairs)
         won = sum(two.success and not one.success for one, two in pairs)
         starts = [outcome.begins for outcome in theirs]
-        decision = comparison.judge(lost, won, after, independent(starts))
-        if too_few(starts) and decision.verdict in ("pass", "fail"):
+        decision = comparison.judge(lost, won, after, independent_starts(starts))
+        if has_too_few_starts(starts) and decision.verdict in ("pass", "fail"):
             decision = replace(decision, verdict=GO_ON if after < comparison.most else "inconclusive")
         context.progress(f"{after} pairs: {told(decision)}", after / comparison.most)
         if decision.over:
@@ -70,7 +70,7 @@ def told(decision: Decision) -> str:
 def with_decision(row: Row, decision: Decision) -> Row:
     """Return the row with the interval of its drop that holds over all interim analyses."""
     note = f"paired: {decision.lost} lost, {decision.won} won of {decision.pairs} episodes, {decision.most} at most"
-    note += f"; {distinct(row.raw[series.START])} distinct starts"
+    note += f"; {distinct_starts(row.raw[series.START])} distinct starts"
     low, high = decision.low, decision.high
     drop = SUCCESS_DROP.measurement(decision.drop, samples=decision.pairs, low=low, high=high, note=note)
     return replace(row, measurements=tuple(drop if item.name == drop.name else item for item in row.measurements))

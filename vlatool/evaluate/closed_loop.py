@@ -39,7 +39,7 @@ from vlatool.report import Report, Row
 from vlatool.runtime.control import layers
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.cache import STREAMS
-from vlatool.stats.starts import distinct
+from vlatool.stats.starts import distinct_starts
 from vlatool.user_code import trust
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ class ClosedLoop(Measure):
         how += f" with the controller {','.join(self.controller)}" if self.controller else ""
         text = f"{row.value(SUCCESS):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
-        decided = (sentence(decision, distinct(row.raw[series.START])),) if decision else ()
+        decided = (sentence(decision, distinct_starts(row.raw[series.START])),) if decision else ()
         summary = (*believed.sentences, *decided, text, *told(rows, self.board), *again.sentences)
         doubts = (*repeated_starts(row), *seen_in_training(bundles, jobs), *found_wrong(source))
         warnings = (*believed.warnings, *doubts, *again.warnings, *dict.fromkeys(context.notes))

@@ -1,4 +1,4 @@
-"""Why a bundle is as accurate and as fast as it is: the layers, the operators, the limit, and what to do about it."""
+"""Explanation of a bundle's accuracy and speed: layers, operators, the limit, and how to improve it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.errors import VlatoolError
 from vlatool.explain import _tables as tables
-from vlatool.explain._bfloat16 import Phases, phase_sentences, phases
-from vlatool.explain._islands import Fallback, Island, QuantizedGraph, fallbacks, timed
+from vlatool.explain._bfloat16 import Phases, measure_phases, phase_sentences
+from vlatool.explain._candidates import measure, plan_candidates
+from vlatool.explain._float_roundtrips import Fallback, QuantizedGraph, RoundTrip, fallbacks, with_times
 from vlatool.explain._operators import Operator, profile, reference_engine, table
 from vlatool.explain._origin import (
     Observations,
@@ -25,7 +26,6 @@ from vlatool.explain._origin import (
     origin,
     sensitivity_stage,
 )
-from vlatool.explain._remedy import measure, plans
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.workload import workload
 from vlatool.machine.host import before_run
@@ -42,16 +42,16 @@ __all__ = ["Options", "explain", "explanation"]
 
 @dataclass(frozen=True)
 class Options:
-    """What an explanation is made of.
+    """Options of an explanation.
 
     Args:
-        baseline: The float32 bundle; looked for in the cache when None.
-        data: Recorded observations that errors are taken on; the bundle's own when None.
-        samples: Observations at most.
-        runs: Inferences that the operators are timed over.
-        threads: Intra-op threads.
-        suggest: Make and measure candidates.
-        seconds: The layers are measured on fewer observations when all would take longer.
+        baseline: The float32 bundle; searched in the cache when None.
+        data: Recorded observations for the errors; the bundle's own when None.
+        samples: Largest number of observations.
+        runs: Number of profiled inferences.
+        threads: Number of intra-op threads.
+        suggest: Whether to build and measure candidates.
+        seconds: Time limit for measuring the layers, which reduces the number of observations.
     """
 
     baseline: Path | None = None
@@ -65,25 +65,25 @@ class Options:
 
 @dataclass
 class _Findings:
-    """What was found out about a bundle."""
+    """Findings about a bundle."""
 
     bundle: Bundle
     baseline: Bundle | None
-    made: Origin
-    seen: Observations
+    origin: Origin
+    observations: Observations
     layers: list[LayerError] = field(default_factory=list)
     operators: list[Operator] = field(default_factory=list)
-    before: list[Operator] = field(default_factory=list)
-    islands: list[Island] = field(default_factory=list)
+    float_operators: list[Operator] = field(default_factory=list)
+    round_trips: list[RoundTrip] = field(default_factory=list)
     pairs: tuple[int, int] = (0, 0)
-    fallen: list[Fallback] = field(default_factory=list)
+    fallbacks: list[Fallback] = field(default_factory=list)
     reach: dict[str, float] = field(default_factory=dict)
     phases: list[Phases] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     @property
     def source(self) -> str:
-        """The float32 bundle as it is written in a command."""
+        """The float32 bundle as an argument of a command."""
         return str(self.baseline.path) if self.baseline is not None else "FLOAT_BUNDLE"
 
 
@@ -100,22 +100,25 @@ def explain(bundle: Bundle, options: Options, context: Context) -> Report:
     findings = _find(bundle, options, context)
     with scratch_directory() as scratch:
         engine = bundle.manifest.engine or DEFAULT_ENGINE
-        suggests = options.suggest and findings.baseline is not None and findings.seen.recorded
-        tried = plans(findings.made.stage, findings.layers, findings.fallen, engine) if suggests else []
-        values = findings.seen.values
-        contest = measure(bundle, findings.baseline, tried, values, scratch, options.threads, context)
-        sentences = _sentences(findings, contest.speed)
-        sentences[1:1] = tables.suggestion(contest, findings.source)
-        sentences += tables.trial_sentences(contest, findings.layers)
+        candidates = []
+        if options.suggest and findings.baseline is not None and findings.observations.recorded:
+            candidates = plan_candidates(findings.origin.stage, findings.layers, findings.fallbacks, engine)
+        values = findings.observations.values
+        comparison = measure(bundle, findings.baseline, candidates, values, scratch, options.threads, context)
+        sentences = _sentences(findings, comparison.speed)
+        sentences[1:1] = tables.suggestion(comparison, findings.source)
+        sentences += tables.trial_sentences(comparison, findings.layers)
         findings.warnings += [
-            f"the candidate '{candidate.name}' failed: {candidate.failed}" for candidate in tried if candidate.failed
+            f"the candidate '{candidate.name}' failed: {candidate.failed}"
+            for candidate in candidates
+            if candidate.failed
         ]
         details = _details(findings)
         rows: list[Row] = []
-        for candidate in (contest.baseline, contest.now, *contest.others):
+        for candidate in (comparison.baseline, comparison.current, *comparison.others):
             if candidate is not None:
-                own = details if candidate is contest.now else {}
-                rows.append(tables.candidate_row(candidate, contest, own, findings.source))
+                own = details if candidate is comparison.current else {}
+                rows.append(tables.candidate_row(candidate, comparison, own, findings.source))
     name = str(bundle.manifest.made_by.get("stage", "")).rpartition(".")[2]
     rows = [replace(row, name=name or row.name) if row.name == "as it is" else row for row in rows]
     title = f"Why {bundle.manifest.name} ({name or 'as it is'}) is as accurate and as fast as it is"
@@ -140,15 +143,15 @@ def explanation(
     runs: int = 10,
     seconds: float = 60.0,
 ) -> tuple[str, ...]:
-    """Return the explanation as a few sentences, for another report. What cannot be found out is left out.
+    """Return the explanation as a few sentences, for another report, without what cannot be determined.
 
     Args:
-        bundle: What is explained.
+        bundle: Bundle to explain.
         baseline: The float32 bundle that it was made from.
-        context: For progress.
-        samples: Observations that the layers are measured on.
-        runs: Inferences that the operators are timed over.
-        seconds: The layers are measured on fewer observations when all would take longer, on one at least.
+        context: Receiver of progress.
+        samples: Number of observations for measuring the layers.
+        runs: Number of profiled inferences.
+        seconds: Time limit for measuring the layers, which reduces the number of observations, down to one.
     """
     try:
         options = Options(baseline.path if baseline is not None else None, samples=samples, runs=runs, seconds=seconds)
@@ -162,22 +165,20 @@ def _find(bundle: Bundle, options: Options, context: Context) -> _Findings:
         raise no_graph_error(bundle, "explain")
     quantization = origin(bundle)
     baseline = find_baseline(bundle, quantization, options.baseline)
-    seen = observations_of(bundle, baseline, options.data, options.samples)
-    findings = _Findings(bundle, baseline, quantization, seen, warnings=list(quantization.notes))
-    if not seen.recorded:
-        findings.warnings.append(
-            "there are no recorded observations: the layers' errors are not measured (--data FILE)"
-        )
+    observations = observations_of(bundle, baseline, options.data, options.samples)
+    findings = _Findings(bundle, baseline, quantization, observations, warnings=list(quantization.notes))
+    if not observations.recorded:
+        findings.warnings.append("without recorded observations the layers' errors are not measured (--data FILE)")
     _layers(findings, options.seconds, context)
     _times(findings, options, context)
-    findings.phases = phases(bundle, baseline, seen.values, context)
+    findings.phases = measure_phases(bundle, baseline, observations.values, context)
     return findings
 
 
 def _layers(findings: _Findings, seconds: float, context: Context) -> None:
-    """Measure each layer alone in int8."""
-    stage = sensitivity_stage(findings.made.stage)
-    if stage is None or not findings.seen.recorded:
+    """Measure each layer in int8 by itself."""
+    stage = sensitivity_stage(findings.origin.stage)
+    if stage is None or not findings.observations.recorded:
         return
     if findings.baseline is None:
         findings.warnings.append(
@@ -186,18 +187,18 @@ def _layers(findings: _Findings, seconds: float, context: Context) -> None:
         )
         return
     try:
-        static = isinstance(findings.made.stage, StaticInt8)
+        static = isinstance(findings.origin.stage, StaticInt8)
         ranges = ranges_of(findings.baseline, stage, context) if static else {}
         findings.layers = sensitivities(
-            findings.baseline, stage, ranges, findings.seen.values, context, seconds=seconds
+            findings.baseline, stage, ranges, findings.observations.values, context, seconds=seconds
         )
     except VlatoolError as error:
         findings.warnings.append(f"the layers could not be measured: {error.message} {error.fix}".strip())
 
 
 def _times(findings: _Findings, options: Options, context: Context) -> None:
-    """Profile the bundle and the float32 one, and look at the quantized graphs."""
-    values = findings.seen.values
+    """Profile the bundle and the float32 one, and examine the quantized graphs."""
+    values = findings.observations.values
     context.progress("profiling the operators", None)
     findings.operators = profile(findings.bundle, values, options.runs, options.threads)
     engine = findings.bundle.manifest.engine or DEFAULT_ENGINE
@@ -205,44 +206,44 @@ def _times(findings: _Findings, options: Options, context: Context) -> None:
     if findings.baseline is not None:
         context.progress("profiling the operators of float32", None)
         compared = reference_engine(findings.bundle)
-        findings.before = profile(findings.baseline, values, options.runs, options.threads, compared)
+        findings.float_operators = profile(findings.baseline, values, options.runs, options.threads, compared)
     engine = findings.bundle.manifest.engine or DEFAULT_ENGINE
     for name, graph in findings.bundle.manifest.graphs.items():
         seen = QuantizedGraph(name, findings.bundle.file(graph.file))
-        findings.islands += seen.islands()
+        findings.round_trips += seen.round_trips()
         findings.pairs = tuple(a + b for a, b in zip(findings.pairs, seen.pairs(), strict=True))  # type: ignore[assignment]
-        findings.fallen += fallbacks(seen, findings.operators, engine)
-    findings.islands = timed(findings.islands, findings.operators)
+        findings.fallbacks += fallbacks(seen, findings.operators, engine)
+    findings.round_trips = with_times(findings.round_trips, findings.operators)
 
 
 def _sentences(findings: _Findings, speed: float = math.nan) -> list[str]:
-    """Return the findings, what matters most first."""
+    """Return the findings as sentences, the most important first."""
     again = (
-        command(findings.made.stage, findings.source)
-        if findings.made.stage is not None
+        command(findings.origin.stage, findings.source)
+        if findings.origin.stage is not None
         else "see vlatool quantize --help"
     )
     about_phases = [
         *(finding["message"] for finding in findings.bundle.manifest.findings),
         *phase_sentences(findings.phases, again),
     ]
-    ruined = len(findings.bundle.manifest.findings) + sum(bool(finding.nodes) for finding in findings.phases)
-    sentences = about_phases[:ruined]
+    damaged = len(findings.bundle.manifest.findings) + sum(bool(finding.nodes) for finding in findings.phases)
+    sentences = about_phases[:damaged]
     if findings.layers:
         sentences.append(tables.layers_sentence(findings.layers))
     sentences.append(tables.time_sentence(findings.operators))
-    if findings.fallen or findings.pairs[0]:
-        sentences.append(tables.fallbacks_sentence(findings.fallen, findings.operators))
+    if findings.fallbacks or findings.pairs[0]:
+        sentences.append(tables.fallbacks_sentence(findings.fallbacks, findings.operators))
     if findings.pairs[0]:
-        sentences.append(tables.islands_sentence(findings.islands, findings.pairs, findings.operators))
+        sentences.append(tables.round_trips_sentence(findings.round_trips, findings.pairs, findings.operators))
     macs = _macs(findings.bundle)
-    sentences += tables.limit_sentences(findings.operators, findings.before, macs, speed)
+    sentences += tables.limit_sentences(findings.operators, findings.float_operators, macs, speed)
     sentences += tables.reach_sentence(findings.operators, macs, findings.reach)
-    return sentences + about_phases[ruined:]
+    return sentences + about_phases[damaged:]
 
 
 def _macs(bundle: Bundle) -> dict[str, int]:
-    """Return precision -> multiply-accumulates of one inference, as the graphs are computed."""
+    """Return effective precision -> multiply-accumulates of one inference."""
     counted = workload(bundle)
     macs: Counter[str] = Counter()
     for name, graph in counted.graphs.items():
@@ -253,16 +254,16 @@ def _macs(bundle: Bundle) -> dict[str, int]:
 
 
 def _details(findings: _Findings) -> Mapping[str, Sequence[Mapping[str, Any]]]:
-    """Return the tables that belong to the bundle."""
+    """Return the tables of the bundle."""
     action = findings.bundle.manifest.spec.action
     units = dict(zip(action.labels, action.units(), strict=False))
     several = len({layer.graph for layer in findings.layers}) > 1
-    every = {
+    tables_by_title = {
         "Layers that cost the accuracy, each alone in int8": tables.layers_table(findings.layers, several),
         "What the worst layers do to the action": tables.elements_table(findings.layers, units),
         "Time by what it is computed in": tables.precision_table(findings.operators),
         "Time by operator": table(findings.operators),
-        "Layers that fell back": tables.fallbacks_table(findings.fallen),
-        "Round trips through float": tables.islands_table(findings.islands),
+        "Layers that fell back": tables.fallbacks_table(findings.fallbacks),
+        "Round trips through float": tables.round_trips_table(findings.round_trips),
     }
-    return {title: rows for title, rows in every.items() if rows}
+    return {title: rows for title, rows in tables_by_title.items() if rows}

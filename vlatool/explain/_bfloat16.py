@@ -1,4 +1,4 @@
-"""Why some phases of a bfloat16 bundle are computed in float32, and what it costs a bundle that lacks the cut."""
+"""Effect of bfloat16 on phases: measured with the phases in bfloat16 and in float32."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.explain._operators import raw_actions
 from vlatool.files.scratch import scratch_directory
-from vlatool.graph.files import load, part_phases, save
-from vlatool.graph.phase import cut_phases, periodic
+from vlatool.graph.files import load, save, split_phases
+from vlatool.graph.phase import cut_phases, periodic_nodes
 from vlatool.runtime.engine import computing, engine_class
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program, Session
@@ -28,15 +28,15 @@ REASON = (
 
 @dataclass(frozen=True)
 class Phases:
-    """What bfloat16 does to the phases of one graph.
+    """Effect of bfloat16 on the phases of one graph.
 
     Args:
         graph: Name of the graph.
-        kept: Name of the float32 graph that its phases were moved to; empty when they were not.
+        kept: Name of the float32 graph that its phases were moved to; empty when they were not moved.
         nodes: Names of its Sin and Cos that depend on an input and are computed in bfloat16.
-        error: Relative error of the actions to float32 with the phases in bfloat16; NaN when it was not measured.
-        cut: The same with the phases in float32; NaN when it was not measured.
-        note: Why it was not cut or not measured.
+        error: Relative error of the actions to float32 with the phases in bfloat16; NaN when not measured.
+        cut: The same with the phases in float32; NaN when not measured.
+        note: Reason why it was not cut or not measured.
     """
 
     graph: str
@@ -47,38 +47,39 @@ class Phases:
     note: str = ""
 
 
-def phases(
+def measure_phases(
     bundle: Bundle, baseline: Bundle | None, observations: Sequence[Mapping[str, Any]], context: Context
 ) -> list[Phases]:
-    """Return what is known of each graph of a bundle that computes in bfloat16.
+    """Return the effect on each graph of a bundle that computes in bfloat16.
 
     Args:
-        bundle: What is explained.
-        baseline: The float32 bundle, to measure what the bundle would be without its cuts.
+        bundle: Bundle to explain.
+        baseline: The float32 bundle, to measure the bundle without its cuts.
         observations: Raw observations.
-        context: For progress.
+        context: Receiver of progress.
     """
-    known = []
+    effects = []
     graphs = bundle.manifest.graphs
     for name, graph in graphs.items():
         if graph.compute != "bfloat16":
             continue
         kept = f"{name}_phases" if f"{name}_phases" in graphs else ""
-        nodes = tuple(node.name for node in periodic(load(bundle.file(graph.file))))
+        nodes = tuple(node.name for node in periodic_nodes(load(bundle.file(graph.file))))
         state = Phases(name, kept, nodes)
         if nodes:
-            known.append(_measured(bundle, state, observations, context))
+            effects.append(_with_cut(bundle, state, observations, context))
         elif kept:
             whole = set(graph.precision) <= {"bfloat16", "float32"}  # else int8 errors would be mixed in
-            known.append(_without(bundle, baseline, state, observations, context) if baseline and whole else state)
-    return known
+            base = baseline if whole else None
+            effects.append(_without_cut(bundle, base, state, observations, context) if base else state)
+    return effects
 
 
-def _without(
+def _without_cut(
     bundle: Bundle, baseline: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context
 ) -> Phases:
     """Run float32, the bundle with its cut, and the whole float32 graph in bfloat16."""
-    context.progress(f"measuring what the phases of {phase.graph} would be in bfloat16", None)
+    context.progress(f"measuring the phases of {phase.graph} in bfloat16", None)
     graphs = baseline.manifest.graphs
     try:
         plain = _actions(baseline, {}, observations, dict.fromkeys(graphs, ""))
@@ -90,9 +91,9 @@ def _without(
     return replace(phase, error=_error(uncut, plain), cut=_error(cut, plain))
 
 
-def _measured(bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context) -> Phases:
-    """Run float32, the bundle as it is, and the bundle with the cut."""
-    context.progress(f"measuring what bfloat16 does to the phases of {phase.graph}", None)
+def _with_cut(bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context) -> Phases:
+    """Run float32, the bundle itself, and the bundle with the cut."""
+    context.progress(f"measuring the effect of bfloat16 on the phases of {phase.graph}", None)
     manifest = bundle.manifest
     note = ""
     with scratch_directory() as scratch:
@@ -100,15 +101,15 @@ def _measured(bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str,
         model = load(bundle.file(manifest.graphs[phase.graph].file))
         save(model, path)
         if cut_phases(model) is None:
-            note = "the network itself computes the phase, so that it cannot be cut out"
-        program, parted = part_phases(manifest.program, phase.graph, path)
-        if not parted:
-            note = note or "the graph runs in a loop, which a program cannot share between two graphs"
+            note = "the network itself computes the phase, so it cannot be cut out"
+        program, phase_graphs = split_phases(manifest.program, phase.graph, path)
+        if not phase_graphs:
+            note = note or "the graph runs in a loop, which a program cannot split between two graphs"
         try:
             plain = _actions(bundle, {}, observations, dict.fromkeys(manifest.graphs, ""))
             now = _actions(bundle, {}, observations, {})
-            replaced = {phase.graph: path, **{name: path.with_name(f"{name}.onnx") for name in parted}}
-            cut = _actions(bundle, replaced, observations, {}, program) if parted else []
+            replaced = {phase.graph: path, **{name: path.with_name(f"{name}.onnx") for name in phase_graphs}}
+            cut = _actions(bundle, replaced, observations, {}, program) if phase_graphs else []
         except VlatoolError as error:
             return replace(phase, note=f"not measured: {error.message}")
     return replace(phase, error=_error(now, plain), cut=_error(cut, plain) if cut else float("nan"), note=note)
@@ -135,30 +136,30 @@ def _actions(
     return raw_actions(policy, observations)
 
 
-def _error(got: Sequence[Any], wanted: Sequence[Any]) -> float:
-    return float(np.mean([relative_error(*pair) for pair in zip(got, wanted, strict=True)]))
+def _error(got: Sequence[Any], reference: Sequence[Any]) -> float:
+    return float(np.mean([relative_error(*pair) for pair in zip(got, reference, strict=True)]))
 
 
-def phase_sentences(known: Sequence[Phases], again: str) -> list[str]:
+def phase_sentences(effects: Sequence[Phases], again: str) -> list[str]:
     """Return the sentences for a reader, the bad news first.
 
     Args:
-        known: From ``phases``.
-        again: The command that makes the bundle again.
+        effects: From ``measure_phases``.
+        again: Command that makes the bundle again.
     """
     sentences = []
-    for phase in sorted(known, key=lambda item: not item.nodes):
+    for phase in sorted(effects, key=lambda item: not item.nodes):
         if phase.kept:
             text = f"The phases of {phase.graph} stay in float32, in the graph {phase.kept}: {REASON}."
             if not phase.nodes and phase.error == phase.error:
                 text += f" Measured: relative error {phase.cut:.3g}; it would be {phase.error:.3g} all in bfloat16."
             sentences.append(text)
         if phase.nodes:
-            sentences.append(_ruined(phase, again))
+            sentences.append(_damage_sentence(phase, again))
     return sentences
 
 
-def _ruined(phase: Phases, again: str) -> str:
+def _damage_sentence(phase: Phases, again: str) -> str:
     nodes = ", ".join(phase.nodes[:3]) + (f" and {len(phase.nodes) - 3} more" if len(phase.nodes) > 3 else "")
     text = f"{phase.graph} computes {nodes} of its inputs in bfloat16, which ruins such phases: {REASON}."
     if phase.error == phase.error:

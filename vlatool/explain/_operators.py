@@ -1,4 +1,4 @@
-"""Where the time of an inference goes: the engine's own profile, operator by operator."""
+"""Profile of an inference by the engine, operator by operator."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Operator:
 
     Args:
         graph: Name of the graph.
-        name: Name that the engine gives the node, often that of the layer.
-        kind: Operator type of the engine.
+        name: The engine's name of the node, often that of the layer.
+        kind: The engine's operator type.
         precision: One of ``GROUPS``, or another dtype.
-        kernel: What the engine says of its kernel (OpenVINO), or the dtypes of its inputs (ONNX Runtime).
+        kernel: The engine's description of its kernel (OpenVINO), or the dtypes of its inputs (ONNX Runtime).
         calls: Runs in one inference.
         ms: Time of all its runs in one inference, median over the inferences.
     """
@@ -57,7 +57,7 @@ class Operator:
 
     @property
     def node(self) -> Node:
-        """As the engine's profile has it."""
+        """Key of the node in the engine's profile."""
         return self.name, self.kind, self.kernel
 
     @property
@@ -72,17 +72,17 @@ def profile(
     """Run a bundle with the engine's profiler on.
 
     Args:
-        bundle: What is profiled.
-        observations: Raw observations, taken in turn.
-        runs: Inferences that count; three before them do not.
-        threads: Intra-op threads.
-        engine: The bundle's own when empty.
+        bundle: Bundle to profile.
+        observations: Raw observations, used in turn.
+        runs: Number of inferences after three warm-up inferences.
+        threads: Number of intra-op threads.
+        engine: Engine to profile; the bundle's own when empty.
 
     Returns:
         Every operator that ran, the slowest first.
 
     Raises:
-        GraphError: when the engine has no profiler here, or fails.
+        GraphError: when the engine has no profiler on this machine, or fails.
     """
     engine = engine or bundle.manifest.engine or DEFAULT_ENGINE
     library: type[Engine] = engine_class(engine)
@@ -106,9 +106,9 @@ def profile(
 
 
 def raw_actions(policy: Policy, observations: Iterable[Mapping[str, Any]]) -> list[Any]:
-    """Return the raw action of each observation, each an episode of its own.
+    """Return the raw action of each observation, each as a separate episode.
 
-    A policy that keeps values is given what was recorded before each in its episode, too.
+    A policy that keeps values also gets the earlier observations of each episode.
     """
     moments: Iterable[Moment]
     if policy.program.keeps and isinstance(observations, Observations):
@@ -125,9 +125,9 @@ def raw_actions(policy: Policy, observations: Iterable[Mapping[str, Any]]) -> li
 
 
 def reference_engine(bundle: Bundle) -> str:
-    """Return the engine that float32 runs in when a bundle is compared with it; empty for float32's own.
+    """Return the engine of float32 in a comparison with a bundle; empty for its own.
 
-    Where OpenVINO is confined to an instruction set, a ratio to ONNX Runtime, which cannot be, is one of two sets.
+    Where OpenVINO is confined to an instruction set, a ratio to ONNX Runtime, which cannot be, would mix two sets.
     """
     engine = bundle.manifest.engine or DEFAULT_ENGINE
     return engine if onednn_max_cpu_isa() and engine_class(engine).confined else ""

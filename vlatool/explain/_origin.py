@@ -1,4 +1,4 @@
-"""Which stage lowered the precision of a bundle, from which bundle, and what to run both on."""
+"""The quantization that made a bundle, its float32 baseline, and observations to run both on."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Origin:
     """The quantization that made a bundle.
 
     Args:
-        stage: The stage with the options that it had; None when the bundle was not quantized.
+        stage: The stage with its options; None when the bundle was not quantized.
         inputs: Hashes of bundles that it may have started from, the likeliest first.
-        notes: What of its options could not be taken over.
+        notes: Notes on options that could not be adopted.
     """
 
     stage: Stage | None = None
@@ -43,12 +43,12 @@ class Origin:
 
 @dataclass(frozen=True)
 class Observations:
-    """What the bundles are run on.
+    """Observations to run the bundles on.
 
     Args:
         values: Raw observations.
-        words: Where they are from.
-        recorded: Whether they are recorded, so that errors on them mean something.
+        words: Description of their source.
+        recorded: Whether they are recorded, so that errors on them are meaningful.
     """
 
     values: Sequence[dict[str, Any]] = ()
@@ -70,13 +70,13 @@ def origin(bundle: Bundle) -> Origin:
 
 
 def _stage(name: str, options: Mapping[str, Any]) -> tuple[Stage | None, tuple[str, ...]]:
-    """Return the stage, without the options that name files of another time and place."""
+    """Return the stage, without options that name files."""
     try:
         kind = stage_class(name)
     except VlatoolError:
-        return None, (f"this vlatool knows no stage {name}",)
+        return None, (f"this vlatool does not know the stage {name}",)
     kept = {key: value for key, value in options.items() if key in kind.model_fields and key != "calibration"}
-    notes = tuple(f"the option {key}: {value} was not taken over" for key, value in options.items() if key not in kept)
+    notes = tuple(f"the option {key}: {value} was not adopted" for key, value in options.items() if key not in kept)
     try:
         return stage_from(kind, kept, name), notes
     except VlatoolError as error:
@@ -84,18 +84,18 @@ def _stage(name: str, options: Mapping[str, Any]) -> tuple[Stage | None, tuple[s
 
 
 def find_baseline(bundle: Bundle, quantization: Origin, path: Path | None) -> Bundle | None:
-    """Return the float32 bundle that a bundle was quantized from: the one given, else one in the cache.
+    """Return the float32 bundle that a bundle was quantized from: the given one, or one in the cache.
 
     Raises:
-        BundleError: when the given one is damaged, is another policy's, or is quantized.
+        BundleError: when the given one is damaged, belongs to another policy, or is quantized.
     """
     if path is None:
-        return _cached(quantization.inputs)
+        return _cached_bundle(quantization.inputs)
     baseline = Bundle.open(path)
     missing = [name for name in bundle.manifest.graphs if name not in baseline.manifest.graphs and not _phases(name)]
     kinds = sorted({kind for graph in baseline.manifest.graphs.values() for kind in graph.precision} - {*FLOATS})
     if missing or kinds or baseline.manifest.spec != bundle.manifest.spec:
-        what = f"it has no graph '{missing[0]}'" if missing else "its inputs or outputs are others"
+        what = f"it has no graph '{missing[0]}'" if missing else "its inputs or outputs differ"
         what = f"it is quantized itself ({', '.join(kinds)})" if kinds else what
         raise BundleError(
             f"{path} is not what {bundle.path} was made from: {what}.",
@@ -108,8 +108,8 @@ def _phases(name: str) -> bool:
     return name.endswith("_phases")
 
 
-def _cached(hashes: tuple[str, ...]) -> Bundle | None:
-    """Return the bundle of the cache whose hash is one of those."""
+def _cached_bundle(hashes: tuple[str, ...]) -> Bundle | None:
+    """Return a bundle in the cache with one of the hashes."""
     for path in sorted((cache_directory() / "stages").glob(f"*/{MANIFEST}")):
         if "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest() in hashes:
             try:
@@ -122,7 +122,7 @@ def _cached(hashes: tuple[str, ...]) -> Bundle | None:
 
 
 def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, count: int) -> Observations:
-    """Return observations that calibration has not seen, where there are any.
+    """Return observations, preferably ones that calibration has not used.
 
     Raises:
         DataError: when the given data does not fit the policy.
@@ -141,7 +141,7 @@ def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, 
 
 
 def sensitivity_stage(stage: Stage | None) -> StaticInt8 | None:
-    """Return the stage that names the layers of an int8 stage; None when it is none."""
+    """Return the static stage with the layers of an int8 stage; None for other stages."""
     if isinstance(stage, StaticInt8):
         return stage
     if isinstance(stage, DynamicInt8):

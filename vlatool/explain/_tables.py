@@ -1,4 +1,4 @@
-"""Rows of a report and sentences, made of what was found."""
+"""Rows and sentences of the report."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from vlatool.explain._islands import Fallback, Island
+from vlatool.explain._candidates import Candidate, Comparison
+from vlatool.explain._float_roundtrips import Fallback, RoundTrip
 from vlatool.explain._operators import GROUPS, Operator, shares
 from vlatool.explain._origin import command
-from vlatool.explain._remedy import Candidate, Contest
 from vlatool.machine.host import isa
 from vlatool.machine.instruction_sets import saturates
 from vlatool.measurement.interleaved import latency_measurements, speedup
@@ -20,22 +20,22 @@ from vlatool.measures.actions import RAW_RELATIVE_ERROR
 from vlatool.report import Row
 from vlatool.sensitivity.layers import LayerError
 
-MOST = 10
-MOST_ELEMENTS = 12
-"""Of a longer action those are shown that the worst layer moves most."""
-OTHERS = 6
-"""Kinds of operators that are named beside products."""
-FASTER = 4.0
-"""What int8 does with one instruction of the same width that float32 does with four."""
-FASTER_IN_PAIRS = 2.0
-"""The same without VNNI: three instructions do what float32 does with six."""
+MAX_ROWS = 10
+MAX_ELEMENTS = 12
+"""Largest number of elements in a table: of a longer action, those that the worst layer changes most."""
+MAX_OTHERS = 6
+"""Largest number of operator types in a sentence, besides products."""
+INT8_SPEEDUP = 4.0
+"""Float32 instructions that one int8 instruction of the same width replaces."""
+INT8_SPEEDUP_IN_PAIRS = 2.0
+"""The same without VNNI: three instructions replace six of float32."""
 
 
 def layers_table(layers: Sequence[LayerError], several: bool) -> list[dict[str, Any]]:
     """Return the ten worst layers: error, largest error of an element, flips, jump, share of the MACs."""
     rows = []
     names = short_names(layers)
-    for layer in layers[:MOST]:
+    for layer in layers[:MAX_ROWS]:
         name = names[layer.name]
         row: dict[str, Any] = {"layer": f"{layer.graph}: {name}" if several else name}
         row |= {"error %": round(100 * layer.error, 3), "flips %": round(100 * layer.flips, 1)}
@@ -55,12 +55,12 @@ def short_names(layers: Sequence[LayerError]) -> dict[str, str]:
 
 
 def elements_table(layers: Sequence[LayerError], units: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return what the three worst layers do to each element of the action, in its unit."""
+    """Return the effect of the three worst layers on each element of the action, in its unit."""
     worst = [layer for layer in layers[:3] if layer.elements]
     names = short_names(layers)
     rows: list[dict[str, Any]] = []
     labels = list(worst[0].elements) if worst else []
-    largest = sorted(labels, key=lambda label: -worst[0].elements[label])[:MOST_ELEMENTS]
+    largest = sorted(labels, key=lambda label: -worst[0].elements[label])[:MAX_ELEMENTS]
     for label in (label for label in labels if label in largest):
         unit = units.get(label, "")
         shown, factor = ("mm", 1000.0) if unit == "m" else (unit, 1.0)
@@ -90,49 +90,49 @@ def time_sentence(operators: Sequence[Operator]) -> str:
     return f"Of {total:.3g} ms inside operators: {', '.join(parts)}."
 
 
-def islands_table(islands: Sequence[Island]) -> list[dict[str, Any]]:
-    """Return the ten dearest round trips."""
+def round_trips_table(trips: Sequence[RoundTrip]) -> list[dict[str, Any]]:
+    """Return the ten most expensive round trips."""
     return [
         {
-            "from": island.start.removesuffix("/dequantize"),
-            "in float": " ".join(island.between) or "nothing",
-            "to": island.end.removesuffix("/quantize"),
-            "ms": round(island.ms, 4),
+            "from": trip.start.removesuffix("/dequantize"),
+            "in float": " ".join(trip.between) or "nothing",
+            "to": trip.end.removesuffix("/quantize"),
+            "ms": round(trip.ms, 4),
         }
-        for island in islands[:MOST]
+        for trip in trips[:MAX_ROWS]
     ]
 
 
-def islands_sentence(islands: Sequence[Island], pairs: tuple[int, int], operators: Sequence[Operator]) -> str:
+def round_trips_sentence(trips: Sequence[RoundTrip], pairs: tuple[int, int], operators: Sequence[Operator]) -> str:
     """Return the sentence about round trips through float."""
     total = sum(part.ms for part in operators) or 1.0
     text = f"The file quantizes {pairs[0]} values and dequantizes {pairs[1]} at run time"
-    if not islands:
+    if not trips:
         return f"{text}; no value goes from int8 to float and back without a layer in between."
-    spent = sum(part.ms for part in islands)
-    direct = sum(not part.between for part in islands)
-    text += f"; {len(islands)} of them go int8 -> float -> int8 with only light operators in between"
+    spent = sum(part.ms for part in trips)
+    direct = sum(not part.between for part in trips)
+    text += f"; {len(trips)} of them go int8 -> float -> int8 with only light operators in between"
     text += f" ({direct} with none)" if direct else ""
     if not spent:
         return f"{text}. The profile shows none of them: the engine fused them, so they cost nothing."
     return f"{text}. They take {spent:.3g} ms, {spent / total:.1%} of the time."
 
 
-def fallbacks_table(fallen: Sequence[Fallback]) -> list[dict[str, Any]]:
-    """Return the ten dearest layers that fell back."""
+def fallbacks_table(fallbacks: Sequence[Fallback]) -> list[dict[str, Any]]:
+    """Return the ten most expensive layers that fell back."""
     return [
         {"layer": fallback.layer, "what happened": fallback.why, "ms": round(fallback.ms, 4)}
-        for fallback in fallen[:MOST]
+        for fallback in fallbacks[:MAX_ROWS]
     ]
 
 
-def fallbacks_sentence(fallen: Sequence[Fallback], operators: Sequence[Operator]) -> str:
+def fallbacks_sentence(fallbacks: Sequence[Fallback], operators: Sequence[Operator]) -> str:
     """Return the sentence about layers that did not run as fast int8 kernels."""
     total = sum(part.ms for part in operators) or 1.0
-    if not fallen:
+    if not fallbacks:
         return "Every layer that is int8 in the file runs as an int8 kernel."
     whys: dict[str, list[Fallback]] = {}
-    for part in fallen:
+    for part in fallbacks:
         whys.setdefault(part.why, []).append(part)
     parts = []
     for why, members in whys.items():
@@ -144,11 +144,11 @@ def fallbacks_sentence(fallen: Sequence[Fallback], operators: Sequence[Operator]
 def limit_sentences(
     operators: Sequence[Operator], before: Sequence[Operator], macs: Mapping[str, int], speed: float
 ) -> list[str]:
-    """Return why int8 could not be faster: Amdahl's law on the measured time of both bundles.
+    """Return why int8 is not faster: Amdahl's law on the measured time of both bundles.
 
     Args:
-        operators: Of the bundle.
-        before: Of the float32 bundle; empty when it was not found.
+        operators: Operators of the bundle.
+        before: Operators of the float32 bundle; empty when it was not found.
         macs: Precision -> multiply-accumulates of one inference of the bundle.
         speed: Measured speed-up over float32; that of the profiles when NaN.
     """
@@ -166,24 +166,23 @@ def limit_sentences(
         base = sum(operator.ms for operator in before) or 1.0
         actual = base / total if math.isnan(speed) else speed
         rest = base - heavy
-        faster, word = (FASTER_IN_PAIRS, "two") if saturates(isa() or ()) else (FASTER, "four")
-        ideal, most = base / (rest + heavy / faster), base / rest if rest else math.inf
+        faster, word = (INT8_SPEEDUP_IN_PAIRS, "two") if saturates(isa() or ()) else (INT8_SPEEDUP, "four")
+        ideal, limit = base / (rest + heavy / faster), base / rest if rest else math.inf
         text = f"In float32 they took {heavy / base:.0%} of {base:.3g} ms. By Amdahl's law products {word} times as"
-        text += (
-            f" fast make the whole {ideal:.2g}x as fast, and products for nothing {most:.2g}x; measured: {actual:.2g}x."
-        )
-        grown = total - products - rest
-        if grown > 0.02 * total:
-            text += f" What is not a product takes {grown:.2g} ms more than in float32: quantizing and moving data."
+        text += f" fast make the whole {ideal:.2g}x as fast, and products for nothing {limit:.2g}x;"
+        text += f" measured: {actual:.2g}x."
+        overhead = total - products - rest
+        if overhead > 0.02 * total:
+            text += f" What is not a product takes {overhead:.2g} ms more than in float32: quantizing and moving data."
         sentences.append(text)
     return sentences
 
 
 def reach_sentence(operators: Sequence[Operator], macs: Mapping[str, int], reach: Mapping[str, float]) -> list[str]:
-    """Return which part of the time the work would take at the speed of large products, and what the rest goes to.
+    """Return the share of the time that the work would take at the speed of large products, and the rest.
 
     Args:
-        operators: Of the bundle.
+        operators: Operators of the bundle.
         macs: Precision -> multiply-accumulates of one inference.
         reach: Precision -> 10^9 multiply-accumulates in a second of a large product in the same engine.
     """
@@ -202,7 +201,7 @@ def reach_sentence(operators: Sequence[Operator], macs: Mapping[str, int], reach
     others: Counter[str] = Counter()
     for operator in operators:
         others[operator.kind] += 0 if operator.product else operator.ms  # type: ignore[assignment]
-    listed = ", ".join(f"{kind} {ms:.2g} ms" for kind, ms in others.most_common(OTHERS) if ms > 0.005 * total)
+    listed = ", ".join(f"{kind} {ms:.2g} ms" for kind, ms in others.most_common(MAX_OTHERS) if ms > 0.005 * total)
     slower = f"its products take {products - share * total:.2g} ms more than that" if products > share * total else ""
     rest = f"everything else {total - products:.2g} ms{f': {listed}' if listed else ''}"
     text += f" The rest: {', '.join(filter(None, (slower, rest)))}."
@@ -221,56 +220,56 @@ def precision_table(operators: Sequence[Operator]) -> list[dict[str, Any]]:
     ]
 
 
-def candidate_row(candidate: Candidate, contest: Contest, where: Mapping[str, Any], source: str) -> Row:
-    """Return the row of a candidate, of the bundle as it is, or of the float32 bundle."""
+def candidate_row(candidate: Candidate, comparison: Comparison, where: Mapping[str, Any], source: str) -> Row:
+    """Return the row of a candidate, of the current bundle, or of the float32 bundle."""
     measurements = []
     samples: list[float] = []
-    reference = contest.baseline or contest.now
+    reference = comparison.baseline or comparison.current
     if candidate.contestant is not None and reference.contestant is not None:
         samples = candidate.contestant.samples
         measurements = latency_measurements(samples)
         if candidate is not reference:
             measurements.append(speedup(candidate.contestant, reference.contestant))
-    if not math.isnan(candidate.error) and candidate is not contest.baseline:
+    if not math.isnan(candidate.error) and candidate is not comparison.baseline:
         note = "mean over observations of |difference|2 / |raw action|2, to float32"
         count = len(candidate.contestant.observations) if candidate.contestant else 0
         measurements.append(RAW_RELATIVE_ERROR.measurement(candidate.error, samples=count, note=note))
     role, reason = "subject", ""
-    if candidate is contest.baseline:
+    if candidate is comparison.baseline:
         role = "baseline"
-    elif candidate is contest.suggested:
+    elif candidate is comparison.suggestion:
         role = "chosen"
     if candidate.stage is not None:
         reason = command(candidate.stage, source)
     return Row(candidate.name, role, reason, tuple(measurements), {series.LATENCY: samples} if samples else {}, where)
 
 
-def suggestion(contest: Contest, source: str) -> list[str]:
-    """Return the sentence with the command that is suggested; none when nothing helps enough."""
-    best = contest.suggested
+def suggestion(comparison: Comparison, source: str) -> list[str]:
+    """Return the sentence with the suggested command; none when nothing helps enough."""
+    best = comparison.suggestion
     if best is None or best.stage is None:
         return []
-    return [f"Do this: {command(best.stage, source)} ({_effect(best, contest.now)})."]
+    return [f"Do this: {command(best.stage, source)} ({_effect(best, comparison.current)})."]
 
 
-def trial_sentences(contest: Contest, worst: Sequence[LayerError]) -> list[str]:
-    """Return a sentence for each candidate, with what was measured."""
+def trial_sentences(comparison: Comparison, worst: Sequence[LayerError]) -> list[str]:
+    """Return a sentence for each candidate, with its measurements."""
     sentences = []
-    for candidate in contest.others:
+    for candidate in comparison.others:
         names = ", ".join(f"'{short_names(worst)[layer.name]}'" for layer in worst[: candidate.layers])
         what = candidate.name.partition("without")[0] + (f"exclude {names}" if candidate.layers else "")
-        sentences.append(f"Tried: {what}: {_effect(candidate, contest.now)}.")
-    if contest.others and contest.suggested is None:
+        sentences.append(f"Tried: {what}: {_effect(candidate, comparison.current)}.")
+    if comparison.others and comparison.suggestion is None:
         sentences.append("None of these helps enough to be suggested: the error is spread over many layers.")
     return sentences
 
 
-def _effect(candidate: Candidate, now: Candidate) -> str:
-    """Return error and latency of a candidate beside the bundle as it is, the latency with its 95 % interval."""
-    error = f"error {now.error:.2%} -> {candidate.error:.2%}"
-    if candidate.contestant is None or now.contestant is None:
+def _effect(candidate: Candidate, current: Candidate) -> str:
+    """Return error and latency of a candidate relative to the current bundle, the latency with its 95 % interval."""
+    error = f"error {current.error:.2%} -> {candidate.error:.2%}"
+    if candidate.contestant is None or current.contestant is None:
         return error
-    ratio = speedup(now.contestant, candidate.contestant)  # its latency in units of the other's
+    ratio = speedup(current.contestant, candidate.contestant)  # its latency in units of the other's
     change = f"latency {ratio.value - 1:+.0%}"
     if ratio.low is None or ratio.high is None:
         return f"{error}, {change}"

@@ -15,7 +15,7 @@ from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, RecipeError, SourceError, require, require_present
 from vlatool.files.validate import short_repr
-from vlatool.graph.as_float32 import ROUNDING, float32_text, written_in_float32
+from vlatool.graph.float32_conversion import ROUNDING, describe_conversion, rewrite_as_float32
 from vlatool.machine.engine_calls import engine_call
 from vlatool.module.edits import is_changed
 from vlatool.module.folding import fold_weights
@@ -89,7 +89,7 @@ class ExportOnnx(Transform):
         check_chunk(bundle.manifest.spec)
         observations = observations_for(bundle, self.samples)
         expected, graphs = self._run_and_export(bundle, observations, out, context)
-        gone = {name: written_in_float32(out / graph.file) for name, graph in graphs.items()}
+        gone = {name: rewrite_as_float32(out / graph.file) for name, graph in graphs.items()}
         for name, graph in graphs.items():
             graphs[name] = replace(graph, precision=count_shares(out / graph.file, context))
         carry_over(bundle, out)
@@ -100,7 +100,7 @@ class ExportOnnx(Transform):
         for name, types in gone.items():
             if types:
                 context.messages.append(
-                    f"{name}: {float32_text(types)}; its action differs from torch's by up to {error:.2g}"
+                    f"{name}: {describe_conversion(types)}; its action differs from torch's by up to {error:.2g}"
                 )
         return exported
 

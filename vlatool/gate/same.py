@@ -11,8 +11,8 @@ from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import BundleError, DataError, GraphError, fix_for, require, suggest
 from vlatool.gate.config import Gate
-from vlatool.graph.draws import drawing
 from vlatool.graph.files import read
+from vlatool.graph.random_ops import random_operators
 
 MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite")
 """What a robot relies on; files of statistics and tokenizers may differ."""
@@ -99,7 +99,7 @@ def _refuse_draws(bundle: Bundle) -> None:
     for name, graph in bundle.manifest.graphs.items():
         file = bundle.path / graph.file
         try:
-            operators = drawing(read(file, weights=False))
+            operators = random_operators(read(file, weights=False))
         except DecodeError as error:
             raise GraphError(f"{file} cannot be read as an ONNX file: {error}.", "make the bundle again") from error
         if operators:

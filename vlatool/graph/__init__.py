@@ -1,1 +1,1 @@
-"""What reads and edits an ONNX graph."""
+"""Reading and editing ONNX graphs."""

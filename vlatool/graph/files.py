@@ -1,4 +1,4 @@
-"""ONNX files: read with names for all nodes, written with their weights, parted in two."""
+"""ONNX files: read with names for all nodes, written with their weights, split in two."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from typing import Any
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import GraphError, VlatoolError, require
-from vlatool.graph.nodes import name_nodes, part_outputs
+from vlatool.graph.nodes import detach_constant_outputs, name_nodes
 from vlatool.graph.phase import cut_phases
 
 
-def part_phases(
+def split_phases(
     program: tuple[ProgramStep, ...], name: str, path: Path
 ) -> tuple[tuple[ProgramStep, ...], dict[str, Graph]]:
     """Move the phases of a graph into a file beside it; return the new program and the new graph.
 
-    Nothing changes when there is no phase that depends on an input, or when the graph runs in a loop, which a program
-    cannot share between two graphs.
+    Nothing changes without a phase that depends on an input, or when the graph runs in a loop, which a program cannot
+    split between two graphs.
     """
     steps = [step for step in program if step.graph == name]
     if any(step.repeat > 1 for step in steps):
@@ -50,10 +50,10 @@ def part_phases(
 
 
 def load(path: Path) -> Any:
-    """Load an ONNX model with its weights, without the shapes that ONNX Runtime's quantizer trips over.
+    """Load an ONNX model with its weights, without the recorded shapes, on which ONNX Runtime's quantizer fails.
 
     The dynamo exporter records the shape of a Gemm's weight before a transposition that the quantizer undoes; without
-    ``value_info`` the shapes are inferred afresh.
+    ``value_info`` the shapes are inferred anew.
     """
     model = read(path)
     del model.graph.value_info[:]
@@ -61,10 +61,10 @@ def load(path: Path) -> Any:
 
 
 def read(path: Path, *, weights: bool = True) -> Any:
-    """Read an ONNX model, with a name of its own for every node; no output is itself a constant.
+    """Read an ONNX model with unique names for all nodes; outputs are never constants.
 
     Raises:
-        GraphError: when a file with its weights is missing.
+        GraphError: when a file of its weights is missing.
     """
     onnx = require("onnx", "build")
     try:
@@ -72,10 +72,10 @@ def read(path: Path, *, weights: bool = True) -> Any:
     except (OSError, onnx.checker.ValidationError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
         raise GraphError(
-            f"The weights of {path} cannot be read: {reason}.", "put the file with its weights beside the graph"
+            f"The weights of {path} cannot be read: {reason}.", "put the file of its weights next to the graph"
         ) from error
     name_nodes(model)
-    part_outputs(model)
+    detach_constant_outputs(model)
     return model
 
 
@@ -88,19 +88,19 @@ def save(model: Any, path: Path) -> None:
     onnx.save(model, str(path), save_as_external_data=large, location=data.name)
 
 
-def write_beside(model: Any, original: Path, target: Path) -> Path:
-    """Write a model that was read without its weights to another directory; the files of weights are linked there."""
+def write_linked(model: Any, original: Path, target: Path) -> Path:
+    """Write a model that was read without its weights to another directory, with links to the files of its weights."""
     target.write_bytes(model.SerializeToString())
-    for beside in original.parent.glob("*.data"):
-        if not (target.parent / beside.name).exists():
-            link(beside, target.parent / beside.name)
+    for data in original.parent.glob("*.data"):
+        if not (target.parent / data.name).exists():
+            link(data, target.parent / data.name)
     return target
 
 
 def link(original: Path, copy: Path) -> None:
-    """Give a file a second name; copy it where the file system cannot.
+    """Create a hard link; copy the file where the file system does not support it.
 
-    ONNX Runtime follows no symbolic link out of the model's directory.
+    ONNX Runtime does not follow symbolic links out of the model's directory.
     """
     try:
         os.link(original, copy)
@@ -110,7 +110,7 @@ def link(original: Path, copy: Path) -> None:
 
 @contextlib.contextmanager
 def foreign_errors(graph: str) -> Iterator[None]:
-    """Tell what onnx or ONNX Runtime raises as a fault of the graph that is quantized."""
+    """Convert exceptions of onnx and ONNX Runtime to errors of the graph that is quantized."""
     try:
         yield
     except (VlatoolError, OSError, MemoryError):
@@ -119,5 +119,5 @@ def foreign_errors(graph: str) -> Iterator[None]:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
         raise GraphError(
             f"The graph '{graph}' cannot be quantized: {type(error).__name__}: {reason}.",
-            "leave layers out with --exclude, or use another method; export the policy again if it is damaged",
+            "exclude layers with --exclude, or use another method; export the policy again if it is damaged",
         ) from error

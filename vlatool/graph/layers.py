@@ -1,4 +1,4 @@
-"""The layers of an ONNX graph that can be computed in int8, and the values that they read."""
+"""The layers of an ONNX graph that can be computed in int8, and their inputs."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any, Literal
 import numpy as np
 
 from vlatool.errors import GraphError
-from vlatool.graph.nodes import nodes_inside, varying
+from vlatool.graph.nodes import inner_nodes, varying_values
 from vlatool.graph.onnx_graph import FLOAT, OnnxGraph
 
-LOWEST_OPSET = 13
-"""Per-channel scales came with opset 13."""
-SHAPES = ("Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "MaxPool")
-"""Operators that only move values: what is quantized before them stays quantized."""
+MIN_OPSET = 13
+"""First opset with per-channel scales."""
+MOVE_OPS = ("Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "MaxPool")
+"""Operators that only move values: a value quantized before them stays quantized."""
 SOFTMAXES = ("Softmax", "LogSoftmax")
-MASKED = (*SHAPES, "Add", "Where", "Max", "Min", "Clip", "Cast", "Identity", "Mul", "Div")
-"""Operators between the sum of scores and a mask and its softmax."""
-FOLLOWS = ("Relu", "Clip")
+MASK_OPS = (*MOVE_OPS, "Add", "Where", "Max", "Min", "Clip", "Cast", "Identity", "Mul", "Div")
+"""Operators between a sum of scores and mask and its softmax."""
+FUSED_ACTIVATIONS = ("Relu", "Clip")
 """Activation functions that engines fuse into the quantization of a convolution's output."""
 
 
@@ -33,8 +33,8 @@ class Layer:
         activations: Values that must be quantized at run time.
         weight: Initializer that is quantized ahead of time; empty when both operands are activations.
         axis: Axis of the weight with one scale for each entry.
-        bias: Initializer that is added, for convolutions.
-        output: What the node gives, after a Relu or Clip that engines fuse.
+        bias: Initializer of the bias, for convolutions.
+        output: Output of the node, after a Relu or Clip that engines fuse.
     """
 
     name: str
@@ -48,19 +48,19 @@ class Layer:
 
 @dataclass(frozen=True)
 class Style:
-    """How layers are written.
+    """Quantization style of layers.
 
     Args:
         activations: ``uint8`` with a zero point, ``int8`` symmetric, or ``symmetric``: int8, and uint8 with the zero
             point 0 for what is never negative.
         per_channel: One weight scale for each output channel.
         reduce_range: Weights of which no pair saturates 16 bits (``weights.pairs``).
-        fused_convolutions: Quantize a convolution's bias and output too: ONNX Runtime then computes it in int8.
+        fused_convolutions: Quantize the bias and output of convolutions, too: ONNX Runtime then computes them in int8.
         hoist: Quantize before operators that only move values, so that they move bytes instead of floats.
-        signed_second: Write the second of two activations that are multiplied (keys and values of attention) in 7 bits
-            and signed, whatever the others are: ONNX Runtime multiplies uint8 with int8 twice as fast as with uint8 on
-            x86, and within 63 no processor saturates.
-        unsigned_convolutions: Write what convolutions read as uint8 with a zero point, whatever the others are.
+        signed_second: Quantize the second of two multiplied activations (keys and values of attention) to signed 7
+            bits, whatever the others are: ONNX Runtime multiplies uint8 with int8 twice as fast as with uint8 on x86,
+            and within 63 no processor saturates.
+        unsigned_convolutions: Quantize inputs of convolutions to uint8 with a zero point, whatever the others are.
     """
 
     activations: Literal["uint8", "int8", "symmetric"] = "uint8"
@@ -75,21 +75,21 @@ class Style:
 def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elementwise: bool = False) -> list[Layer]:
     """Return the layers of a graph that can be computed in int8, in the order of the graph.
 
-    What depends on no input stays as it is: engines compute it once, and OpenVINO (2026.4) fails on a graph in which
-    such a value is quantized, or computes it wrongly.
+    Values that do not depend on an input are left alone: engines compute them once, and OpenVINO (2026.4) fails on a
+    graph in which such a value is quantized, or computes it wrongly.
 
     Args:
         model: An ``onnx.ModelProto``.
         ops: ``MatMul``, ``Gemm``, ``Conv``: operators whose layers with constant weights are returned.
-        attention: Also products of two activations.
-        elementwise: Also sums of two activations (residual connections); not those that a softmax reads, which add a
-            mask to scores.
+        attention: Whether to include products of two activations.
+        elementwise: Whether to include sums of two activations (residual connections), except sums of scores and mask,
+            which a softmax reads.
 
     Raises:
         GraphError: when the opset is too old.
     """
-    graph, live = OnnxGraph(model), varying(model)
-    check_opset(graph.opset, "int8", LOWEST_OPSET)
+    graph, live = OnnxGraph(model), varying_values(model)
+    check_opset(graph.opset, "int8", MIN_OPSET)
     layers = []
     for node in model.graph.node:
         layer = None
@@ -99,13 +99,13 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
             layer = Layer(node.name, "Add", tuple(node.input))
         if layer is not None and live.issuperset(layer.activations):
             after = graph.readers[node.output[0]]
-            fused = len(after) == 1 and after[0].op_type in FOLLOWS
+            fused = len(after) == 1 and after[0].op_type in FUSED_ACTIVATIONS
             layers.append(replace(layer, output=(after[0] if fused else node).output[0]))
     return layers
 
 
 def check_opset(opset: int, method: str, lowest: int) -> None:
-    """Refuse a graph of an opset in which a method has no operators; 0 is an opset that nobody said.
+    """Refuse a graph whose opset lacks the operators of a method; 0 is an unknown opset.
 
     Raises:
         GraphError: when the opset is too old.
@@ -113,26 +113,26 @@ def check_opset(opset: int, method: str, lowest: int) -> None:
     if 0 < opset < lowest:
         raise GraphError(
             f"The graph has opset {opset}; {method} needs opset {lowest} or later.",
-            f"convert the file that it came from: vlatool export FILE.onnx --opset {LOWEST_OPSET} -o BUNDLE; where "
-            "onnx cannot, which that says, export it again where it was made",
+            f"convert the file that it came from: vlatool export FILE.onnx --opset {MIN_OPSET} -o BUNDLE; where "
+            "onnx cannot convert it, export it again where it was made",
         )
 
 
 def _is_residual(node: Any, graph: OnnxGraph) -> bool:
-    """Say whether a node adds two float activations and its sum is no input of a softmax, however that is moved."""
+    """Return whether a node adds two float activations and its sum does not reach a softmax through moves."""
     floats = all(graph.types.get(name) == FLOAT and name not in graph.constants for name in node.input)
     sums, seen = [node.output[0]], set()
     while floats and sums:
         seen.add(value := sums.pop())
         if any(reader.op_type in SOFTMAXES for reader in graph.readers[value]):
             return False
-        moved = (reader for reader in graph.readers[value] if reader.op_type in MASKED)
-        sums += [name for reader in moved for name in reader.output if name not in seen]
+        hoisted = (reader for reader in graph.readers[value] if reader.op_type in MASK_OPS)
+        sums += [name for reader in hoisted for name in reader.output if name not in seen]
     return floats
 
 
 def check_weights(model: Any, layers: Iterable[Layer]) -> None:
-    """Look at the weights and biases of layers before anything is computed with them.
+    """Check the weights and biases of layers before they are used.
 
     Raises:
         GraphError: when one holds NaN or infinity; names it and its layer.
@@ -146,7 +146,7 @@ def check_weights(model: Any, layers: Iterable[Layer]) -> None:
                 raise GraphError(
                     f"The weight '{name}' of the layer '{node.name}' holds NaN or infinity ({bad} of "
                     f"{values.size} values); allowed: finite ones.",
-                    "look at the checkpoint, or leave the layer in float32 with --exclude",
+                    "check the checkpoint, or keep the layer in float32 with --exclude",
                 )
 
 
@@ -164,11 +164,11 @@ def _product(node: Any, graph: OnnxGraph, weighted: bool, attention: bool) -> La
     return Layer(node.name, node.op_type, (first,), second, axis, bias)
 
 
-def hoisted(model: Any, layers: Iterable[Layer], style: Style) -> dict[str, str]:
-    """Return value that a layer reads -> the value that is quantized in its place, where they differ.
+def hoisted_values(model: Any, layers: Iterable[Layer], style: Style) -> dict[str, str]:
+    """Return input of a layer -> the value that is quantized instead, where they differ.
 
-    A value moves up through an operator of ``SHAPES`` when all that read it are quantized layers and the graph does not
-    give it; through Split always, whose other parts are then rounded too.
+    The quantizer moves up through an operator of ``MOVE_OPS`` when all readers of the value are quantized layers and it
+    is not an output of the graph; through Split always, whose other parts are then rounded, too.
     """
     if not style.hoist:
         return {}
@@ -177,7 +177,7 @@ def hoisted(model: Any, layers: Iterable[Layer], style: Style) -> dict[str, str]
     for name in sorted({name for _, name in read}):
         value = name
         while (mover := graph.producers.get(value)) is not None:
-            if mover.op_type not in SHAPES or mover.input[0] in graph.constants or value in graph.outputs:
+            if mover.op_type not in MOVE_OPS or mover.input[0] in graph.constants or value in graph.outputs:
                 break
             readers = graph.readers[value]
             if not (len(readers) == 1 if value != name else all((reader.name, value) in read for reader in readers)):
@@ -186,37 +186,37 @@ def hoisted(model: Any, layers: Iterable[Layer], style: Style) -> dict[str, str]
     return roots
 
 
-def calibrated_values(layers: Iterable[Layer], style: Style, moved: Mapping[str, str]) -> list[str]:
-    """Return the values whose ranges are needed, each once, in order."""
+def calibrated_values(layers: Iterable[Layer], style: Style, hoisted: Mapping[str, str]) -> list[str]:
+    """Return the values that need ranges, without repetition, in order."""
     values: dict[str, None] = {}
     for layer in layers:
-        values.update(dict.fromkeys(moved.get(name, name) for name in layer.activations))
+        values.update(dict.fromkeys(hoisted.get(name, name) for name in layer.activations))
         if style.fused_convolutions and layer.kind == "Conv":
             values[layer.output] = None
     return list(values)
 
 
-def convolved(layers: Iterable[Layer], style: Style, moved: Mapping[str, str]) -> set[str]:
-    """Return the values that are written as uint8 because a convolution reads them.
+def convolution_inputs(layers: Iterable[Layer], style: Style, hoisted: Mapping[str, str]) -> set[str]:
+    """Return the values that are quantized to uint8 because a convolution reads them.
 
-    On x86 processors without AMX, OpenVINO (2025.2 to 2026.4) turns signed inputs of convolutions into unsigned ones,
-    and loses their scale where a Concat is near; unsigned ones it computes as they are written, everywhere.
+    On x86 processors without AMX, OpenVINO (2025.2 to 2026.4) converts signed inputs of convolutions to unsigned ones,
+    and loses their scale near a Concat; unsigned inputs are computed correctly everywhere.
     """
     if not style.unsigned_convolutions:
         return set()
-    return {moved.get(name, name) for layer in layers if layer.kind == "Conv" for name in layer.activations}
+    return {hoisted.get(name, name) for layer in layers if layer.kind == "Conv" for name in layer.activations}
 
 
-def signed(layers: Iterable[Layer], style: Style) -> set[str]:
-    """Return the values that are written in 7 bits and signed; what is also read as a first operand is not."""
+def signed_values(layers: Iterable[Layer], style: Style) -> set[str]:
+    """Return the values that are quantized to signed 7 bits, except those that are also read as first operands."""
     products = [layer for layer in layers if layer.kind == "MatMul" and not layer.weight]
     if not style.signed_second:
         return set()
     return {layer.activations[1] for layer in products} - {layer.activations[0] for layer in layers}
 
 
-def split_gemm(model: Any) -> int:
-    """Rewrite every plain Gemm with a constant weight as MatMul and Add, in place; return how many.
+def split_gemms(model: Any) -> int:
+    """Rewrite every plain Gemm with a constant weight as MatMul and Add, in place; return their number.
 
     ONNX Runtime has an integer MatMul with float output, but none for Gemm.
     """
@@ -242,11 +242,11 @@ def split_gemm(model: Any) -> int:
     return count
 
 
-def part_inner_gemms(model: Any) -> None:
-    """Give every Gemm inside an If, Loop or Scan that transposes a weight of the graph a copy of its own, in place."""
+def copy_inner_gemm_weights(model: Any) -> None:
+    """Copy the weights of the graph for each Gemm inside an If, Loop or Scan that transposes them, in place."""
     graph = OnnxGraph(model)
-    for number, node in enumerate(inner for outer in model.graph.node for inner in nodes_inside(outer)):
-        turned = node.op_type == "Gemm" and graph.attributes(node).get("transB")
-        if turned and node.input[1] in graph.constants:
+    for number, node in enumerate(inner for outer in model.graph.node for inner in inner_nodes(outer)):
+        transposes = node.op_type == "Gemm" and graph.attributes(node).get("transB")
+        if transposes and node.input[1] in graph.constants:
             weight = graph.constants[node.input[1]]
             node.input[1] = graph.add_tensor(weight, f"{weight.name}.{number}")

@@ -11,26 +11,26 @@ INTEGER_OPS = {
     *("MatMulInteger", "ConvInteger", "QLinearMatMul", "QLinearConv"),
     *("QGemm", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"),
 }
-"""They compute in int8 whatever surrounds them."""
+"""Operators that always compute in int8."""
 WEIGHT_AT = {"QLinearMatMul": 3, "QLinearConv": 3, "QGemm": 3}
-"""Position of the second operand where it is not 1."""
+"""Index of the second operand where it is not 1."""
 MATMULS = {"MatMul", "FusedMatMul", "MatMulInteger", "QLinearMatMul", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"}
 CONVOLUTIONS = {"Conv", "ConvInteger", "QLinearConv", "FusedConv"}
-OTHERS = {"Gemm", "QGemm", "ConvTranspose", "MatMulNBits", "Einsum", "Attention", "LSTM", "GRU", "RNN"}
-TURNING = ("Gemm", "QGemm", "FusedMatMul")
-"""They can turn the last two axes of their first operand."""
+OTHER_PRODUCTS = {"Gemm", "QGemm", "ConvTranspose", "MatMulNBits", "Einsum", "Attention", "LSTM", "GRU", "RNN"}
+TRANSPOSING = ("Gemm", "QGemm", "FusedMatMul")
+"""Operators that can transpose the last two axes of their first operand."""
 OPAQUE = {"QAttention", "MultiHeadAttention", "GroupQueryAttention"}
-"""They compute, but nothing here counts them: a graph that has one has an unknown layer, never a wrong sum."""
-MOVED = {"Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "Pad", "MaxPool"}
-"""They move values and leave their precision as it is."""
-COMPUTE = MATMULS | CONVOLUTIONS | OTHERS | OPAQUE
+"""Compute operators that are not counted: a graph with one has an unknown layer, never a wrong sum."""
+MOVE_OPS = {"Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "Pad", "MaxPool"}
+"""Operators that move values without changing their precision."""
+COMPUTE = MATMULS | CONVOLUTIONS | OTHER_PRODUCTS | OPAQUE
 
 
 def precision_of(node: Any, tensors: Tensors) -> str:
-    """Return the precision that a layer is computed in.
+    """Return the precision in which a layer is computed.
 
-    A float layer counts as int8 when both operands come out of DequantizeLinear (QDQ form); when only the weight does,
-    it is computed in float.
+    A float layer counts as int8 when both operands come from DequantizeLinear (QDQ form); when only the weight does, it
+    is computed in float.
     """
     if node.op_type in INTEGER_OPS:
         return "int8"
@@ -43,10 +43,10 @@ def precision_of(node: Any, tensors: Tensors) -> str:
     return tensors.dtype(node.input[0])
 
 
-def weights_alone(node: Any, tensors: Tensors) -> str:
-    """Return the precision of a layer's weights where they alone are stored so (``int4``); empty for any other layer.
+def weight_precision(node: Any, tensors: Tensors) -> str:
+    """Return the precision of a layer's weights where only they are quantized (``int4``); empty for any other layer.
 
-    What such a layer is computed in is up to the engine: one dequantizes the weights, another rounds the activations.
+    How such a layer is computed depends on the engine: one dequantizes the weights, another rounds the activations.
     """
     if node.op_type == "MatMulNBits":
         return precision_of(node, tensors)
@@ -58,9 +58,9 @@ def weights_alone(node: Any, tensors: Tensors) -> str:
 
 
 def _source(name: str, tensors: Tensors) -> Any:
-    """Return the node that gave a value before it was moved."""
+    """Return the node that produced a value, before any moves."""
     node = tensors.producer(name)
-    while node is not None and node.op_type in MOVED:
+    while node is not None and node.op_type in MOVE_OPS:
         node = tensors.producer(node.input[0])
     return node
 
@@ -89,7 +89,7 @@ def node_macs(node: Any, tensors: Tensors) -> int | None:
         return None
     if kind in CONVOLUTIONS:  # each output element sums (inputs / group) x kernel products
         return math.prod(out) * math.prod(second[1:])
-    inner = first[-2] if kind in TURNING and tensors.attribute(node, "transA", 0) else first[-1]
+    inner = first[-2] if kind in TRANSPOSING and tensors.attribute(node, "transA", 0) else first[-1]
     return math.prod(out) * inner
 
 

@@ -1,4 +1,4 @@
-"""The graph of an ONNX model: what gives and what reads each value, constants, types, shapes, and edits in place."""
+"""The graph of an ONNX model: producers and readers of values, constants, types, shapes, and edits in place."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from vlatool.errors import require
 from vlatool.graph.nodes import read_names, reads
 
 FLOAT = 1  # onnx.TensorProto.FLOAT
-LARGE = 4096
-"""Bytes from which a constant is a weight; what shapes are computed from is smaller."""
+LARGE_CONSTANT = 4096
+"""Bytes above which a constant is a weight; constants that determine shapes are smaller."""
 DOMAINS = ("", "ai.onnx")
 """Names of the standard domain."""
 
 
 class OnnxGraph:
-    """A graph that is looked up and edited in place, in protobuf: what is not touched keeps its bytes and its order.
+    """A graph in protobuf with lookups and edits in place: untouched parts keep their bytes and their order.
 
-    Lookups are made when they are first asked for, and hold what the graph was then; of edits, ``constants`` alone
-    knows. Nodes may read from outside of the graphs inside them (If, Loop, Scan): such readers count.
+    Lookups are computed at their first use and reflect the graph at that time; only ``constants`` follows edits. Nodes
+    count as readers of values that their subgraphs (If, Loop, Scan) capture.
 
     Args:
         model: An ``onnx.ModelProto``.
@@ -44,12 +44,12 @@ class OnnxGraph:
 
     @cached_property
     def producers(self) -> dict[str, Any]:
-        """Value -> the node that gives it."""
+        """Value -> the node that produces it."""
         return {name: node for node in self.graph.node for name in node.output if name}
 
     @cached_property
     def readers(self) -> dict[str, list[Any]]:
-        """Value -> the nodes that read it, a node once for each time; empty for a value that none reads."""
+        """Value -> the nodes that read it, repeated for each read; empty for an unread value."""
         readers: dict[str, list[Any]] = defaultdict(list)
         for node in self.graph.node:
             for name in reads(node):
@@ -64,7 +64,7 @@ class OnnxGraph:
     # ---- types and shapes
 
     @cached_property
-    def inferred(self) -> list[Any]:
+    def value_infos(self) -> list[Any]:
         """``onnx.ValueInfoProto`` of inputs, inferred values and outputs.
 
         Weights take part as inputs of their type and shape: neither their bytes nor protobuf's limit of 2 GiB matter.
@@ -72,7 +72,7 @@ class OnnxGraph:
         graph, helper, external = self.graph, self.onnx.helper, self.onnx.TensorProto.EXTERNAL
         small, inputs = [], list(graph.input)
         for tensor in graph.initializer:
-            if tensor.ByteSize() > LARGE or tensor.data_location == external:
+            if tensor.ByteSize() > LARGE_CONSTANT or tensor.data_location == external:
                 inputs.append(helper.make_tensor_value_info(tensor.name, tensor.data_type, tensor.dims))
             else:
                 small.append(tensor)
@@ -84,17 +84,17 @@ class OnnxGraph:
     @cached_property
     def types(self) -> dict[str, int]:
         """Value -> ``onnx.TensorProto.DataType``; constants are not among them."""
-        return {value.name: value.type.tensor_type.elem_type for value in self.inferred}
+        return {value.name: value.type.tensor_type.elem_type for value in self.value_infos}
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Value or constant -> shape, of those whose shape is fixed."""
         shapes = {name: tuple(tensor.dims) for name, tensor in self.constants.items()}
-        static = ((value.name, static_shape(value.type.tensor_type)) for value in self.inferred)
+        static = ((value.name, static_shape(value.type.tensor_type)) for value in self.value_infos)
         return shapes | {name: shape for name, shape in static if shape is not None}
 
     def float_values(self) -> list[str]:
-        """Return the float32 values that nodes give, in order."""
+        """Return the float32 outputs of all nodes, in order."""
         return [name for node in self.graph.node for name in node.output if self.types.get(name) == FLOAT]
 
     # ---- constants
@@ -105,22 +105,22 @@ class OnnxGraph:
         return values
 
     def is_weight(self, name: str, rank: int | None = None) -> bool:
-        """Say whether a value is a float32 constant, and of that many axes."""
+        """Return whether a value is a float32 constant, of the given rank."""
         tensor = self.constants.get(name)
         return tensor is not None and tensor.data_type == FLOAT and rank in (None, len(tensor.dims))
 
     def is_scalar(self, name: str) -> bool:
-        """Say whether a value is a constant whose axes, if it has any, are all 1."""
+        """Return whether a value is a constant with a single element."""
         return name in self.constants and all(axis == 1 for axis in self.constants[name].dims)
 
     def add(self, name: str, values: Any, dtype: Any = None) -> str:
-        """Add a constant where there is none of that name; return the name."""
+        """Add a constant unless one of that name exists; return the name."""
         if name in self.constants:
             return name
         return self.add_tensor(self.onnx.numpy_helper.from_array(np.asarray(values, dtype, order="C"), name))
 
     def add_tensor(self, tensor: Any, name: str = "") -> str:
-        """Add a copy of a ``TensorProto``, under another name where one is given; return its name."""
+        """Add a copy of a ``TensorProto``, optionally under another name; return its name."""
         self.graph.initializer.append(tensor)
         copy = self.graph.initializer[-1]
         copy.name = name or copy.name
@@ -130,7 +130,7 @@ class OnnxGraph:
     # ---- nodes
 
     def node(self, kind: str, inputs: Iterable[str], outputs: Iterable[str], name: str = "", **attributes: Any) -> Any:
-        """Make a node, which is not in the graph yet."""
+        """Create a node without adding it to the graph."""
         return self.onnx.helper.make_node(kind, inputs, outputs, name, **attributes)
 
     def attributes(self, node: Any) -> dict[str, Any]:
@@ -138,33 +138,33 @@ class OnnxGraph:
         return {item.name: self.onnx.helper.get_attribute_value(item) for item in node.attribute}
 
     def replace_nodes(self, nodes: Iterable[Any]) -> None:
-        """Take these nodes for those of the graph."""
+        """Replace all nodes of the graph."""
         kept = list(nodes)
         del self.graph.node[:]
         self.graph.node.extend(kept)
 
     def insert_before(self, node: Any, *added: Any) -> None:
-        """Put nodes in front of one that is in the graph."""
-        place = list(self.graph.node).index(node)
+        """Insert nodes before a node of the graph."""
+        position = list(self.graph.node).index(node)
         for number, new in enumerate(added):
-            self.graph.node.insert(place + number, new)
+            self.graph.node.insert(position + number, new)
 
     def replace_reads(self, old: str, new: str) -> None:
-        """Let all nodes that read a value read another one."""
+        """Redirect all readers of a value to another one."""
         for node in self.graph.node:
-            for place, name in enumerate(node.input):
+            for index, name in enumerate(node.input):
                 if name == old:
-                    node.input[place] = new
+                    node.input[index] = new
 
     def drop_unread_constants(self) -> None:
-        """Remove the constants that neither a node reads nor the graph gives; the others are not copied."""
+        """Remove the constants that neither a node nor an output uses; the others are not copied."""
         used = read_names(self.graph.node) | self.outputs
-        for place in range(len(self.graph.initializer) - 1, -1, -1):
-            if self.graph.initializer[place].name not in used:
-                del self.graph.initializer[place]
+        for index in range(len(self.graph.initializer) - 1, -1, -1):
+            if self.graph.initializer[index].name not in used:
+                del self.graph.initializer[index]
 
     def drop_unread(self) -> None:
-        """Remove nodes, whose order must be right, and constants that lead to no output."""
+        """Remove nodes and constants that no output depends on; the nodes must be sorted."""
         used, kept = set(self.outputs), []
         for node in reversed(self.graph.node):
             if not used.isdisjoint(node.output):
@@ -174,24 +174,24 @@ class OnnxGraph:
         self.drop_unread_constants()
 
     def sort(self) -> None:
-        """Put every node after what it reads, else in the order in which they are."""
+        """Sort nodes topologically, otherwise in their current order."""
         nodes = list(self.graph.node)
-        places = {name: place for place, node in enumerate(nodes) for name in node.output if name}
-        before = {place: {places[name] for name in reads(node) if name in places} for place, node in enumerate(nodes)}
+        origin = {name: index for index, node in enumerate(nodes) for name in node.output if name}
+        before = {index: {origin[name] for name in reads(node) if name in origin} for index, node in enumerate(nodes)}
         sorter = graphlib.TopologicalSorter(before)
         sorter.prepare()
         ready: list[int] = []
         order = []
         while sorter.is_active():
-            for place in sorter.get_ready():
-                heapq.heappush(ready, place)
+            for index in sorter.get_ready():
+                heapq.heappush(ready, index)
             order.append(heapq.heappop(ready))
             sorter.done(order[-1])
-        self.replace_nodes(nodes[place] for place in order)
+        self.replace_nodes(nodes[index] for index in order)
 
 
 def type_name(code: int) -> str:
-    """Return a ``TensorProto.DataType`` as numpy calls it: ``float64``, ``bfloat16``.
+    """Return numpy's name of a ``TensorProto.DataType``: ``float64``, ``bfloat16``.
 
     Example:
         >>> type_name(11)
@@ -202,7 +202,7 @@ def type_name(code: int) -> str:
 
 
 def static_shape(tensor_type: Any) -> tuple[int, ...] | None:
-    """Return the shape of an ``onnx.TypeProto.Tensor``; None where an axis is free or nothing is known."""
+    """Return the shape of an ``onnx.TypeProto.Tensor``; None where an axis is dynamic or unknown."""
     if not tensor_type.HasField("shape"):
         return None
     axes = tensor_type.shape.dim

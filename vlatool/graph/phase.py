@@ -1,7 +1,7 @@
 """Cut the computation of phases out of a graph, so that it stays in float32 when the rest is computed in bfloat16.
 
-A phase is what Sin and Cos take: position or denoising time multiplied by frequencies. bfloat16 has 8 significant bits,
-so that a phase of 300 radians is off by up to one radian and its sine is noise; no later layer can repair that.
+A phase is an argument of Sin and Cos: position or denoising time multiplied by frequencies. bfloat16 has 8 significant
+bits, so a phase of 300 radians is off by up to one radian and its sine is noise; no later layer can repair that.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from vlatool.graph.nodes import read_names, reads, varying
+from vlatool.graph.nodes import read_names, reads, varying_values
 from vlatool.graph.onnx_graph import OnnxGraph
 
 PERIODIC = ("Sin", "Cos")
@@ -18,14 +18,14 @@ HEAVY = ("MatMul", "Gemm", "Conv", "Einsum", "Attention")
 
 
 @dataclass(frozen=True)
-class Cut:
+class PhaseCut:
     """The float32 part of a graph.
 
     Args:
         model: An ``onnx.ModelProto`` that computes ``values`` from ``inputs``.
-        inputs: Inputs of the whole graph that it reads.
+        inputs: Inputs of the original graph that it reads.
         values: Values that the rest of the graph reads from it.
-        kept: Inputs of the whole graph that the rest still reads.
+        kept: Inputs of the original graph that the rest still reads.
     """
 
     model: Any
@@ -34,48 +34,48 @@ class Cut:
     kept: tuple[str, ...]
 
 
-def cut_phases(model: Any) -> Cut | None:
-    """Move what leads to Sin and Cos from a graph into one of its own, in place.
+def cut_phases(model: Any) -> PhaseCut | None:
+    """Move the nodes that lead to Sin and Cos into a separate graph, in place.
 
     Args:
-        model: An ``onnx.ModelProto``; afterwards the values of the cut are inputs of it.
+        model: An ``onnx.ModelProto``; afterwards the values of the cut are its inputs.
 
     Returns:
         The cut, or None when no phase depends on an input, or when one depends on a heavy layer (a phase that the
         network itself computes cannot be cut out cheaply).
     """
     graph = OnnxGraph(model)
-    names = _leading(graph)
-    early = [node for node in model.graph.node if node.output[0] in names]
-    late = [node for node in model.graph.node if node.output[0] not in names]
-    moved, read = [name for node in early for name in node.output], read_names(late)
-    values = [name for name in moved if name in read]
-    heavy = any(node.op_type in HEAVY for node in early)
-    if heavy or not values or graph.outputs.intersection(moved):
+    names = _phase_nodes(graph)
+    phase_nodes = [node for node in model.graph.node if node.output[0] in names]
+    other_nodes = [node for node in model.graph.node if node.output[0] not in names]
+    phase_values, read = [name for node in phase_nodes for name in node.output], read_names(other_nodes)
+    values = [name for name in phase_values if name in read]
+    heavy = any(node.op_type in HEAVY for node in phase_nodes)
+    if heavy or not values or graph.outputs.intersection(phase_values):
         return None
-    part = _model_of(early, graph)
+    part = _model_of(phase_nodes, graph)
     typed = graph.onnx.shape_inference.infer_shapes(part).graph
     types = {value.name: value for value in typed.value_info}
     if any(name not in types for name in values):
         return None
     part.graph.output.extend(types[name] for name in values)
-    graph.replace_nodes(late)
+    graph.replace_nodes(other_nodes)
     graph.drop_unread_constants()
     inputs = [value for value in model.graph.input if value.name in read]
     del model.graph.input[:]
     model.graph.input.extend([*inputs, *(types[name] for name in values)])
-    return Cut(part, _names(part.graph.input), tuple(values), _names(inputs))
+    return PhaseCut(part, _names(part.graph.input), tuple(values), _names(inputs))
 
 
-def periodic(model: Any) -> list[Any]:
+def periodic_nodes(model: Any) -> list[Any]:
     """Return the Sin and Cos nodes whose argument depends on an input of the graph."""
-    live = varying(model)
+    live = varying_values(model)
     return [node for node in model.graph.node if node.op_type in PERIODIC and not live.isdisjoint(node.input)]
 
 
-def _leading(graph: OnnxGraph) -> set[str]:
+def _phase_nodes(graph: OnnxGraph) -> set[str]:
     """Return the first output of each node that leads from an input to Sin or Cos, those included."""
-    pending = periodic(graph.model)
+    pending = periodic_nodes(graph.model)
     names: set[str] = set()
     while pending:
         node = pending.pop()
@@ -86,7 +86,7 @@ def _leading(graph: OnnxGraph) -> set[str]:
 
 
 def _model_of(nodes: list[Any], graph: OnnxGraph) -> Any:
-    """Return a model of those nodes alone, with the inputs and constants that they read."""
+    """Return a model of the given nodes, with the inputs and constants that they read."""
     helper, read = graph.onnx.helper, read_names(nodes)
     inputs = [value for value in graph.graph.input if value.name in read]
     constants = [tensor for name, tensor in graph.constants.items() if name in read]

@@ -1,4 +1,4 @@
-"""Share of a graph's multiply-accumulates by the precision that they are computed in, or that their weights have."""
+"""Shares of a graph's multiply-accumulates by the precision of the computation, or of the weights."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ FLOATS = ("float64", "float32", "float16")
 def precision_shares(path: Path) -> dict[str, float]:
     """Return precision -> share of the multiply-accumulates (rounded to 0.001, the largest first).
 
-    Layers whose weights alone are quantized count as ``int4 weights`` and the like, in whatever form they are stored.
+    Layers with only quantized weights count as ``int4 weights`` and the like, whatever their storage format.
     """
     return shares_and_unknown(path)[0]
 
 
 def shares_and_unknown(path: Path) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return those shares, and the layers that cannot be counted, because nobody knows their shapes."""
+    """Return those shares, and the layers that cannot be counted because their shapes are unknown."""
     from vlatool.graph.workload import graph_workload
 
     load = graph_workload(path, count_as=_by_weights)
@@ -28,7 +28,7 @@ def shares_and_unknown(path: Path) -> tuple[dict[str, float], tuple[str, ...]]:
 
 
 def _by_weights(node: Any, tensors: Any) -> str:
-    from vlatool.graph.macs import precision_of, weights_alone
+    from vlatool.graph.macs import precision_of, weight_precision
 
-    alone = weights_alone(node, tensors)
+    alone = weight_precision(node, tensors)
     return f"{alone} weights" if alone else precision_of(node, tensors)

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vlatool.graph.flat import Branches, Turns, all_nodes, flatten, named_everywhere
-from vlatool.graph.nodes import nodes_inside
-from vlatool.graph.onnx_graph import DOMAINS, LARGE, static_shape, type_name
-from vlatool.graph.seen import Seen, read_seen
+from vlatool.graph.control_flow import Branches, LoopBody, all_nodes, flatten, with_unique_names
+from vlatool.graph.nodes import inner_nodes
+from vlatool.graph.onnx_graph import DOMAINS, LARGE_CONSTANT, static_shape, type_name
+from vlatool.graph.run_shapes import RunShapes, read_run_shapes
 
 Shape = tuple[int, ...]
 
@@ -21,23 +21,23 @@ SAME_SHAPE_AS = {
     "FusedConv": "Conv",
     "QGemm": "Gemm",
 }
-"""Contributed operator -> the standard one with the same output shape; ONNX infers shapes of standard ones only."""
-UNCHANGED = {"DequantizeLinear", "QuantizeLinear", "Transpose", "Reshape", "Squeeze", "Unsqueeze", "Cast", "Identity"}
-"""Operators whose output holds the numbers of their first input, in another type or order."""
+"""Contributed operator -> standard one with the same output shape; ONNX infers shapes only of standard operators."""
+COPY_OPS = {"DequantizeLinear", "QuantizeLinear", "Transpose", "Reshape", "Squeeze", "Unsqueeze", "Cast", "Identity"}
+"""Operators whose output holds the values of their first input, in another type or order."""
 
 
 class Tensors:
-    """The nodes of a graph and what is known of its tensors.
+    """The nodes of a graph with shapes and types of its tensors.
 
     Args:
         onnx: The imported ``onnx`` package.
-        items: Nodes in the order in which they run, and bodies that one of them has (``vlatool.graph.flat``).
+        items: Nodes in execution order, with nested bodies (``vlatool.graph.control_flow``).
         graph: The graph after shape inference.
-        seen: Node -> what a run has shown, where shapes are not static.
+        run_shapes: Node -> shapes of a run, where shapes are not static.
     """
 
-    def __init__(self, onnx: Any, items: list[Any], graph: Any, seen: Mapping[str, Seen]) -> None:
-        self._onnx, self.items, self._graph, self._seen = onnx, items, graph, seen
+    def __init__(self, onnx: Any, items: list[Any], graph: Any, run_shapes: Mapping[str, RunShapes]) -> None:
+        self._onnx, self.items, self._graph, self._run_shapes = onnx, items, graph, run_shapes
         self.nodes = [*all_nodes(items)]
         self._types: dict[str, int] = {}
         self._shapes: dict[str, Shape | None] = {}
@@ -48,11 +48,11 @@ class Tensors:
             self._types[item.name], self._shapes[item.name] = item.data_type, tuple(item.dims)
         self._producers = {name: node for node in self.nodes for name in node.output if name}
         self._stored = {item.name for item in graph.initializer}
-        for node in (node for node in self.nodes if node.name in seen):
-            self._learn(node, seen[node.name])
+        for node in (node for node in self.nodes if node.name in run_shapes):
+            self._add_run_shapes(node, run_shapes[node.name])
 
-    def _learn(self, node: Any, seen: Seen) -> None:
-        """Take in the shapes that a run has shown of a node, where they are not static."""
+    def _add_run_shapes(self, node: Any, seen: RunShapes) -> None:
+        """Add the shapes of a node in a run, where they are not static."""
         pending, missing = list(seen.inputs), sum(map(bool, node.input)) - len(seen.inputs)
         for name in filter(None, node.input):
             packed = missing > 0 and name in self._stored and pending[:1] != [self._shapes[name]]
@@ -63,11 +63,11 @@ class Tensors:
             self._shapes[name] = self._shapes.get(name) or shape
 
     def shape(self, name: str) -> Shape | None:
-        """Return a shape of whole numbers, None when an axis is free or nothing is known."""
+        """Return a static shape; None when an axis is dynamic or unknown."""
         return self._shapes.get(name)
 
     def dtype(self, name: str) -> str:
-        """Return a dtype as ``float32``; ``float32`` when it is not known."""
+        """Return the name of a dtype; ``float32`` when it is unknown."""
         known = self._types.get(name, 0)
         if not known:
             return "float32"
@@ -75,21 +75,21 @@ class Tensors:
         return label[: len("float8")] if label.startswith(("float8", "float4")) else label  # float8e4m3fn and its kin
 
     def producer(self, name: str) -> Any | None:
-        """Return the node that gives a tensor."""
+        """Return the node that produces a tensor."""
         return self._producers.get(name)
 
     def is_constant(self, name: str) -> bool:
-        """Say whether a tensor is a weight, or computed from weights alone (dequantized, transposed)."""
+        """Return whether a tensor is a weight, or derived only from weights (dequantized, transposed)."""
         while name not in self._stored:
             node = self._producers.get(name)
-            if node is None or node.op_type not in UNCHANGED:
+            if node is None or node.op_type not in COPY_OPS:
                 return node is not None and node.op_type == "Constant"
             name = node.input[0]
         return True
 
-    def root(self, name: str) -> str:
-        """Return the name of the tensor whose numbers these are, before their type or order changed."""
-        while name not in self._stored and (node := self._producers.get(name)) and node.op_type in UNCHANGED:
+    def source_tensor(self, name: str) -> str:
+        """Return the tensor whose values these are, before changes of type or order."""
+        while name not in self._stored and (node := self._producers.get(name)) and node.op_type in COPY_OPS:
             name = node.input[0]
         return name
 
@@ -112,9 +112,9 @@ class Tensors:
         return sum(self.bytes_of(item.name) or 0 for item in self._graph.initializer)
 
     def peak_bytes(self) -> int:
-        """Return the most bytes of inputs, intermediate values and outputs that are alive at one node.
+        """Return the peak of bytes of live inputs, intermediate values and outputs.
 
-        What is computed from weights alone (a dequantized weight) is not counted: engines fold it or keep it packed.
+        Values derived only from weights (a dequantized weight) are not counted: engines fold them or keep them packed.
         """
         constant = {*self._stored}
         last = {name: index for index, node in enumerate(self.nodes) for name in node.input}
@@ -134,19 +134,19 @@ class Tensors:
                     alive.pop(name, None)
         return peak
 
-    def hidden(self, operators: set[str]) -> Iterator[str]:
-        """Yield the names of nodes that run such operators inside, which nothing here counts: bodies of other nodes."""
+    def nodes_with_inner(self, operators: set[str]) -> Iterator[str]:
+        """Yield the names of nodes with such operators in bodies that are not counted here."""
         for node in self.nodes:
-            if any(inner.op_type in operators for inner in nodes_inside(node)):
+            if any(inner.op_type in operators for inner in inner_nodes(node)):
                 yield node.name or node.output[0]
 
-    def runs(self, macs: Callable[[Any], int]) -> list[tuple[Any, int]]:
-        """Return the nodes that run, and how often each does; 0: nobody knows how often.
+    def run_counts(self, macs: Callable[[Any], int]) -> list[tuple[Any, int]]:
+        """Return the nodes that run, and the number of runs of each; 0: unknown.
 
-        Of the branches of an If it is the one with the most multiply-accumulates.
+        Of the branches of an If, the one with the most multiply-accumulates counts.
 
         Args:
-            macs: Returns those of a node.
+            macs: Function that returns the multiply-accumulates of a node.
         """
         return self._runs(self.items, 1, macs)
 
@@ -157,14 +157,14 @@ class Tensors:
                 bodies = [self._runs(body, times, macs) for body in item.bodies]
                 costs = [sum(macs(node) * max(1, count) for node, count in body) for body in bodies]
                 found += bodies[costs.index(max(costs))]
-            elif isinstance(item, Turns):
-                found += [] if item.count == 0 else self._runs(item.body, times * self._turns(item), macs)
+            elif isinstance(item, LoopBody):
+                found += [] if item.count == 0 else self._runs(item.body, times * self._loop_count(item), macs)
             else:
-                seen = self._seen.get(item.name)
+                seen = self._run_shapes.get(item.name)
                 found.append((item, times or (seen.times if seen else 0)))
         return found
 
-    def _turns(self, item: Turns) -> int:
+    def _loop_count(self, item: LoopBody) -> int:
         if item.count is not None:
             return item.count
         shape = self.shape(item.along[0]) if item.along else None
@@ -172,17 +172,17 @@ class Tensors:
 
 
 def open_graph(onnx: Any, path: Path) -> Tensors:
-    """Read an ONNX file without its external weights and infer shapes, a free first axis of an input being 1."""
-    model = named_everywhere(onnx.load(str(path), load_external_data=False))
+    """Read an ONNX file without its external weights and infer shapes; a dynamic first axis of an input becomes 1."""
+    model = with_unique_names(onnx.load(str(path), load_external_data=False))
     graph = model.graph
     for value in graph.input:
         axes = value.type.tensor_type.shape.dim
         if axes and not axes[0].HasField("dim_value"):
             axes[0].dim_value = 1
-    for value in graph.output:  # what was declared may name the axis that is now 1
+    for value in graph.output:  # the declared type may name the axis that is now 1
         value.ClearField("type")
     for item in graph.initializer:  # shapes do not depend on weights; this keeps a copy of them out of the inference
-        if len(item.raw_data) > LARGE:
+        if len(item.raw_data) > LARGE_CONSTANT:
             item.ClearField("raw_data")
     items: list[Any] = copy.deepcopy([*graph.node])
     if any(item.HasField("g") for node in items for item in node.attribute):
@@ -190,15 +190,15 @@ def open_graph(onnx: Any, path: Path) -> Tensors:
         known = {value.name: value for value in (*before.input, *before.value_info, *before.output)}
         opset = next((entry.version for entry in model.opset_import if entry.domain in DOMAINS), 0)
         items = flatten(graph, opset, known)
-    standard = [item for node in copy.deepcopy([*graph.node]) for item in _standard(onnx, node, graph)]
+    standard = [item for node in copy.deepcopy([*graph.node]) for item in _standard_nodes(onnx, node, graph)]
     del graph.node[:]
     graph.node.extend(standard)
     inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
-    return Tensors(onnx, items, inferred.graph, read_seen(model))
+    return Tensors(onnx, items, inferred.graph, read_run_shapes(model))
 
 
-def _standard(onnx: Any, node: Any, graph: Any) -> list[Any]:
-    """Return standard operators with the same output shape and dtype as a contributed one; other nodes as they are."""
+def _standard_nodes(onnx: Any, node: Any, graph: Any) -> list[Any]:
+    """Return standard operators with the output shape and dtype of a contributed one; other nodes unchanged."""
     kind, out = node.op_type, list(node.output)
     if kind == "MatMulNBits":
         sizes = {item.name: item.i for item in node.attribute}

@@ -1,7 +1,7 @@
-"""Count what one inference of a bundle has to compute and move, from its ONNX graphs alone.
+"""Count the computation and data movement of one inference of a bundle, from its ONNX graphs.
 
 A multiply-accumulate (MAC) is one multiplication and one addition; biases, activations and normalisations are not
-counted, as in the published tables that the predictions rest on.
+counted, as in the published tables that the predictions are based on.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from vlatool.errors import GraphError, require
 from vlatool.graph.macs import COMPUTE, CONVOLUTIONS, INTEGER_OPS, WEIGHT_AT, node_macs, precision_of
 from vlatool.graph.shapes import Tensors, open_graph
 
-DEPTHWISE = 121
-"""Products for each number that a depthwise convolution writes, at most (11 x 11)."""
-ONE_ROW = 2
-"""Times that a weight is used, at most, in a product of one row."""
+MAX_DEPTHWISE_PRODUCTS = 121
+"""Largest number of products for each output element of a depthwise convolution (11 x 11)."""
+MAX_ROW_REUSE = 2
+"""Largest number of uses of each weight in a product of one row."""
 TRAITS = ("depthwise", "attention", "grouped", "branches", "dense")
 """Depthwise convolutions; products of activations (attention); grouped convolutions; concatenated branches; most
 weights in matrix products of one row (the dense head of an early network, or the decoding of a language model)."""
@@ -30,22 +30,22 @@ weights in matrix products of one row (the dense head of an early network, or th
 
 @dataclass(frozen=True)
 class GraphWorkload:
-    """What one run of a graph computes and moves.
+    """Computation and data movement of one run of a graph.
 
     Args:
         macs: Precision (``float32``, ``int8``, ``int4`` ...) -> multiply-accumulates.
         layers: Compute layers (matrix products and convolutions).
-        weights: Numbers in the weights of the compute layers, each weight once, however they are stored.
-        activations: Numbers that the compute layers write.
-        traits: What the published latencies of its kind depend on, of ``TRAITS``.
-        weight_bytes: Bytes of all initializers as they are stored.
+        weights: Elements of the weights of the compute layers, each weight once, whatever its format.
+        activations: Elements that the compute layers write.
+        traits: Traits of ``TRAITS`` that published latencies depend on.
+        weight_bytes: Stored bytes of all initializers.
         activation_bytes: Bytes that the compute layers write.
-        peak_bytes: The most bytes of tensors, weights apart, that are alive at one node.
-        integer_ops: Whether int8 is computed by integer operators (MatMulInteger and its kin) and not in QDQ form.
-        unknown: Compute layers that cannot be counted, because their shapes are not static.
+        peak_bytes: Peak of bytes of live tensors, without weights.
+        integer_ops: Whether int8 is computed by integer operators (MatMulInteger and similar) instead of QDQ.
+        unknown: Compute layers that cannot be counted because their shapes are not static.
         parts: Part of the policy (vision, language ...; empty: none) -> multiply-accumulates, reads of weights,
-            activations and layers of its compute layers, but for those that are unknown.
-        read_again: Numbers that are read from a weight after the first time, as in the turns of a loop.
+            activations and layers of its compute layers, without unknown ones.
+        read_again: Elements that are read from a weight after the first time, as in iterations of a loop.
     """
 
     macs: Mapping[str, int] = field(default_factory=dict)
@@ -63,17 +63,17 @@ class GraphWorkload:
 
     @property
     def reads(self) -> int:
-        """Numbers that one run reads from weights."""
+        """Elements that one run reads from weights."""
         return self.weights + self.read_again
 
 
 @dataclass(frozen=True)
 class Workload:
-    """What one inference of a policy computes and moves.
+    """Computation and data movement of one inference of a policy.
 
     Args:
-        graphs: Graph name -> one run of it.
-        runs: Graph name -> runs in one inference, by the program.
+        graphs: Graph name -> workload of one run.
+        runs: Graph name -> runs in one inference of the program.
     """
 
     graphs: Mapping[str, GraphWorkload]
@@ -99,7 +99,7 @@ class Workload:
 
     @property
     def peak_bytes(self) -> int:
-        """Bytes of live tensors, each open graph keeping its own."""
+        """Peak of bytes of live tensors, summed over the graphs, which stay open."""
         return sum(graph.peak_bytes for graph in self.graphs.values())
 
     @property
@@ -131,7 +131,7 @@ def graph_workload(
     Args:
         path: The file.
         parts: Part of the policy -> globs of module names, to count each by itself.
-        count_as: What the multiply-accumulates of a layer are counted as.
+        count_as: Function that returns the category of a layer's multiply-accumulates.
 
     Raises:
         GraphError: when the file cannot be read.
@@ -144,12 +144,12 @@ def graph_workload(
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise GraphError(
             f"{path} cannot be read as ONNX: {reason}",
-            "check that the file is whole: onnx.checker.check_model(FILE) says more; a bundle's is to be made again",
+            "check that the file is complete: onnx.checker.check_model(FILE); make a bundle again",
         ) from error
     return _count(tensors, parts or {}, count_as)
 
 
-def part_named(name: str, parts: Mapping[str, Sequence[str]]) -> str:
+def part_of(name: str, parts: Mapping[str, Sequence[str]]) -> str:
     """Return the first part that a module, or a node named after one (``head/MatMul``), belongs to; empty for none."""
     names = (name, name.rpartition("/")[0] or name)
     return next((part for part, globs in parts.items() if _matches(names, globs)), "")
@@ -165,9 +165,9 @@ def _count(
     macs: Counter[str] = Counter()
     tally = Tally()
     activation_bytes = 0
-    unknown = [*tensors.hidden(COMPUTE)]
-    for node, times in tensors.runs(lambda node: (node.op_type in COMPUTE and node_macs(node, tensors)) or 0):
-        tally.concat(node.op_type == "Concat")
+    unknown = [*tensors.nodes_with_inner(COMPUTE)]
+    for node, times in tensors.run_counts(lambda node: (node.op_type in COMPUTE and node_macs(node, tensors)) or 0):
+        tally.add_concat(node.op_type == "Concat")
         if node.op_type not in COMPUTE:
             continue
         count = node_macs(node, tensors)
@@ -178,10 +178,10 @@ def _count(
             continue
         macs[count_as(node, tensors)] += times * count
         activation_bytes += times * sum(size or 0 for size in written)
-        part = part_named(node.name, parts)
+        part = part_of(node.name, parts)
         written_numbers = math.prod(tensors.shape(node.output[0]) or ())
         weights, groups = _operands(node, tensors)
-        tally.layer(count, written_numbers, weights, groups, part, _weight_of(node, tensors), times)
+        tally.add_layer(count, written_numbers, weights, groups, part, _weight_of(node, tensors), times)
     integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
     return GraphWorkload(
         dict(macs), tally.layers, tally.weights, tally.activations, tally.traits(), tensors.weight_bytes,
@@ -190,7 +190,7 @@ def _count(
 
 
 def _operands(node: Any, tensors: Tensors) -> tuple[int, int]:
-    """Return the numbers in a layer's weight (0 for a product of activations) and the groups of a convolution."""
+    """Return the elements of a layer's weight (0 for a product of activations) and the groups of a convolution."""
     if node.op_type == "MatMulNBits":
         return int(tensors.attribute(node, "K", 0)) * int(tensors.attribute(node, "N", 0)), 1
     second = node.input[WEIGHT_AT.get(node.op_type, 1)] if len(node.input) > WEIGHT_AT.get(node.op_type, 1) else ""
@@ -200,14 +200,14 @@ def _operands(node: Any, tensors: Tensors) -> tuple[int, int]:
 
 
 def _weight_of(node: Any, tensors: Tensors) -> str:
-    """Return the name of the tensor that is stored for a layer's weight."""
-    place = WEIGHT_AT.get(node.op_type, 1)
-    return tensors.root(node.input[place]) if len(node.input) > place else ""
+    """Return the name of the stored tensor of a layer's weight."""
+    index = WEIGHT_AT.get(node.op_type, 1)
+    return tensors.source_tensor(node.input[index]) if len(node.input) > index else ""
 
 
 @dataclass
 class Tally:
-    """Sums over the compute layers of a graph, however they were found."""
+    """Sums over the compute layers of a graph, whatever their source."""
 
     layers: int = 0
     weights: int = 0
@@ -222,7 +222,7 @@ class Tally:
     _parts: dict[str, tuple[int, int, int, int]] = field(default_factory=dict)
     _seen: set[Hashable] = field(default_factory=set)
 
-    def layer(
+    def add_layer(
         self,
         macs: int,
         written: int,
@@ -232,12 +232,11 @@ class Tally:
         weight: Hashable = "",
         times: int = 1,
     ) -> None:
-        """Take in a layer: its multiply-accumulates, the numbers that it writes, its weights, groups and part.
+        """Add a layer: its multiply-accumulates, the elements that it writes, its weights, groups and part.
 
         Args:
-            weight: What tells its weight from others; a weight that was seen before is read again, not stored again.
-                Empty: a weight of its own.
-            times: How often it runs.
+            weight: Identity of its weight; a known weight is read again, not stored again. Empty: a new weight.
+            times: Number of runs.
         """
         before = self._parts.get(part, (0, 0, 0, 0))
         added = zip(before, (times * macs, times * weights, times * written, times), strict=True)
@@ -249,21 +248,21 @@ class Tally:
         self._seen.update([weight] if weight else [])
         self.activations += times * written
         self._macs += times * macs
-        self._depthwise += times * (groups > 1 and macs <= DEPTHWISE * written)
-        self._grouped += times * (macs if groups > 1 and macs > DEPTHWISE * written else 0)
+        self._depthwise += times * (groups > 1 and macs <= MAX_DEPTHWISE_PRODUCTS * written)
+        self._grouped += times * (macs if groups > 1 and macs > MAX_DEPTHWISE_PRODUCTS * written else 0)
         self._products += times * (macs if not weights else 0)
-        self._rows += times * (weights if macs <= ONE_ROW * weights else 0)
+        self._rows += times * (weights if macs <= MAX_ROW_REUSE * weights else 0)
 
-    def concat(self, concatenates: bool) -> None:
-        """Take in a node that may be a concatenation."""
+    def add_concat(self, concatenates: bool) -> None:
+        """Add a node that may be a concatenation."""
         self._concats += concatenates
 
     def parts(self) -> dict[str, tuple[int, int, int, int]]:
-        """Return the sums of each part; nothing when all layers are of none."""
+        """Return the sums of each part; empty when no layer belongs to a part."""
         return dict(self._parts) if set(self._parts) - {""} else {}
 
     def traits(self) -> frozenset[str]:
-        """Return which of ``TRAITS`` the graph has."""
+        """Return the traits of ``TRAITS`` that the graph has."""
         layers, macs, weights = max(1, self.layers), max(1, self._macs), max(1, self.weights + self.read_again)
         has = (
             self._depthwise >= 0.15 * layers, self._products >= 0.005 * macs, self._grouped >= 0.2 * macs,
@@ -272,11 +271,11 @@ class Tally:
         return frozenset(trait for trait, present in zip(TRAITS, has, strict=True) if present)
 
 
-WORK = "workload"
-"""Table of a benchmark's row: what one inference computes."""
+WORKLOAD_TABLE = "workload"
+"""Table in a benchmark's row with the workload of one inference."""
 
 
-def whole_work(load: Workload) -> dict[str, Any]:
+def summarize_workload(load: Workload) -> dict[str, Any]:
     """Return the work of one inference as one record: sums over its graphs and their repeats."""
     sums = {"macs": 0.0, "weights": 0.0, "activations": 0.0, "layers": 0.0}
     traits: set[str] = set()
@@ -296,7 +295,7 @@ def whole_work(load: Workload) -> dict[str, Any]:
 
 
 def stored_precision(graph: GraphWorkload) -> str:
-    """Return the precision that most of a graph's multiply-accumulates have."""
+    """Return the precision of most of a graph's multiply-accumulates."""
     most = max(graph.macs, key=lambda name: graph.macs[name], default="float32")
     return {"int4": "w4", "uint8": "int8", "float4": "float8"}.get(most, most if most in PRECISIONS else "float32")
 

@@ -1,4 +1,4 @@
-"""How much of a bundle's weights is zero."""
+"""Share of zeros in a bundle's weights."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, MissingExtra, require
 from vlatool.graph.files import read
 
-MOST_BYTES = 2_000_000_000
-"""Graphs above this are not looked into."""
+MAX_BYTES = 2_000_000_000
+"""Largest size of graphs that are read."""
 FLOATS = (1, 10)
 """``TensorProto.FLOAT`` and ``FLOAT16``."""
 
@@ -18,9 +18,9 @@ def zero_share(bundle: Bundle) -> float:
     """Return the share of zeros among the floating-point weights with two axes or more; 0 where they are not read.
 
     Args:
-        bundle: With graphs. They are not read where onnx is not installed, or they are larger than 2 GB.
+        bundle: Bundle with graphs, which are not read without onnx installed, or above 2 GB.
     """
-    if not bundle.manifest.graphs or bundle.graph_bytes > MOST_BYTES:
+    if not bundle.manifest.graphs or bundle.graph_bytes > MAX_BYTES:
         return 0.0
     zeros = total = 0
     try:

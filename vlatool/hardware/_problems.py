@@ -1,4 +1,4 @@
-"""What is wrong in a profile: one line for each field, in words."""
+"""Problems of a profile: one line for each field."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vlatool.errors import suggest
 UNITS = ("cpu", "gpu", "npu")
 WEIGHTS = ("w8", "w4")
 """Weights alone in few bits; they are computed with in float16 or float32."""
-WORDS = {
+REASONS = {
     "missing": "is missing",
     "model_type": "must be a mapping",
     "dict_type": "must be a mapping",
@@ -23,7 +23,7 @@ WORDS = {
 }
 
 
-def problem(error: ErrorDetails, known: Iterable[str]) -> str:
+def describe_problem(error: ErrorDetails, known: Iterable[str]) -> str:
     """Return ``field: what is wrong`` for one finding of pydantic."""
     kind, got = error["type"], f"; got {error['input']!r}"
     where = ".".join(str(part) for part in error["loc"] if part != "[key]")
@@ -33,10 +33,10 @@ def problem(error: ErrorDetails, known: Iterable[str]) -> str:
     if kind == "value_error":
         return f"{where}: {error['msg'].removeprefix('Value error, ')}"
     words = error["msg"].replace("Input should be", "must be").replace("greater than 0", "above 0")
-    return f"{where}: {WORDS.get(kind, words)}{'' if kind == 'missing' else got}"
+    return f"{where}: {REASONS.get(kind, words)}{'' if kind == 'missing' else got}"
 
 
-def wrong_sources(value: Any, sources: Mapping[str, str], where: str = "") -> Iterator[str]:
+def source_problems(value: Any, sources: Mapping[str, str], where: str = "") -> Iterator[str]:
     """Yield a problem for each figure below ``value`` whose source is not listed."""
     if isinstance(value, BaseModel):
         source = getattr(value, "source", None)
@@ -45,10 +45,10 @@ def wrong_sources(value: Any, sources: Mapping[str, str], where: str = "") -> It
         value = dict(value)
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, tuple) else ()
     for key, item in items:
-        yield from wrong_sources(item, sources, f"{where}{key}.")
+        yield from source_problems(item, sources, f"{where}{key}.")
 
 
-def wrong_names(profile: Any) -> Iterator[str]:
+def name_problems(profile: Any) -> Iterator[str]:
     """Yield a problem for each reference to a unit or mode that does not exist."""
     for unit_name in set(profile.units) - set(UNITS):
         yield f"units.{unit_name}: is not a kind of unit; {suggest(unit_name, UNITS)}"

@@ -17,7 +17,7 @@ class Platform(Strict):
 
     Args:
         control_hz: Rate of the actions.
-        compute_watts: What the battery and the cooling leave for the computer.
+        compute_watts: Power that battery and cooling leave for the computer.
         battery_wh: None for a robot on mains power.
         sensors: With their rates.
     """

@@ -23,14 +23,14 @@ from vlatool.errors import OutputError, ProfileError, fix_for, suggest
 from vlatool.files.numbers import Numeric
 from vlatool.files.user_files import remove_stamp, write_own_file
 from vlatool.files.yaml import read_mapping
-from vlatool.hardware._problems import problem, wrong_names, wrong_sources
+from vlatool.hardware._problems import describe_problem, name_problems, source_problems
 
 SEARCH_PATH = "VLATOOL_PROFILES"
 SUFFIXES = (".yaml", ".yml")
 NAME = r"^[a-z0-9][a-z0-9-]*$"
 
 Kind = Literal["vendor", "measured", "derived", "estimate", "unverified"]
-COMPUTED = ("float32", "float16", "bfloat16", "float8", "int8", "w8", "w4")
+COMPUTE_DTYPES = ("float32", "float16", "bfloat16", "float8", "int8", "w8", "w4")
 """Precisions of a candidate: a dtype of weights and activations, or of weights alone."""
 DTYPES = ("float32", "tf32", "float16", "bfloat16", "float8", "int8", "int4", "float4")
 
@@ -51,7 +51,7 @@ def _version(text: str) -> str:
 
 
 Dtype = Annotated[str, _one_of(DTYPES, "a dtype")]
-Computed = Annotated[str, _one_of(COMPUTED, "what an engine computes in")]
+Computed = Annotated[str, _one_of(COMPUTE_DTYPES, "what an engine computes in")]
 Version = Annotated[str, AfterValidator(_version)]
 
 
@@ -163,12 +163,12 @@ class Profile(Strict):
     Args:
         name: As on the command line; lower case, digits and hyphens.
         aliases: Other names that people type for it.
-        model_strings: What the board's firmware or processor calls itself (see ``vlatool.machine.host.matches``).
+        model_strings: Names of the board in its firmware or processor (see ``vlatool.machine.host.matches``).
         memory_gb: Memory in GB (10^9 bytes), shared by CPU and GPU where ``unified``.
-        usable_memory_gb: What is left for a policy beside system, desktop and drivers.
+        usable_memory_gb: Memory left for a policy besides system, desktop and drivers.
         bandwidth_gb_s: Peak memory bandwidth.
         power_w: The most that the board draws.
-        idle_w: What it draws when it does nothing.
+        idle_w: Idle power.
         price_usd: What the board costs, or what it costs to have one of its kind installed (see the note).
         price_usd_per_hour: What an hour of it costs where it is rented: it then is a cloud machine, no board.
         storage: Storage that was tested to boot and to hold a policy.
@@ -177,7 +177,7 @@ class Profile(Strict):
         engines: Engine -> how well it does here, the preferred one first.
         modes: Name -> power mode.
         default_mode: The mode in which the board starts.
-        caveats: What a person should know before trusting a plan for this board.
+        caveats: Caveats of plans for this board.
         sources: Key -> public reference.
     """
 
@@ -207,7 +207,7 @@ class Profile(Strict):
 
     @model_validator(mode="after")
     def _consistent(self) -> Profile:
-        problems = [*wrong_sources(self, self.sources), *wrong_names(self)]
+        problems = [*source_problems(self, self.sources), *name_problems(self)]
         if self.usable_memory_gb.value > self.memory_gb.value:
             problems.append("usable_memory_gb.value: is more than memory_gb")
         if problems:
@@ -255,9 +255,9 @@ class Profile(Strict):
 KEYS = {key for model in (Profile, Unit, EngineFigures, PowerMode, Software, Price) for key in model.model_fields}
 
 
-def names() -> list[str]:
+def profile_names() -> list[str]:
     """List the profiles that ``load_profile`` finds by name."""
-    return sorted(_found())
+    return sorted(_find_profiles())
 
 
 def load_profile(name_or_path: str | os.PathLike[str]) -> Profile:
@@ -277,7 +277,7 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> Profile:
     try:
         return Profile.model_validate(data)
     except ValidationError as error:
-        problems = [problem(item, KEYS) for item in error.errors(include_url=False)]
+        problems = [describe_problem(item, KEYS) for item in error.errors(include_url=False)]
     except ProfileError as error:  # from the checks between fields; pydantic lets foreign exceptions through
         problems = error.message.splitlines()
     listed = "\n".join(f"  {problem}" for problem in problems)
@@ -317,7 +317,7 @@ def profile_file(wanted: str) -> Path:
     """
     if wanted.endswith(SUFFIXES) or os.sep in wanted:
         return Path(wanted)
-    files = _found()
+    files = _find_profiles()
     if wanted in files:
         return files[wanted]
     typed = re.sub(r"[\s_]+", "-", wanted.strip().lower())
@@ -348,7 +348,7 @@ def _folder(entry: EntryPoint) -> Path | None:
     return Path(next(iter(places))) if places else None
 
 
-def _found() -> dict[str, Path]:
+def _find_profiles() -> dict[str, Path]:
     """Profile name -> file; the first directory that has it wins."""
     package = Path(__file__).resolve().parents[1]
     shipped = next((place for place in (package / "_profiles", package.parent / "profiles") if place.is_dir()), None)

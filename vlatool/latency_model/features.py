@@ -1,4 +1,4 @@
-"""What the latency model knows of a question: the work, what computes it, and in which precision."""
+"""Features of the latency model: the work, the compute unit, and the precision."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from vlatool.latency_model.gaussian_process import KEYS, Rows
 
 Array = NDArray[Any]
 
-ALIKE = {"bfloat16": "float16", "float8": "int8"}
-"""Precision -> the one whose published latencies speak for it."""
+PROXIES = {"bfloat16": "float16", "float8": "int8"}
+"""Precision -> precision whose published latencies stand for it."""
 CENTRE = np.array([0.6, 1.8, 2.0, 4.0])
 SPREAD = np.array([1.8, 0.6, 1.0, 0.6])
 DEVICE_CENTRE = np.array([0.3, 4.3, 0.6, 2.0])
@@ -28,15 +28,15 @@ LAYER_MS = 0.03
 
 @dataclass(frozen=True)
 class Work:
-    """One graph, once.
+    """Work of one run of a graph.
 
     Args:
         macs: Multiply-accumulates.
-        weights: Numbers that it reads from weights, as often as it reads them.
-        activations: Numbers that its compute layers write.
-        layers: Compute layers.
-        traits: Of ``TRAITS``.
-        name: What it is called where it was published; unique for a user's own graph.
+        weights: Elements read from weights, counted at each read.
+        activations: Elements that its compute layers write.
+        layers: Number of compute layers.
+        traits: Traits of ``TRAITS``.
+        name: Published name; unique for a user's own graph.
     """
 
     macs: float
@@ -48,19 +48,18 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Place:
-    """What computes.
+class ComputeUnit:
+    """A unit of a device that computes.
 
     Args:
-        device: Name of the board or processor; two places with one name share what is known of it.
+        device: Name of the board or processor; units with one name share what is known about it.
         unit: ``cpu``, ``gpu``, ``igpu`` or ``npu``.
-        cores: Cores (threads) that take part.
-        clock_ghz: Of them.
+        cores: Number of cores (threads) in use.
+        clock_ghz: Clock of the cores.
         peaks: Precision -> 10^12 operations per second, dense; at least one.
-        bandwidth_gb_s: Of the memory.
-        setting: What else a measurement was taken with: power mode, threads, version.
-        isa: Instruction set features of its cores, in words, as profiles have them: places with the same ones speak
-            for each other.
+        bandwidth_gb_s: Bandwidth of the memory.
+        setting: Other conditions of a measurement: power mode, threads, version.
+        isa: Instruction set features of its cores, as in profiles: units with the same features inform each other.
     """
 
     device: str
@@ -73,32 +72,32 @@ class Place:
     isa: str = ""
 
     def peak(self, precision: str) -> float:
-        """Return the peak that a precision computes at: that of float16, or float32, for weights alone in few bits."""
+        """Return the peak of a precision; for weight-only precisions that of float16, or float32."""
         computed = {"w4": "float16", "w8": "float16"}.get(precision, precision)
-        chain = (computed, ALIKE.get(computed, computed), "float16" if computed in ALIKE else "float32", "float32")
+        chain = (computed, PROXIES.get(computed, computed), "float16" if computed in PROXIES else "float32", "float32")
         return next((self.peaks[name] for name in chain if name in self.peaks), max(self.peaks.values()))
 
 
 @dataclass(frozen=True)
 class Question:
-    """How long this work takes there.
+    """A question to the model: the latency of this work on this compute unit.
 
     Args:
-        runtime: Inference library, as ``_points`` names it.
+        runtime: Inference library.
         precision: A key of ``PRECISIONS``.
     """
 
     work: Work
-    place: Place
+    compute_unit: ComputeUnit
     runtime: str
     precision: str
 
 
 @dataclass(frozen=True)
 class Shares:
-    """What is reached of the peaks before anything is known (0-1), and a factor on ``LAYER_MS``.
+    """Prior shares of the peaks that are reached (0-1), and a factor on ``LAYER_MS``.
 
-    Weights are read in one stream, activations are written and read in pieces: each has a share of the bandwidth.
+    Weights are read in one stream, activations are written and read in pieces: each has its own share of the bandwidth.
     """
 
     compute: float = 0.3
@@ -108,32 +107,32 @@ class Shares:
 
 
 def roofline_ms(question: Question, shares: Shares) -> float:
-    """Return compute, memory and layers in ms, added up."""
+    """Return the sum of compute, memory and overhead in ms."""
     return sum(roofline_parts(question, shares).values())
 
 
 def roofline_parts(question: Question, shares: Shares) -> dict[str, float]:
     """Return ``compute``, ``memory`` and ``overhead`` in ms (Williams, Waterman, Patterson, CACM 2009)."""
-    work, place = question.work, question.place
+    work, compute_unit = question.work, question.compute_unit
     weight, activation = PRECISIONS[question.precision]
     moved = work.weights * weight / shares.weights + work.activations * activation / shares.activations
     return {
-        "compute": 2e3 * work.macs / (place.peak(question.precision) * 1e12 * shares.compute),
-        "memory": 1e3 * moved / (place.bandwidth_gb_s * 1e9),
-        "overhead": work.layers / place.clock_ghz * LAYER_MS * shares.layers,
+        "compute": 2e3 * work.macs / (compute_unit.peak(question.precision) * 1e12 * shares.compute),
+        "memory": 1e3 * moved / (compute_unit.bandwidth_gb_s * 1e9),
+        "overhead": work.layers / compute_unit.clock_ghz * LAYER_MS * shares.layers,
     }
 
 
 def rows_of(questions: Iterable[Question], shares: Shares) -> Rows:
     """Return the rows of the process for some questions."""
-    asked = list(questions)
-    keys = [_keys(question) for question in asked]
+    listed = list(questions)
+    keys = [_keys(question) for question in listed]
     return Rows(
         {name: np.array([row[name] for row in keys], np.int64) for name in KEYS},
-        np.array([_model(question.work) for question in asked]).reshape(-1, 4),
-        np.array([[trait in question.work.traits for trait in TRAITS] for question in asked], float).reshape(-1, 5),
-        np.array([_device(question) for question in asked]).reshape(-1, 4),
-        np.log([roofline_ms(question, shares) for question in asked]),
+        np.array([_model(question.work) for question in listed]).reshape(-1, 4),
+        np.array([[trait in question.work.traits for trait in TRAITS] for question in listed], float).reshape(-1, 5),
+        np.array([_device(question) for question in listed]).reshape(-1, 4),
+        np.log([roofline_ms(question, shares) for question in listed]),
     )
 
 
@@ -145,22 +144,22 @@ def _model(work: Work) -> Array:
 
 
 def _device(question: Question) -> Array:
-    place = question.place
-    values = (place.peak(question.precision), place.bandwidth_gb_s, place.clock_ghz, place.cores)
+    unit = question.compute_unit
+    values = (unit.peak(question.precision), unit.bandwidth_gb_s, unit.clock_ghz, unit.cores)
     return np.asarray((np.log(values) - DEVICE_CENTRE) / DEVICE_SPREAD)
 
 
 def _keys(question: Question) -> dict[str, int]:
-    place, runtime = question.place, question.runtime
-    precision = ALIKE.get(question.precision, question.precision)
+    compute_unit, runtime = question.compute_unit, question.runtime
+    precision = PROXIES.get(question.precision, question.precision)
     work = question.work
     own = f"own {work.macs} {work.weights} {work.activations} {work.layers} {sorted(work.traits)}"
     name = f"{work.name} {work.macs:.3g}" if work.name else own
-    unit = f"{place.device}/{place.unit}"
-    core = f"{place.unit}/{' '.join(sorted(place.isa.split()))}" if place.isa else unit
+    unit = f"{compute_unit.device}/{compute_unit.unit}"
+    core = f"{compute_unit.unit}/{' '.join(sorted(compute_unit.isa.split()))}" if compute_unit.isa else unit
     names = (
-        place.unit, core, unit, runtime, f"{runtime} {precision}", f"{core} {runtime} {precision}", f"{unit} {runtime}",
-        f"{unit} {runtime} {precision}", f"{unit} {runtime} {precision} {place.setting}", name,
-        f"{name} {runtime} {precision}",
+        compute_unit.unit, core, unit, runtime, f"{runtime} {precision}", f"{core} {runtime} {precision}",
+        f"{unit} {runtime}", f"{unit} {runtime} {precision}", f"{unit} {runtime} {precision} {compute_unit.setting}",
+        name, f"{name} {runtime} {precision}",
     )  # fmt: skip
     return {key: zlib.crc32(text.encode()) for key, text in zip(KEYS, names, strict=True)}

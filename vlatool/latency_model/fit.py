@@ -20,45 +20,45 @@ from vlatool.errors import DataError, OutputError
 from vlatool.latency_model.features import Shares, rows_of
 from vlatool.latency_model.folds import UNITS, Folds, Sample
 from vlatool.latency_model.gaussian_process import Scales
-from vlatool.latency_model.model import DATA, LEVEL, Known, LatencyModel, read_model, write
-from vlatool.latency_model.published import Point, merged, read_points
+from vlatool.latency_model.model import DATA, LEVEL, LatencyModel, TrainingData, read_model, write
+from vlatool.latency_model.published_latencies import Point, merge_versions, read_points
 
 Array = NDArray[Any]
-TAIL = 0.3
-"""What the 90th percentile counts beside the median."""
-DEVICES = 0.6
-"""What an unseen device counts beside an unseen model."""
-CALIBRATED, QUICK = 0.6, 6
-"""What a device counts of which one model is known; how many of its models are tried in the search for scales."""
-STEP, LEAST_STEP = 0.5, 0.04
-"""Of the search for scales, in their logarithm: the first, and what is too small to try."""
-MOST = 32
-"""Figures of one device, runtime and precision that the search for scales looks at."""
+TAIL_WEIGHT = 0.3
+"""Weight of the 90th percentile relative to the median."""
+DEVICE_WEIGHT = 0.6
+"""Weight of an unseen device relative to an unseen model."""
+CALIBRATED_WEIGHT, MAX_SEARCH_MODELS = 0.6, 6
+"""Weight of a device with one known model; number of its models in the search for scales."""
+INITIAL_STEP, MIN_STEP = 0.5, 0.04
+"""Steps of the search for scales, in their logarithm: the first, and the smallest."""
+MAX_SEARCH_FIGURES = 32
+"""Largest number of figures of one device, runtime and precision in the search for scales."""
 
 
 def loss(error: Array) -> float:
-    """Return median and 90th percentile of the relative error, weighed."""
+    """Return the weighted sum of median and 90th percentile of the relative error."""
     if not len(error):
         return 0.0
-    off = np.abs(np.expm1(error))
-    return float(np.median(off) + TAIL * np.quantile(off, 0.9))
+    relative = np.abs(np.expm1(error))
+    return float(np.median(relative) + TAIL_WEIGHT * np.quantile(relative, 0.9))
 
 
-def assess(sample: Sample, scales: Scales, shares: Shares) -> float:
-    """Return what the search for scales lowers."""
+def search_objective(sample: Sample, scales: Scales, shares: Shares) -> float:
+    """Return the objective that the search for scales minimizes."""
     folds = Folds(rows_of(sample.questions, shares), sample, scales)
     likelihood = 0.0
     total = 0.0
-    for groups, weight in ((sample.models, 1.0), (sample.devices, DEVICES)):
-        error, deviation = folds.without(groups)
+    for groups, weight in ((sample.models, 1.0), (sample.devices, DEVICE_WEIGHT)):
+        error, deviation = folds.leave_out(groups)
         total += weight * loss(error)
         likelihood += weight * float(np.mean(np.log(deviation) + 0.5 * (error / deviation) ** 2))
-    total += CALIBRATED * loss(folds.calibrated(sample.devices, QUICK)[0])
-    return total + LIKELIHOOD * likelihood
+    total += CALIBRATED_WEIGHT * loss(folds.leave_out_calibrated(sample.devices, MAX_SEARCH_MODELS)[0])
+    return total + LIKELIHOOD_WEIGHT * likelihood
 
 
-LIKELIHOOD = 0.05
-"""What the predictive likelihood counts: it keeps the intervals honest where the error alone does not care."""
+LIKELIHOOD_WEIGHT = 0.05
+"""Weight of the predictive likelihood, which keeps the intervals honest where the error is indifferent."""
 
 
 def tune(
@@ -69,37 +69,37 @@ def tune(
     seed: int = 0,
     tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[Scales, Shares]:
-    """Search scales and shares by coordinates, in the logarithm, until the time is over.
+    """Search scales and shares by coordinate descent in the logarithm, until the time is over.
 
     Args:
-        seconds: For the search.
-        seed: Of the order of the coordinates.
-        tell: Called with each improvement.
+        seconds: Time limit of the search.
+        seed: Random seed of the order of the coordinates.
+        tell: Receiver of each improvement.
     """
     names = [field.name for field in dataclasses.fields(Scales) if field.name != "constant"]
     names += [f"shares.{field.name}" for field in dataclasses.fields(Shares)]
     random = np.random.default_rng(seed)
-    steps = dict.fromkeys(names, STEP)  # with the sign of the direction that helped last
-    best = assess(sample, scales, shares)
-    begun = time.monotonic()
-    while active := [name for name in names if abs(steps[name]) > LEAST_STEP]:
+    steps = dict.fromkeys(names, INITIAL_STEP)  # with the sign of the direction that helped last
+    best = search_objective(sample, scales, shares)
+    started = time.monotonic()
+    while active := [name for name in names if abs(steps[name]) > MIN_STEP]:
         for name in random.permutation(active):
-            if time.monotonic() - begun > seconds:
+            if time.monotonic() - started > seconds:
                 return scales, shares
-            better = False
+            improved = False
             for step in (steps[name], -steps[name]):
-                tried = _changed(scales, shares, name, math.exp(step))
-                cost = assess(sample, *tried) if tried else math.inf
+                candidate = _scaled_parameter(scales, shares, name, math.exp(step))
+                cost = search_objective(sample, *candidate) if candidate else math.inf
                 if cost < best - 1e-4:
-                    (scales, shares), best, better = tried or (scales, shares), cost, True
+                    (scales, shares), best, improved = candidate or (scales, shares), cost, True
                     steps[name] = step
-                    tell(f"{time.monotonic() - begun:.0f} s, {name}: {best:.4f}")
+                    tell(f"{time.monotonic() - started:.0f} s, {name}: {best:.4f}")
                     break
-            steps[name] *= 1.3 if better else 0.6
+            steps[name] *= 1.3 if improved else 0.6
     return scales, shares
 
 
-def _changed(scales: Scales, shares: Shares, name: str, factor: float) -> tuple[Scales, Shares] | None:
+def _scaled_parameter(scales: Scales, shares: Shares, name: str, factor: float) -> tuple[Scales, Shares] | None:
     part = name.removeprefix("shares.")
     if part == name:
         return replace(scales, **{name: getattr(scales, name) * factor}), shares
@@ -108,35 +108,35 @@ def _changed(scales: Scales, shares: Shares, name: str, factor: float) -> tuple[
 
 
 def conformal(sample: Sample, scales: Scales, shares: Shares) -> dict[str, dict[str, float]]:
-    """Return regime -> unit -> how many standard deviations reach ``LEVEL`` of what is left out (split conformal).
+    """Return regime -> unit -> standard deviations that cover ``LEVEL`` of the left-out figures (split conformal).
 
-    Where a unit has few models or devices, it is drawn towards all of the regime (``Scores.reach``).
+    A unit with few models or devices is shrunk towards all units of the regime (``Scores.quantile``).
     """
     rows = rows_of(sample.questions, shares)
     folds = Folds(rows, sample, scales)
     spans: dict[str, dict[str, float]] = {}
     for regime, scores in (
-        ("known", Scores.of(sample, *folds.without(sample.models), sample.models, sample.models)),
-        ("unseen", Scores.of(sample, *folds.without(sample.devices), sample.devices, rows.keys["pair"])),
-        ("calibrated", Scores.calibrated(sample, folds)),
+        ("known", Scores.for_sample(sample, *folds.leave_out(sample.models), sample.models, sample.models)),
+        ("unseen", Scores.for_sample(sample, *folds.leave_out(sample.devices), sample.devices, rows.keys["pair"])),
+        ("calibrated", Scores.for_calibrated(sample, folds)),
     ):
-        spans[regime] = {unit: scores.reach(number) for number, unit in enumerate(UNITS)}
+        spans[regime] = {unit: scores.quantile(number) for number, unit in enumerate(UNITS)}
     return spans
 
 
-ALL_COUNT = 4
-"""Models or devices that all units together count for beside those of one unit: few of a unit say little."""
+SHRINKAGE_COUNT = 4
+"""Weight of all units together, in models or devices of one unit: few of them say little."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How many standard deviations left-out figures are away.
+    """Distances of left-out figures in standard deviations.
 
     Args:
-        values: (n,) for each published figure, several versions of a runtime apart.
-        groups: (n,) what it was left out with.
+        values: (n,) distance of each published figure, versions of a runtime counted separately.
+        groups: (n,) group that it was left out with.
         units: (n,) index into ``UNITS``.
-        draws: (n,) which draw it is of: a model; a device with a runtime and precision; a device with the model that
+        draws: (n,) index of the draw: a model; a device with a runtime and precision; a device with the model that
             calibrates it.
     """
 
@@ -146,31 +146,31 @@ class Scores:
     draws: Array
 
     @staticmethod
-    def of(sample: Sample, error: Array, deviation: Array, groups: Array, draws: Array) -> Scores:
+    def for_sample(sample: Sample, error: Array, deviation: Array, groups: Array, draws: Array) -> Scores:
         """Return the scores of every row of a sample."""
-        place = sample.figures
-        values = np.abs(error[place] + sample.logs[place] - sample.published) / deviation[place]
-        return Scores(values, groups[place], sample.units[place], draws[place])
+        figure_rows = sample.figures
+        values = np.abs(error[figure_rows] + sample.logs[figure_rows] - sample.published) / deviation[figure_rows]
+        return Scores(values, groups[figure_rows], sample.units[figure_rows], draws[figure_rows])
 
     @staticmethod
-    def calibrated(sample: Sample, folds: Folds) -> Scores:
-        """Return the scores of devices of which one model is known, for many of their models."""
-        error, deviation, places, draws = folds.calibrated(sample.devices)
+    def for_calibrated(sample: Sample, folds: Folds) -> Scores:
+        """Return the scores of devices with one known model, for many of their models."""
+        error, deviation, rows, draws = folds.leave_out_calibrated(sample.devices)
         order = np.argsort(sample.figures, kind="stable")
         starts = np.searchsorted(sample.figures[order], np.arange(len(sample.logs) + 1))
-        copies = np.diff(starts)[places]  # versions of each row
-        copy = np.repeat(np.arange(len(places)), copies)
-        figure = order[np.repeat(starts[places] - np.append(0, np.cumsum(copies)[:-1]), copies) + np.arange(len(copy))]
-        at = places[copy]
+        copies = np.diff(starts)[rows]  # versions of each row
+        copy = np.repeat(np.arange(len(rows)), copies)
+        figure = order[np.repeat(starts[rows] - np.append(0, np.cumsum(copies)[:-1]), copies) + np.arange(len(copy))]
+        at = rows[copy]
         values = np.abs(error[copy] + sample.logs[at] - sample.published[figure]) / deviation[copy]
         return Scores(values, sample.devices[at], sample.units[at], draws[copy])
 
-    def reach(self, unit: int, but: int | None = None) -> float:
-        """Return the score that ``LEVEL`` do not exceed: this unit's, drawn towards all units' where it has few groups.
+    def quantile(self, unit: int, but: int | None = None) -> float:
+        """Return the ``LEVEL`` quantile of a unit's scores, shrunk towards that of all units where it has few groups.
 
         Args:
             unit: Index into ``UNITS``.
-            but: A group that takes no part.
+            but: Excluded group.
         """
         others = np.ones(len(self.values), bool) if but is None else self.groups != but
         alike = others & (self.units == unit)
@@ -178,40 +178,40 @@ class Scores:
             return math.inf
         apart = len(np.unique(self.groups[alike]))
         own = self._share(alike) if apart else 0.0
-        return (apart * own + ALL_COUNT * self._share(others)) / (apart + ALL_COUNT)
+        return (apart * own + SHRINKAGE_COUNT * self._share(others)) / (apart + SHRINKAGE_COUNT)
 
     def _share(self, rows: Array) -> float:
-        """Return the score that ``LEVEL`` of some rows do not exceed."""
+        """Return the ``LEVEL`` quantile of the scores of some rows."""
         values, groups, draws = self.values[rows], self.groups[rows], len(np.unique(self.draws[rows]))
         _, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
-        weights = counts[inverse] ** -0.5  # figures of one group are no independent witnesses
+        weights = counts[inverse] ** -0.5  # figures of one group are not independent
         order = np.argsort(values)
         share = np.cumsum(weights[order]) / weights.sum()
-        level = LEVEL * (draws + 1) / draws  # what comes is one draw more (Lei et al., JASA 2018, section 2)
+        level = LEVEL * (draws + 1) / draws  # a prediction is one draw more (Lei et al., JASA 2018, section 2)
         return float(values[order][min(len(order) - 1, int(np.searchsorted(share, level)))])
 
 
 PARTS = ("processors", "npu")
 
 
-def by_part(points: Sequence[Point]) -> dict[str, list[Point]]:
+def split_by_part(points: Sequence[Point]) -> dict[str, list[Point]]:
     """Return the points of each process."""
     kept = [point for point in points if point.question is not None]
     return {part: [point for point in kept if (point.kind == "npu") == (part == "npu")] for part in PARTS}
 
 
-def thinned(points: Sequence[Point], most: int = MOST, seed: int = 0) -> list[Point]:
-    """Return at most so many figures of a device, runtime and precision, drawn at random.
+def subsample(points: Sequence[Point], limit: int = MAX_SEARCH_FIGURES, seed: int = 0) -> list[Point]:
+    """Return a random subset of at most ``limit`` figures of each device, runtime and precision.
 
-    The search for scales needs no more of them, and its work grows with the third power.
+    The search for scales needs no more of them, and its cost grows with the third power.
     """
     random = np.random.default_rng(seed)
     alike: dict[tuple[str, ...], list[Point]] = {}
-    for point in merged(points):
+    for point in merge_versions(points):
         if asked := point.question:
-            alike.setdefault((point.group, asked.place.unit, asked.runtime, asked.precision), []).append(point)
-    drawn = (random.permutation(len(same))[:most] for same in alike.values())
-    return [same[place] for same, places in zip(alike.values(), drawn, strict=True) for place in sorted(places)]
+            alike.setdefault((point.group, asked.compute_unit.unit, asked.runtime, asked.precision), []).append(point)
+    drawn = (random.permutation(len(same))[:limit] for same in alike.values())
+    return [same[index] for same, indices in zip(alike.values(), drawn, strict=True) for index in sorted(indices)]
 
 
 def fit(
@@ -220,19 +220,19 @@ def fit(
     """Return the model of some figures.
 
     Args:
-        before: Where the search for scales begins; at ``Scales()`` and ``Shares()`` when None.
-        seconds: For the search; 0 keeps the scales.
-        seed: Of the search.
-        tell: Called with what is done.
+        before: Start of the search for scales; ``Scales()`` and ``Shares()`` when None.
+        seconds: Time limit of the search; 0 keeps the scales.
+        seed: Random seed of the search.
+        tell: Receiver of progress.
     """
-    parts: dict[str, Known] = {}
+    parts: dict[str, TrainingData] = {}
     shares: dict[str, Shares] = {}
     bounds: dict[str, dict[str, dict[str, float]]] = {}
-    usable = {part: mine for part, mine in by_part(points).items() if mine}
-    few = {part: thinned(mine, seed=seed) for part, mine in usable.items()}
-    work = {part: float(len(mine)) ** 3 for part, mine in few.items()}  # of one assessment
+    usable = {part: mine for part, mine in split_by_part(points).items() if mine}
+    subsamples = {part: subsample(mine, seed=seed) for part, mine in usable.items()}
+    work = {part: float(len(mine)) ** 3 for part, mine in subsamples.items()}  # of one assessment
     for part, mine in usable.items():
-        sample = Sample.of(mine)
+        sample = Sample.from_points(mine)
         groups = f"{len(set(sample.devices))} devices and {len(set(sample.models))} models"
         tell(f"{part}: {len(sample.published)} figures of {groups}")
         begin = (Scales(), Shares())
@@ -240,30 +240,30 @@ def fit(
             begin = (before.parts[part].scales, before.shares[part])
         progress: list[str] = []
         share = seconds * work[part] / sum(work.values())
-        scales, shares[part] = tune(Sample.of(few[part]), *begin, share, seed, progress.append)
+        scales, shares[part] = tune(Sample.from_points(subsamples[part]), *begin, share, seed, progress.append)
         for line in progress[-3:]:
             tell(line)
         bounds[part] = conformal(sample, scales, shares[part])
-        parts[part] = Known(rows_of(sample.questions, shares[part]), sample.logs, scales)
+        parts[part] = TrainingData(rows_of(sample.questions, shares[part]), sample.logs, scales)
     about = {"figures": sum(len(known.rows) for known in parts.values()), "seed": seed, "level": LEVEL}
     return LatencyModel(parts, shares, bounds, about)
 
 
-def _refuse_other(out: Path) -> None:
-    """Refuse files called as the model's that are no model.
+def _refuse_foreign_files(out: Path) -> None:
+    """Refuse files with the model's names that are not a model.
 
     Raises:
-        OutputError: when there are.
+        OutputError: when there are such files.
     """
     present = [out / name for name in ("latency.npz", "latency.json") if os.path.lexists(out / name)]
     if not present:
         return
     try:
-        ours = set(json.loads((out / "latency.json").read_text(encoding="utf-8"))) == {"about", "parts"}
-        ours = ours and zipfile.is_zipfile(out / "latency.npz") and not any(path.is_symlink() for path in present)
+        is_ours = set(json.loads((out / "latency.json").read_text(encoding="utf-8"))) == {"about", "parts"}
+        is_ours = is_ours and zipfile.is_zipfile(out / "latency.npz") and not any(path.is_symlink() for path in present)
     except (OSError, ValueError, TypeError, RecursionError):
-        ours = False
-    if not ours:
+        is_ours = False
+    if not is_ours:
         raise OutputError(f"{present[0]} is not a model that vlatool wrote.", "name another directory, or move it away")
 
 
@@ -273,15 +273,15 @@ def fit_files(
     """Fit on a file and write the model's data.
 
     Args:
-        anew: Begin the search for scales at ``Scales()`` and ``Shares()``, and not at those of the shipped model, which
-            saw all that was published.
-        tell: Called with what is done.
+        anew: Start the search for scales at ``Scales()`` and ``Shares()``, instead of those of the shipped model, which
+            was fitted on all published figures.
+        tell: Receiver of progress.
 
     Raises:
         DataError: when the file is malformed, or has no row to fit on.
-        OutputError: when other files have the names of the model's.
+        OutputError: when other files have the names of the model's files.
     """
-    _refuse_other(out)
+    _refuse_foreign_files(out)
     points = read_points(path)
     shipped = not anew and (DATA / "latency.json").is_file()
     before = read_model(DATA) if shipped else None  # and not the user's own: the search begins at what was shipped

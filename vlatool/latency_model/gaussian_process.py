@@ -1,10 +1,10 @@
-"""A Gaussian process over the logarithm of latency: what is published near a question decides, and how far it is.
+"""A Gaussian process over the logarithm of latency: nearby published figures determine a prediction.
 
     log(ms) = log(roofline) + f,   f ~ GP(0, K)
 
-K is a sum of components: some are shared by all that has one runtime, one device, one precision or one model; some
-vary smoothly with what a model and a device are (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
-chapters 2 and 5). A measurement on a board is one more point: conditioning on it is the calibration.
+K is a sum of components: some are shared by all rows of one runtime, device, precision or model; some vary smoothly
+with the features of model and device (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapters 2
+and 5). A measurement on a board is one more point: calibration conditions on it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Rows:
         return Rows(keys, self.model[index], self.traits[index], self.device[index], self.prior[index])
 
     @staticmethod
-    def joined(first: Rows, second: Rows) -> Rows:
+    def concatenate(first: Rows, second: Rows) -> Rows:
         """Return the rows of both."""
         keys = {name: np.concatenate([first.keys[name], second.keys[name]]) for name in KEYS}
         rest = (np.concatenate([getattr(first, name), getattr(second, name)]) for name in PARTS)
@@ -63,7 +63,7 @@ PARTS = tuple(field.name for field in fields(Rows))[1:]
 
 @dataclass(frozen=True)
 class Scales:
-    """What the fit chooses: standard deviations of the components in log(ms), and lengths.
+    """Parameters of the fit: standard deviations of the components in log(ms), and length scales.
 
     The ``*_m`` components vary with the model (its features, ``lengths`` apart), the ``*_d`` ones with the device.
     """
@@ -98,7 +98,7 @@ class Scales:
 
 
 BLOCK = 32
-"""Rows of the covariance that are made at a time: they stay in the processor's cache."""
+"""Rows of the covariance that are computed at a time: they stay in the processor's cache."""
 
 
 def kernel(first: Rows, second: Rows, scales: Scales) -> Array:
@@ -109,28 +109,28 @@ def kernel(first: Rows, second: Rows, scales: Scales) -> Array:
     for begin in range(0, len(first), BLOCK):
         part = slice(begin, begin + BLOCK)
         keys = {name: values[part] for name, values in first.keys.items()}
-        smooth, near = _alike(_squares(models[0][part], models[1]))
-        places = _squares(first.device[part], second.device)
-        covariance[part] = _covariance(keys, second.keys, smooth, near, places, scales)
+        smooth, near = _similarities(_squares(models[0][part], models[1]))
+        devices = _squares(first.device[part], second.device)
+        covariance[part] = _covariance(keys, second.keys, smooth, near, devices, scales)
     return covariance
 
 
-def _alike(squares: Array) -> tuple[Array, Array]:
-    """Return how alike models are, with a long tail and with a short one."""
+def _similarities(squares: Array) -> tuple[Array, Array]:
+    """Return similarities of models, with a long tail and with a short one."""
     return 1 / (1 + squares / 2), np.exp(-squares / 2)
 
 
 def _covariance(
-    first: Mapping[str, Array], second: Mapping[str, Array], smooth: Array, near: Array, places: Array, scales: Scales
+    first: Mapping[str, Array], second: Mapping[str, Array], smooth: Array, near: Array, devices: Array, scales: Scales
 ) -> Array:
     def same(name: str) -> Array:
         return np.asarray(first[name][:, None] == second[name][None])
 
     covariance = scales.constant**2 + scales.all_m**2 * smooth
     covariance += same("runtime") * scales.runtime**2
-    twins = np.exp(places / (-2 * scales.length_kind**2))
+    twins = np.exp(devices / (-2 * scales.length_kind**2))
     covariance += same("kind") * (scales.kind**2 + scales.kind_m**2 * smooth + scales.kind_d**2 * twins)
-    alike = np.exp(places / (-2 * scales.length_device**2))
+    alike = np.exp(devices / (-2 * scales.length_device**2))
     covariance += same("unit") * (scales.unit_d**2 * alike + scales.unit_m**2 * smooth)
     covariance += same("core") * scales.core**2
     covariance += same("made") * (scales.made**2 + scales.made_m**2 * smooth)
@@ -150,12 +150,12 @@ def _squares(first: Array, second: Array) -> Array:
 
 
 class Process:
-    """The process given measurements.
+    """The process conditioned on measurements.
 
     Args:
-        rows: What was measured.
+        rows: Measured rows.
         logs: (n,) natural logarithm of the latency in ms.
-        scales: Of the fit.
+        scales: Scales of the fit.
         noise: (n,) standard deviation of each measurement; that of the fit when None.
     """
 
@@ -170,7 +170,7 @@ class Process:
         self._weights = cho_solve((self._factor, True), logs - rows.prior)
 
     def predict(self, questions: Rows) -> tuple[Array, Array]:
-        """Return mean and standard deviation of log(ms) of each question; the noise of a measurement is in it."""
+        """Return mean and standard deviation of log(ms) of each question, including the noise of a measurement."""
         mean, covariance = self.joint(questions)
         return mean, np.sqrt(np.diag(covariance) + self.scales.noise**2)
 

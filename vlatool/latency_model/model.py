@@ -1,4 +1,4 @@
-"""How long a graph takes on a board: a prediction with an interval, or why there is no ground for one."""
+"""Latency of a graph on a board: a prediction with an interval, or the reason why it is unknown."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from numpy.typing import NDArray
 
 from vlatool.errors import DataError
 from vlatool.files.user_files import atomic_file
-from vlatool.latency_model.features import ALIKE, Question, Shares, rows_of
+from vlatool.latency_model.features import PROXIES, Question, Shares, rows_of
 from vlatool.latency_model.gaussian_process import KEYS, Process, Rows, Scales
 
 Array = NDArray[Any]
 DATA = Path(__file__).with_name("data")
-PLACE = "VLATOOL_LATENCY"
-"""Variable that names a directory of ``vlatool hwselect fit``."""
+MODEL_ENV = "VLATOOL_LATENCY"
+"""Environment variable with a directory of ``vlatool hwselect fit``."""
 LEVEL = 0.8
-"""Share of measurements that fall into the interval."""
-WIDEST = 1.4
-"""Half an interval in log(ms), above which nothing useful is said: more than a factor of 4 either way."""
+"""Share of measurements inside the interval."""
+MAX_HALF_INTERVAL = 1.4
+"""Largest useful half width of an interval in log(ms): a factor of 4 in either direction."""
 
 
 @dataclass(frozen=True)
-class Predicted:
+class Prediction:
     """Milliseconds of one run.
 
     Args:
         ms: Median; NaN when unknown.
-        low, high: Interval that ``LEVEL`` of measurements fall into.
+        low, high: Interval with ``LEVEL`` of measurements.
         regime: ``known`` (this runtime and precision were measured on this device), ``calibrated`` (the user measured
             something there), ``unseen``.
-        why: Why it is unknown; empty when it is known.
+        why: Reason why it is unknown; empty when it is known.
     """
 
     ms: float
@@ -56,33 +56,33 @@ class Predicted:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What a process is given: figures and scales.
+class TrainingData:
+    """Data of a process: figures and scales.
 
     Args:
-        rows: What was measured.
+        rows: Measured rows.
         logs: (n,) natural logarithm of the ms.
-        scales: Of the fit.
+        scales: Scales of the fit.
     """
 
     rows: Rows
     logs: Array
     scales: Scales
 
-    def without(self, runtimes: Iterable[int]) -> Process:
-        """Return the process that is not given the figures of some runtimes (codes of ``KEYS``)."""
+    def process_without(self, runtimes: Iterable[int]) -> Process:
+        """Return the process without the figures of some runtimes (codes of ``KEYS``)."""
         kept = ~np.isin(self.rows.keys["runtime"], sorted(runtimes))
         return Process(self.rows.take(kept), self.logs[kept], self.scales)
 
 
-CROWD = 900
-"""Figures of one runtime that are left out when nobody asks about it."""
+MAX_IDLE_FIGURES = 900
+"""Number of figures above which a runtime is left out when no question is about it."""
 
 
-def crowds(rows: Rows) -> set[int]:
+def crowded_runtimes(rows: Rows) -> set[int]:
     """Return the runtimes (codes of ``KEYS``) with very many figures."""
     codes, counts = np.unique(rows.keys["runtime"], return_counts=True)
-    return {int(code) for code in codes[counts > CROWD]}
+    return {int(code) for code in codes[counts > MAX_IDLE_FIGURES]}
 
 
 @dataclass
@@ -90,14 +90,14 @@ class LatencyModel:
     """Two processes: one for processors and GPUs, one for neural processing units.
 
     Args:
-        parts: ``processors`` and ``npu`` -> what the process is given.
-        shares: The same -> the roofline below it.
-        conformal: The same -> regime -> unit -> standard deviations that the interval spans on either side.
-        about: Where it was fitted, for reports.
+        parts: ``processors`` and ``npu`` -> data of the process.
+        shares: The same -> shares of the roofline.
+        conformal: The same -> regime -> unit -> half width of the interval in standard deviations.
+        about: Description of the fit, for reports.
         own: Codes of the devices (of ``KEYS``) that the user measured.
     """
 
-    parts: Mapping[str, Known]
+    parts: Mapping[str, TrainingData]
     shares: Mapping[str, Shares]
     conformal: Mapping[str, Mapping[str, Mapping[str, float]]]
     about: Mapping[str, Any]
@@ -105,31 +105,32 @@ class LatencyModel:
     _processes: dict[tuple[str, frozenset[int]], Process] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
-    _taught: tuple[Sequence[tuple[Question, float]], LatencyModel] | None = field(
+    _condition_cache: tuple[Sequence[tuple[Question, float]], LatencyModel] | None = field(
         default=None, init=False, repr=False, compare=False
     )
 
-    def predict(self, questions: Sequence[Question]) -> list[Predicted]:
-        """Answer every question, in order."""
-        answers = [Predicted(math.nan, why="the latency model has no figures of such a unit")] * len(questions)
+    def predict(self, questions: Sequence[Question]) -> list[Prediction]:
+        """Return the prediction for every question, in order."""
+        answers = [Prediction(math.nan, why="the latency model has no figures of such a unit")] * len(questions)
         for part in self.parts:
-            places = [place for place, question in enumerate(questions) if part_of(question) == part]
-            for place, answer in zip(places, self._answers(part, [questions[index] for index in places]), strict=True):
-                answers[place] = answer
+            indices = [index for index, question in enumerate(questions) if part_of(question) == part]
+            predictions = self._predict(part, [questions[index] for index in indices])
+            for index, answer in zip(indices, predictions, strict=True):
+                answers[index] = answer
         return answers
 
-    def conditioned(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
-        """Return the model that also knows what a user measured: (question, ms); the same object for the same figures.
+    def condition(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
+        """Return the model with a user's measurements added: (question, ms); the same object for the same figures.
 
-        Its processes, about a second of work, are so made once in a command, however many bundles are predicted.
+        Its processes, about a second of work, are therefore built once in a command, for any number of bundles.
         """
         if not measured:
             return self
-        if self._taught is None or self._taught[0] != measured:
-            self._taught = (measured, self._conditioned(measured))
-        return self._taught[1]
+        if self._condition_cache is None or self._condition_cache[0] != measured:
+            self._condition_cache = (measured, self._condition(measured))
+        return self._condition_cache[1]
 
-    def _conditioned(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
+    def _condition(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
         parts = dict(self.parts)
         own = set(self.own)
         for part, known in self.parts.items():
@@ -138,11 +139,11 @@ class LatencyModel:
                 continue
             rows = rows_of([question for question, _ in mine], self.shares[part])
             logs = np.log([ms for _, ms in mine])
-            parts[part] = Known(Rows.joined(known.rows, rows), np.append(known.logs, logs), known.scales)
+            parts[part] = TrainingData(Rows.concatenate(known.rows, rows), np.append(known.logs, logs), known.scales)
             own.update(rows.keys["device"].tolist())
         return LatencyModel(parts, self.shares, self.conformal, self.about, frozenset(own))
 
-    def _answers(self, part: str, questions: list[Question]) -> list[Predicted]:
+    def _predict(self, part: str, questions: list[Question]) -> list[Prediction]:
         if not questions:
             return []
         known = self.parts[part]
@@ -154,77 +155,78 @@ class LatencyModel:
             regime = "known" if int(rows.keys["pair"][number]) in pairs else "unseen"
             if int(rows.keys["device"][number]) in self.own:
                 regime = "calibrated"
-            if why := no_ground(question, int(rows.keys["runtime"][number]) in runtimes, regime != "unseen"):
-                answers.append(Predicted(math.nan, regime=regime, why=why))
+            if why := unknown_reason(question, int(rows.keys["runtime"][number]) in runtimes, regime != "unseen"):
+                answers.append(Prediction(math.nan, regime=regime, why=why))
                 continue
             spans = self.conformal[part][regime]
-            half = float(spans.get(question.place.unit, max(spans.values())) * deviation[number])
-            if half > WIDEST:
+            half = float(spans.get(question.compute_unit.unit, max(spans.values())) * deviation[number])
+            if half > MAX_HALF_INTERVAL:
                 factor = math.exp(half)
                 reason = f"published figures leave a factor of {factor:.1f} either way; measure it on the board"
-                answers.append(Predicted(math.nan, regime=regime, why=reason))
+                answers.append(Prediction(math.nan, regime=regime, why=reason))
                 continue
             ms = math.exp(mean[number])
-            answers.append(Predicted(ms, ms * math.exp(-half), ms * math.exp(half), regime))
+            answers.append(Prediction(ms, ms * math.exp(-half), ms * math.exp(half), regime))
         return answers
 
     def _process(self, part: str, rows: Rows) -> Process:
         """Return the process for some questions.
 
-        A runtime with very many figures that nobody asks about is left out: it says next to nothing of the others, and
-        the work grows with the third power of the figures.
+        A runtime with very many figures that no question is about is left out: it says next to nothing about the
+        others, and the cost grows with the third power of the figures.
         """
-        unasked = frozenset(crowds(self.parts[part].rows) - set(rows.keys["runtime"].tolist()))
+        unasked = frozenset(crowded_runtimes(self.parts[part].rows) - set(rows.keys["runtime"].tolist()))
         if (part, unasked) not in self._processes:
-            self._processes[part, unasked] = self.parts[part].without(unasked)
+            self._processes[part, unasked] = self.parts[part].process_without(unasked)
         return self._processes[part, unasked]
 
 
-OTHER_NPU = "figures of one neural processing unit say too little of another; measure it on the board"
+UNKNOWN_NPU = "figures of one neural processing unit say too little about another; measure it on the board"
 
 
 def part_of(question: Question) -> str:
-    """Return which process answers."""
-    return "npu" if question.place.unit == "npu" else "processors"
+    """Return the part that answers a question."""
+    return "npu" if question.compute_unit.unit == "npu" else "processors"
 
 
-def no_ground(question: Question, published: bool, seen: bool) -> str:
-    """Return why nothing can be said, or an empty string.
+def unknown_reason(question: Question, published: bool, device_known: bool) -> str:
+    """Return why a question cannot be answered, or an empty string.
 
     Args:
-        question: What is asked.
+        question: The question.
         published: Whether a figure of the runtime is known.
-        seen: Whether one of this device is known.
+        device_known: Whether a figure of this device is known.
     """
     if question.runtime == "hailort" and "attention" in question.work.traits:
         return "Hailo's published figures are of convolutional networks; a transformer's latency there is unknown"
-    precision = ALIKE.get(question.precision, question.precision)
-    if question.place.unit == "npu" and precision in ("float32", "w4", "w8"):
+    precision = PROXIES.get(question.precision, question.precision)
+    if question.compute_unit.unit == "npu" and precision in ("float32", "w4", "w8"):
         return f"the unit does not compute in {question.precision}"
     if not published:
         return f"no latency was published for the runtime {question.runtime}"
-    return OTHER_NPU if question.place.unit == "npu" and not seen else ""
+    return UNKNOWN_NPU if question.compute_unit.unit == "npu" and not device_known else ""
 
 
-def shipped() -> LatencyModel:
+def load_model() -> LatencyModel:
     """Return the model of the package's data files, or of those in ``$VLATOOL_LATENCY``.
 
     Raises:
         DataError: when the files there cannot be read.
     """
-    own = os.environ.get(PLACE)
+    own = os.environ.get(MODEL_ENV)
     try:
         return read_model(Path(own) if own else DATA)
-    except DAMAGE as error:
+    except READ_ERRORS as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
-        fix = f"unset {PLACE}, or make one: vlatool hwselect fit POINTS.csv -o DIR" if own else "install vlatool again"
+        refit = f"unset {MODEL_ENV}, or make one: vlatool hwselect fit POINTS.csv -o DIR"
+        fix = refit if own else "install vlatool again"
         raise DataError(f"The latency model in {own or DATA} cannot be read: {reason}.", fix) from error
 
 
-DAMAGE = (
+READ_ERRORS = (
     OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""What reading a file that is none of ours raises."""
+"""Exceptions of reading a file in another format."""
 
 
 @functools.cache
@@ -238,9 +240,9 @@ def read_model(folder: Path) -> LatencyModel:
             keys = stored[f"{part}.keys"]
             if keys.ndim != 2 or keys.shape[1] != len(KEYS):
                 raise ValueError("it was fitted by another version of vlatool")
-            rows = Rows({name: keys[:, place].astype(np.int64) for place, name in enumerate(KEYS)},
+            rows = Rows({name: keys[:, column].astype(np.int64) for column, name in enumerate(KEYS)},
                         **{name: array.astype(float) for name, array in arrays.items()})  # fmt: skip
-            parts[part] = Known(rows, stored[f"{part}.logs"].astype(float), Scales(**values["scales"]))
+            parts[part] = TrainingData(rows, stored[f"{part}.logs"].astype(float), Scales(**values["scales"]))
             shares[part] = Shares(**values["shares"])
     if not parts:
         raise ValueError("it has no part")
@@ -249,7 +251,7 @@ def read_model(folder: Path) -> LatencyModel:
 
 
 def write(model: LatencyModel, folder: Path) -> None:
-    """Write ``latency.npz`` and ``latency.json`` as ``shipped`` reads them."""
+    """Write ``latency.npz`` and ``latency.json`` as ``load_model`` reads them."""
     import dataclasses
 
     arrays: dict[str, Array] = {}

@@ -1,4 +1,4 @@
-"""What a profile's board would need for a bundle, as predictions that say so."""
+"""Predictions for a bundle on the board of a profile."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 from vlatool.bundle.bundle import Bundle
 from vlatool.graph.workload import workload
 from vlatool.hardware.profile import Profile
-from vlatool.latency_model.board import Candidate, Outcome, engine_for, outcomes, quantized_as
-from vlatool.latency_model.measured import measured_questions
-from vlatool.latency_model.model import LEVEL, Predicted, shipped
+from vlatool.latency_model.board import Candidate, Outcome, engine_for, outcomes, stored_quantization
+from vlatool.latency_model.board_measurements import measured_questions
+from vlatool.latency_model.model import LEVEL, Prediction, load_model
 from vlatool.measures.latency import LATENCY_P50, LATENCY_PER_ACTION
 from vlatool.measures.resources import ENERGY, ENERGY_PER_ACTION, MEMORY, USABLE_MEMORY, WATTS
 from vlatool.report import Measurement
@@ -19,20 +19,20 @@ SHOWN = (LATENCY_P50.name, MEMORY.name, ENERGY.name)
 
 
 def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Measurement]:
-    """Return predicted latency, memory and energy of a bundle on a board; NaN with a note where there is no ground.
+    """Return predicted latency, memory and energy of a bundle on a board; NaN with a note where unknown.
 
     Args:
-        profile: The board.
-        bundle: With graphs.
-        engine: Which engine of the board runs it; when empty, the bundle's own, where the board has that, or its
-            preferred one, where it runs such graphs, or one that does.
+        profile: Profile of the board.
+        bundle: Bundle with graphs.
+        engine: Engine of the board; when empty, the bundle's own, where the board has that, or its preferred one, where
+            it runs such graphs, or another one that does.
     """
-    load, model = workload(bundle), shipped().conditioned(measured_questions())
+    load, model = workload(bundle), load_model().condition(measured_questions())
     engine = engine or engine_for(profile, load, bundle.manifest.engine)
     outcome = outcomes([Candidate(profile, profile.default_mode, engine or profile.engine)], load, model)[0]
     if not engine:
-        why = f"no engine of {profile.name} runs this bundle, whose graphs are {quantized_as(load)}"
-        outcome = replace(outcome, latency=Predicted(math.nan, why=why))
+        why = f"no engine of {profile.name} runs this bundle, whose graphs are {stored_quantization(load)}"
+        outcome = replace(outcome, latency=Prediction(math.nan, why=why))
     return [measurement for measurement in numbers(outcome) if measurement.name in SHOWN]
 
 

@@ -1,4 +1,4 @@
-"""How far predictions are from published latencies, and how often their intervals hold."""
+"""Errors of predictions of published latencies, and the coverage of their intervals."""
 
 from __future__ import annotations
 
@@ -14,57 +14,57 @@ from numpy.typing import NDArray
 
 from vlatool.errors import DataError, UsageError, fix_for
 from vlatool.latency_model.features import rows_of
-from vlatool.latency_model.fit import Scores, by_part
+from vlatool.latency_model.fit import Scores, split_by_part
 from vlatool.latency_model.folds import UNITS, Folds, Sample
-from vlatool.latency_model.model import LEVEL, PLACE, WIDEST, Predicted, no_ground, shipped
-from vlatool.latency_model.published import Point, read_points
+from vlatool.latency_model.model import LEVEL, MAX_HALF_INTERVAL, MODEL_ENV, Prediction, load_model, unknown_reason
+from vlatool.latency_model.published_latencies import Point, read_points
 
 Array = NDArray[Any]
 SPLITS = ("models", "devices", "calibrated")
 DRAWS = 5
-"""Models that calibrate each device, one after the other."""
+"""Number of models that calibrate each device, one at a time."""
 FOLDS = 10
-"""Parts that the models are dealt into; one part is left out at a time. Devices are left out one at a time."""
+"""Number of folds of the models; one fold is left out at a time. Devices are left out one at a time."""
 
 
 def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict[str, Any]:
     """Predict a file; with ``held_out`` from its own other rows.
 
     Args:
-        path: Published latencies.
+        path: File of published latencies.
         held_out: ``models``: a tenth of the models is left out at a time; ``devices``: each device; ``calibrated``:
-            each device but for one of its models. The widths of the intervals come from the errors of the others,
-            whose predictions knew what is left out here; ``_refit`` is stricter.
+            each device except for one of its models. The widths of the intervals come from the errors of the others,
+            whose predictions used the rows that are left out here; ``refit`` is stricter.
             None: the shipped model predicts every row.
-        seed: Of the dealing of models, and of the choice of the model that calibrates.
+        seed: Random seed of the folds, and of the calibrating models.
 
     Raises:
-        UsageError: when ``held_out`` is none of these.
-        DataError: when the file is malformed, or the model knows nothing of its kind of unit.
+        UsageError: when ``held_out`` is unknown.
+        DataError: when the file is malformed, or the model has no data for its kind of unit.
     """
     points = read_points(path)
-    own = os.environ.get(PLACE)
+    own = os.environ.get(MODEL_ENV)
     whose = f"the model of {own}" if own else "the shipped model"
     if held_out is None:
-        predictions = shipped().predict([point.question for point in points if point.question])
-        return summary(points, predictions, whose)
+        predictions = load_model().predict([point.question for point in points if point.question])
+        return summarize(points, predictions, whose)
     if held_out not in SPLITS:
         raise UsageError(f"--held-out is '{held_out}'; allowed: {', '.join(SPLITS)}.", fix_for(held_out, SPLITS))
-    shown: list[Point] = []
-    answers: list[Predicted] = []
+    scored: list[Point] = []
+    answers: list[Prediction] = []
     for draw in range(DRAWS if held_out == "calibrated" else 1):
-        known: dict[Any, Predicted] = {}
-        for part, mine in by_part(points).items():
+        known: dict[Any, Prediction] = {}
+        for part, mine in split_by_part(points).items():
             if mine:
-                known.update(_left_out(Sample.of(mine), part, held_out, seed + 1000 * draw))
+                known.update(_predict_left_out(Sample.from_points(mine), part, held_out, seed + 1000 * draw))
         drawn = [point for point in points if not point.question or known[point.question].regime != "told"]
         answers += [known[point.question] for point in drawn if point.question]
-        shown += drawn
-    return summary(shown, answers, f"{told_as(held_out, seed)}; scales of {whose}")
+        scored += drawn
+    return summarize(scored, answers, f"{describe_split(held_out, seed)}; scales of {whose}")
 
 
-def told_as(held_out: str, seed: int) -> str:
-    """Return what is left out, in words."""
+def describe_split(held_out: str, seed: int) -> str:
+    """Return a description of the left-out rows."""
     return {
         "models": f"{FOLDS} folds of whole models, dealt with seed {seed}",
         "devices": "each device left out whole",
@@ -72,56 +72,56 @@ def told_as(held_out: str, seed: int) -> str:
     }[held_out]
 
 
-def _left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, Predicted]:
-    """Return question -> its prediction from the rows that are not left out with it."""
-    model = shipped()
+def _predict_left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, Prediction]:
+    """Return question -> prediction from the rows that are not left out with it."""
+    model = load_model()
     if part not in model.parts:
-        raise DataError(f"The latency model has no figures of {part}, and so no scales for them.", f"unset {PLACE}")
+        raise DataError(f"The latency model has no figures of {part}, and so no scales for them.", f"unset {MODEL_ENV}")
     rows = rows_of(sample.questions, model.shares[part])
     folds = Folds(rows, sample, model.parts[part].scales)
     random = np.random.default_rng(seed)
-    taught = np.zeros(len(sample.logs), bool)
+    calibrating = np.zeros(len(sample.logs), bool)
     groups = sample.devices
     if held_out == "models":
         groups = (random.permutation(sample.models.max() + 1) % FOLDS)[sample.models]
     if held_out == "calibrated":
-        error, deviation, taught = folds.once(groups, random)
-        scores = Scores.calibrated(sample, folds)
+        error, deviation, calibrating = folds.leave_out_once(groups, random)
+        scores = Scores.for_calibrated(sample, folds)
     else:
-        error, deviation = folds.without(groups)
+        error, deviation = folds.leave_out(groups)
         draws = sample.models if held_out == "models" else rows.keys["pair"]
-        scores = Scores.of(sample, error, deviation, groups, draws)
+        scores = Scores.for_sample(sample, error, deviation, groups, draws)
     regime = {"models": "known", "devices": "unseen", "calibrated": "calibrated"}[held_out]
-    reach = {pair: scores.reach(pair[1], pair[0]) for pair in set(zip(groups, sample.units, strict=True))}
-    lonely = _lonely(sample, groups, taught)
-    predictions: dict[Any, Predicted] = {}
-    for place, question in enumerate(sample.questions):
-        half = reach[groups[place], sample.units[place]] * deviation[place]
-        why = no_ground(question, not lonely[place], regime != "unseen")
-        if not why and half > WIDEST:
+    reach = {pair: scores.quantile(pair[1], pair[0]) for pair in set(zip(groups, sample.units, strict=True))}
+    unknown = _unknown_runtimes(sample, groups, calibrating)
+    predictions: dict[Any, Prediction] = {}
+    for index, question in enumerate(sample.questions):
+        half = reach[groups[index], sample.units[index]] * deviation[index]
+        why = unknown_reason(question, not unknown[index], regime != "unseen")
+        if not why and half > MAX_HALF_INTERVAL:
             why = "published figures leave too wide an interval"
-        if taught[place] or why:
-            predictions[question] = Predicted(
-                math.nan, regime="told" if taught[place] else regime, why=why or "it was told"
+        if calibrating[index] or why:
+            predictions[question] = Prediction(
+                math.nan, regime="told" if calibrating[index] else regime, why=why or "it was told"
             )
         else:
-            ms = math.exp(sample.logs[place] + error[place])
-            predictions[question] = Predicted(ms, ms * math.exp(-half), ms * math.exp(half), regime)
+            ms = math.exp(sample.logs[index] + error[index])
+            predictions[question] = Prediction(ms, ms * math.exp(-half), ms * math.exp(half), regime)
     return predictions
 
 
-def _lonely(sample: Sample, groups: Array, taught: Array) -> Array:
-    """Say of each row whether its runtime occurs in no other group and was not told: then nothing is known of it."""
+def _unknown_runtimes(sample: Sample, groups: Array, calibrating: Array) -> Array:
+    """Return the mask of rows whose runtime occurs in no other group and does not calibrate: it is unknown."""
     runtimes = np.array([question.runtime for question in sample.questions])
-    lonely = np.zeros(len(runtimes), bool)
+    unknown = np.zeros(len(runtimes), bool)
     for runtime in np.unique(runtimes):
         rows = runtimes == runtime
-        lonely[rows] = len(np.unique(groups[rows])) < 2 and not taught[rows].any()
-    return lonely
+        unknown[rows] = len(np.unique(groups[rows])) < 2 and not calibrating[rows].any()
+    return unknown
 
 
-def summary(points: Sequence[Point], answers: Sequence[Predicted], how: str) -> dict[str, Any]:
-    """Return how far predictions are from figures, as JSON values."""
+def summarize(points: Sequence[Point], answers: Sequence[Prediction], how: str) -> dict[str, Any]:
+    """Return the errors of predictions, as JSON values."""
     asked = [point for point in points if point.question]
     why: Counter[str] = Counter()
     why.update(point.why for point in points if not point.question)
@@ -136,7 +136,7 @@ def summary(points: Sequence[Point], answers: Sequence[Predicted], how: str) -> 
     }  # fmt: skip
 
 
-def _errors(pairs: Sequence[tuple[Point, Predicted]]) -> dict[str, float]:
+def _errors(pairs: Sequence[tuple[Point, Prediction]]) -> dict[str, float]:
     measured = np.exp([point.log_ms for point, _ in pairs])
     predicted, low, high = (np.array([getattr(answer, name) for _, answer in pairs]) for name in ("ms", "low", "high"))
     off = np.abs(predicted / measured - 1)
@@ -147,8 +147,8 @@ def _errors(pairs: Sequence[tuple[Point, Predicted]]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def lines(scored: Mapping[str, Any]) -> Iterator[str]:
-    """Return what a person reads."""
+def summary_lines(scored: Mapping[str, Any]) -> Iterator[str]:
+    """Return the summary as lines of text."""
     yield f"{scored['how']}"
     yield f"{scored['predicted']} of {scored['rows']} rows predicted; relative error |predicted - measured| / measured"
     yield f"{'':14}{'rows':>6}{'median':>9}{'90th pct':>10}{'in interval':>13}{'interval':>10}"

@@ -8,7 +8,7 @@ from typing import Any
 
 from vlatool.measurement.answers import AnswerCheck, Memory
 from vlatool.measurement.cold_start import ColdStart
-from vlatool.telemetry import Recorded
+from vlatool.telemetry import Summary
 
 
 @dataclass(frozen=True)
@@ -131,6 +131,6 @@ class Benchmark:
     canary_ms: tuple[float, ...]
     policies: tuple[PolicyRun, ...]
     host: Mapping[str, Any] = field(default_factory=dict)
-    telemetry: Recorded | None = None
+    telemetry: Summary | None = None
     log: str = ""
     target: Mapping[str, Any] = field(default_factory=dict)

@@ -18,7 +18,7 @@ from vlatool.measures import latency, resources, series
 from vlatool.measures import tables as titles
 from vlatool.measures.actions import GOLDEN_ERROR
 from vlatool.report import Measurement
-from vlatool.telemetry import DEGREE, THROTTLE, Absent, Recorded
+from vlatool.telemetry import DEGREE, THROTTLE, Absent, Summary
 
 ENERGY_S = 10.0
 """Seconds below which the energy of a run says little (MLPerf Tiny: runs of 10 s)."""
@@ -178,7 +178,7 @@ def _start_parts(starts: Sequence[ColdStart]) -> list[dict[str, Any]]:
     ]
 
 
-def _telemetry(telemetry: Recorded) -> dict[str, list[dict[str, Any]]]:
+def _telemetry(telemetry: Summary) -> dict[str, list[dict[str, Any]]]:
     gauges = [
         {"reading": name, "unit": gauge.unit, "min": round(gauge.min, 4), "mean": round(gauge.mean, 4),
          "max": round(gauge.max, 4)}

@@ -18,7 +18,7 @@ from vlatool.errors import SourceError, require, suggest
 from vlatool.module.edits import BLOCKS, holds_weights, is_changed, read_edits
 from vlatool.module.fake_weights import MetaModules, make_meta_modules
 from vlatool.module.origin import RESTART, origin_of
-from vlatool.weights.shards import NUMPY_NAMES, Reader, StoredTensor, read_shards, reading, sampled_hash, shard_files
+from vlatool.weights.shards import NUMPY_NAMES, Reader, StoredTensor, read_shards, sampled_hash, shard_files
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -149,7 +149,7 @@ def _read(values: Iterable[tuple[Tensor, StoredTensor]]) -> dict[int, tuple[Tens
     """Fill saved buffers; return ``id`` of each weight -> the weight without its values, and with them."""
     torch = require("torch", "build")
     weights = {}
-    with reading() as reader, torch.no_grad():
+    with Reader() as reader, torch.no_grad():
         for value, tensor in values:
             read = read_tensor(reader, tensor, value.dtype)
             if value.is_meta:
@@ -185,7 +185,7 @@ def weights_on_demand(stored: StoredModules) -> Iterator[None]:
     from torch.overrides import TorchFunctionMode
     from torch.utils._pytree import tree_map
 
-    with reading() as reader:
+    with Reader() as reader:
         values = list(_values(stored, stored.modules))
         locations = {id(value): tensor for value, tensor in values if value.is_meta}
         _read((value, tensor) for value, tensor in values if not value.is_meta)

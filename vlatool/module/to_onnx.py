@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
-from vlatool.graph.draws import refuse_draws
-from vlatool.graph.nodes import FOLDED
-from vlatool.graph.plain_gemms import plain_gemms
+from vlatool.graph.gemm_factors import extract_gemm_factors
+from vlatool.graph.nodes import FOLDED_MODULE_KEY
+from vlatool.graph.random_ops import refuse_random_ops
 from vlatool.module.changed_buffers import refuse_changed_buffers
 from vlatool.module.factory import map_user_exceptions
 from vlatool.module.failures import export_error
@@ -60,9 +60,9 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
         raise_interrupt(error)
         raise export_error(error, step.graph, module) from error
     refuse_changed_buffers(exported.exported_program, step.graph)
-    refuse_draws(exported.model, step.graph)
+    refuse_random_ops(exported.model, step.graph)
     divide_by_roots(exported.model)
-    plain_gemms(exported.model)
+    extract_gemm_factors(exported.model)
     return exported
 
 
@@ -81,7 +81,7 @@ def name_by_module(model: Any) -> None:
 
     ``blocks.0.mlp.fc1/MatMul``; a second node of that type in the module is ``blocks.0.mlp.fc1/MatMul_1``. What belongs
     to no module keeps the exporter's name. A layer with a normalisation folded in comes from the module that holds its
-    weights; the normalisation's is noted beside it (``FOLDED``).
+    weights; the normalisation's is noted beside it (``FOLDED_MODULE_KEY``).
     """
     seen: Counter[str] = Counter()
     for node in model.graph.all_nodes():
@@ -91,7 +91,7 @@ def name_by_module(model: Any) -> None:
             continue
         module = _folded_into(node) or names[-2]
         if module != names[-2]:
-            node.metadata_props[FOLDED] = names[-2]
+            node.metadata_props[FOLDED_MODULE_KEY] = names[-2]
         base = f"{module}/{node.op_type}"
         node.name = base if not seen[base] else f"{base}_{seen[base]}"
         seen[base] += 1
@@ -114,10 +114,10 @@ def strip_notes(model: Any) -> None:
         graph.doc_string = None
         values = [*graph.inputs, *graph.outputs, *graph.initializers.values()]
         for node in graph.all_nodes():
-            folded = node.metadata_props.get(FOLDED)
+            folded = node.metadata_props.get(FOLDED_MODULE_KEY)
             node.metadata_props.clear()
             if folded:
-                node.metadata_props[FOLDED] = folded
+                node.metadata_props[FOLDED_MODULE_KEY] = folded
             node.doc_string = None
             values.extend(node.outputs)
         for value in values:

@@ -15,7 +15,7 @@ from vlatool.motion.track import Track
 KIND = "motion"
 RESAMPLES = 2000
 CONFIDENCE = 0.95
-FEWEST = 8
+MIN_PAIRS = 8
 """Pairs below which a ratio has no interval."""
 
 
@@ -25,7 +25,7 @@ def metrics() -> dict[str, Metric]:
     return {name: registry.load(KIND, name)() for name in registry.names(KIND)}
 
 
-def measured(track: Track) -> dict[str, float]:
+def measure_episode(track: Track) -> dict[str, float]:
     """Return name -> number of one episode; what the track does not have, or is not finite, is left out."""
     values = {name: metric.of(track) for name, metric in metrics().items()}
     return {name: float(value) for name, value in values.items() if value is not None and math.isfinite(value)}
@@ -44,7 +44,7 @@ def ratio_of(
         confidence: Coverage of the interval.
 
     Returns:
-        Ratio, low, high; the ends are infinite apart for fewer than ``FEWEST`` pairs. 1 where both are 0 throughout;
+        Ratio, low, high; the ends are infinite apart for fewer than ``MIN_PAIRS`` pairs. 1 where both are 0 throughout;
         None where there is no pair, or the mean that divides is 0.
     """
     if not len(base):
@@ -54,7 +54,7 @@ def ratio_of(
     if (mean := float(base.mean())) <= 0:
         return None
     value = float(own.mean()) / mean
-    if len(base) < FEWEST:
+    if len(base) < MIN_PAIRS:
         return value, 0.0, float("inf")
     random = np.random.default_rng(len(base))
     weights = random.multinomial(len(base), np.full(len(base), 1 / len(base)), RESAMPLES)

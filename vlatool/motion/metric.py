@@ -1,4 +1,4 @@
-"""What a metric of motion is."""
+"""Base class of a metric of motion."""
 
 from __future__ import annotations
 

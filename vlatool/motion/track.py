@@ -28,7 +28,7 @@ class Track:
         collision: (T,) whether a step ran into something.
         shortest: Length of the shortest path to the goal, in the unit of ``position``.
         alike: Elements of the action that share its most frequent unit; their steps can be added.
-        grip: The element of the action that moves the gripper; None where there is none.
+        grip: Index of the gripper in the action; None without a gripper.
     """
 
     hz: float

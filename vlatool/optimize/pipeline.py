@@ -17,7 +17,7 @@ from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import NOT_POSSIBLE, DataError, RecipeError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
-from vlatool.explain.apart import explanation_apart
+from vlatool.explain.child_process import explanation_in_child
 from vlatool.files.directory_writer import write_directory
 from vlatool.files.messages import from_json, to_json
 from vlatool.hardware.profile import Profile
@@ -277,7 +277,7 @@ def _explained(judged: list[Judged], bundles: dict[str, Bundle], baseline: Bundl
     name = chosen_of(judged).row.name
     if name not in bundles:
         return {}
-    sentences = explanation_apart(bundles[name], baseline, context, samples=4, runs=10, seconds=EXPLAIN_SECONDS)
+    sentences = explanation_in_child(bundles[name], baseline, context, samples=4, runs=10, seconds=EXPLAIN_SECONDS)
     return {"Explanation (vlatool explain says more)": [{"what": sentence} for sentence in sentences]}
 
 

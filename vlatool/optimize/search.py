@@ -270,12 +270,12 @@ class Search:
         return len(ranked)
 
     def _sensitivities(self, stage: StaticInt8) -> list[LayerError]:
-        from vlatool.sensitivity.apart import sensitivities_apart
+        from vlatool.sensitivity.child_process import sensitivities_in_child
 
         if self._layers is None:
             stage = stage.model_copy(update={"attention": False, "elementwise": False})
             try:
-                self._layers = sensitivities_apart(self.baseline, stage, RECORDED, SAMPLES, self.context, SECONDS)
+                self._layers = sensitivities_in_child(self.baseline, stage, RECORDED, SAMPLES, self.context, SECONDS)
             except GraphError as error:  # the plans that were tried stand
                 self.context.progress(f"search: the layers could not be measured: {error.message}", None)
                 self._layers = []

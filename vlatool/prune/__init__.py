@@ -1,1 +1,1 @@
-"""Remove what a policy can do without, before it is exported."""
+"""Pruning methods: remove the least important parts of a policy before it is exported."""

@@ -1,4 +1,4 @@
-"""Which parts a person lets go: ``--include`` and ``--exclude``, and what stays unless it is named."""
+"""Selection of the parts that may be removed: ``--include``, ``--exclude``, and protected names."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Selection:
     """Parts by name.
 
     Args:
-        include, exclude: Globs of names; everything that is not protected when nothing is included.
-        protected: Words in names of what stays unless it is included.
-        parts: Globs of what stays unless it is included, whatever it is called.
+        include, exclude: Globs of names; everything unprotected when nothing is included.
+        protected: Words in the names of parts that stay unless they are included.
+        parts: Globs of other parts that stay unless they are included.
     """
 
     include: tuple[str, ...]
@@ -36,11 +36,11 @@ class Selection:
                     f"No {what} matches '{pattern}'; {suggest(pattern, list(names))}.", fix_for(pattern, list(names))
                 )
 
-    def has(self, names: Iterable[str]) -> bool:
-        """Return whether a part with these names may go: one of them is asked for, and none is excluded."""
+    def selects(self, names: Iterable[str]) -> bool:
+        """Return whether a part with these names may be removed: one of them is included, and none is excluded."""
         listed = list(names)
-        asked = any(matches(name, self.include) if self.include else not self.protects(name) for name in listed)
-        return asked and not any(matches(name, self.exclude) for name in listed)
+        included = any(matches(name, self.include) if self.include else not self.protects(name) for name in listed)
+        return included and not any(matches(name, self.exclude) for name in listed)
 
     def protects(self, name: str) -> bool:
         """Return whether a part stays unless it is included."""
@@ -48,11 +48,11 @@ class Selection:
 
 
 def protected_parts(parts: Mapping[str, Sequence[str]], words: Sequence[str]) -> tuple[str, ...]:
-    """Return the globs of the parts in a policy's description whose names say that they are protected.
+    """Return the globs of the parts in a policy's description with a protected word in their names.
 
     Args:
         parts: Name of a part, such as ``action_head`` -> globs of modules.
-        words: Of which one is in the name.
+        words: Protected words.
     """
     return tuple(pattern for name, globs in parts.items() if _has_word(name, words) for pattern in globs)
 

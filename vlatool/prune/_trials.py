@@ -1,4 +1,4 @@
-"""What was measured of each choice of a pruning to a latency, and which one to try next."""
+"""Measurements of the trials of a pruning to a latency, and the choice of the next trial."""
 
 from __future__ import annotations
 
@@ -8,77 +8,77 @@ from statistics import median, median_low
 
 from vlatool.errors import RecipeError
 from vlatool.module.edits import Edit
-from vlatool.prune._clock import Clock
+from vlatool.prune._latency_meter import LatencyMeter
 
-LEAST_GONE = 0.999
-"""Share of the latency of the whole policy that is left at most: something goes."""
-HELD_UP = 1.1
-"""Times the least latency of the whole policy from which on a run is taken to have been slowed by other programs."""
+MAX_REMAINING = 0.999
+"""Largest share of the unpruned latency that a trial aims at, so that it removes something."""
+SLOWDOWN_LIMIT = 1.1
+"""Ratio to the least latency of the unpruned policy above which a run counts as slowed down by other programs."""
 NUDGE, NUDGES = 0.01, 5
-"""Share by which a goal is moved, and how often to either side, until it leads to a choice that was not tried yet."""
+"""Share by which a goal is shifted, and how often in either direction, until it leads to a new choice."""
 
 
 class Trials:
-    """What was measured of each choice, all runs of it together.
+    """Measurements of each choice, over all of its runs.
 
     Args:
-        clock: Measures.
-        wholes: Milliseconds of the whole policy in the runs before.
+        meter: Meter of latencies.
+        wholes: Milliseconds of the unpruned policy in earlier runs.
     """
 
-    def __init__(self, clock: Clock, wholes: list[float]) -> None:
-        self._clock, self._wholes = clock, wholes
+    def __init__(self, meter: LatencyMeter, wholes: list[float]) -> None:
+        self._meter, self._wholes = meter, wholes
         self._shares: dict[tuple[Edit, ...], list[float]] = {}
-        self._of_wanted: list[float] = []
-        self.tried: list[float] = []
+        self._result_ratios: list[float] = []
+        self.results: list[float] = []
 
     @property
-    def undisturbed(self) -> float:
-        """What the whole policy takes where nothing else runs, in ms."""
-        return undisturbed(self._wholes)
+    def undisturbed_ms(self) -> float:
+        """Latency of the unpruned policy without other programs, in ms."""
+        return undisturbed_latency(self._wholes)
 
     @property
-    def for_each(self) -> float:
-        """Milliseconds that result where 1 is wanted: the lower median of all tries, since others only slow down."""
-        return median_low(self._of_wanted)
+    def result_ratio(self) -> float:
+        """Ratio of result to goal: the lower median of all trials, since other programs only slow them down."""
+        return median_low(self._result_ratios)
 
-    def measured(self, edits: tuple[Edit, ...]) -> float:
-        """Measure a choice once more; return what it takes by all of its runs, in ms.
+    def measure(self, edits: tuple[Edit, ...]) -> float:
+        """Measure a choice once more; return its latency over all of its runs, in ms.
 
-        It takes turns with the whole policy, so that other programs slow both down: their ratio says what it is without
-        them.
+        The run is interleaved with the unpruned policy, so that other programs slow both down: their ratio holds
+        without them, too.
         """
-        whole, (ms,) = self._clock.times([edits])
+        whole, (ms,) = self._meter.times([edits])
         self._wholes.append(whole)
         self._shares.setdefault(edits, []).append(ms / whole)
-        return median(self._shares[edits]) * self.undisturbed
+        return median(self._shares[edits]) * self.undisturbed_ms
 
-    def seen(self, edits: tuple[Edit, ...], wanted: float) -> float:
-        """Return what a choice takes by all of its runs, in ms, and remember it as the result of a try."""
-        ms = median(self._shares[edits]) * self.undisturbed
-        self.tried.append(ms)
-        self._of_wanted.append(ms / wanted)
+    def record_result(self, edits: tuple[Edit, ...], wanted: float) -> float:
+        """Return the latency of a choice over all of its runs, in ms, and record it as the result of a trial."""
+        ms = median(self._shares[edits]) * self.undisturbed_ms
+        self.results.append(ms)
+        self._result_ratios.append(ms / wanted)
         return ms
 
-    def untried(self, choose: Callable[[float], tuple[Edit, ...]], goal: float, whole: float) -> tuple[Edit, ...]:
-        """Return a choice that was not measured yet, of a goal as near as possible to the one wanted.
+    def next_choice(self, choose: Callable[[float], tuple[Edit, ...]], goal: float, whole: float) -> tuple[Edit, ...]:
+        """Return a choice that was not measured yet, for a goal as near as possible to the given one.
 
-        Widths change in steps, and kernels like some of them better: the next choice is often one that missed already.
+        Widths change in steps, and kernels favour some of them: the next choice is often one that already missed.
         """
-        first = choose(min(goal, LEAST_GONE * whole))
+        first = choose(min(goal, MAX_REMAINING * whole))
         if first not in self._shares:
             return first
         for number in range(1, NUDGES + 1):
             for nudge in (1 + NUDGE * number, 1 - NUDGE * number):
                 with contextlib.suppress(RecipeError):
-                    if (edits := choose(min(nudge * goal, LEAST_GONE * whole))) not in self._shares:
+                    if (edits := choose(min(nudge * goal, MAX_REMAINING * whole))) not in self._shares:
                         return edits
         return first
 
 
-def undisturbed(wholes: Sequence[float]) -> float:
-    """Return what the whole policy takes where nothing else runs, in ms: the median of the runs that were not held up.
+def undisturbed_latency(wholes: Sequence[float]) -> float:
+    """Return the latency of the unpruned policy without other programs, in ms: the median of undisturbed runs.
 
-    The least of several runs would be one on which chance smiled, and what is pruned by it would miss its target.
+    The minimum of several runs would be a lucky one, and a policy pruned by it would miss its target.
     """
-    return median(ms for ms in wholes if ms <= HELD_UP * min(wholes))
+    return median(ms for ms in wholes if ms <= SLOWDOWN_LIMIT * min(wholes))

@@ -1,4 +1,4 @@
-"""Gradual magnitude pruning: zeros are added while the policy is trained, which learns to do without the weights."""
+"""Gradual magnitude pruning: zeros are added during training, so that the policy adapts to them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.stage import ModuleChanges
-from vlatool.prune._sparse import Pattern, check_pattern, least, sparse_layers, zeros_told
+from vlatool.prune._sparse_base import Pattern, check_pattern, describe_zeros, select_layers, smallest_mask
 from vlatool.stage.base import Context
 from vlatool.training.constraint import GrowingZeros
 from vlatool.training.imitation import ImitationStage
@@ -25,14 +25,13 @@ if TYPE_CHECKING:
 
 
 class Gradual(ImitationStage):
-    """Set the smallest weights of each layer to zero step by step, while the teacher says what the policy should do.
+    """Set the smallest weights of each layer to zero step by step, while the policy learns from the teacher.
 
     After step t of n the share of zeros is ``s (1 - (1 - t/n)^3)`` (Zhu and Gupta, arXiv 1710.01878, from no zeros at
-    the start): many early, when there are many weights to spare, and few in the end. What is zero stays zero. The rest
-    of the training goes on with the zeros as they are. The learning rate is lower than that of ``distill policy``: the
-    student begins as the teacher itself, and larger steps move it away before there is anything to learn. Shapes stay:
-    processors multiply zeros like other numbers, so that nothing is faster there; --pattern 2:4 is for sparse tensor
-    cores.
+    the start): many early, when many weights are redundant, and few in the end. Zeros stay zero, and the rest of the
+    training adds no more. The learning rate is lower than that of ``distill policy``: the student starts as the teacher
+    itself, and larger steps would move it away before there is anything to learn. Shapes stay: CPUs multiply zeros like
+    other numbers, so nothing is faster there; --pattern 2:4 is for sparse tensor cores.
     """
 
     changed_first: ClassVar[bool] = False
@@ -50,39 +49,37 @@ class Gradual(ImitationStage):
     exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """The ratio is that of the pattern, and the last weights count."""
+        """Check that the ratio fits the pattern, and that options fit gradual pruning."""
         super().check(source, profile)
         check_pattern(self.pattern, self.ratio)
         if self.shard:
             raise RecipeError(
-                "--shard cuts layers into parts, and which of a layer's weights become zero is chosen in all of it.",
-                "leave --shard out",
+                "--shard splits layers into parts, but the zeros of a layer are chosen over the whole layer.",
+                "omit --shard",
             )
         if self.patience:
-            raise RecipeError(
-                "--patience would choose weights from before the last ones became zero.", "leave --patience out"
-            )
+            raise RecipeError("--patience could choose weights from before the last zeros.", "omit --patience")
 
     def shares(self) -> dict[int, float]:
-        """Return the number of each step that adds zeros -> the share of zeros after it."""
+        """Return step that adds zeros -> share of zeros after it."""
         last = max(1, round(self.steps * self.until))
         numbers = [*range(self.interval, last, self.interval), last]
         return {number: self.ratio * (1 - (1 - number / last) ** 3) for number in numbers}
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
-        """Train, and say which layers stay dense."""
-        context.messages.extend(sparse_layers(modules, source, self.include, self.exclude).told())
+        """Train, and report the layers that stay dense."""
+        context.messages.extend(select_layers(modules, source, self.include, self.exclude).describe())
         return super().change(modules, source, context)
 
     def objective(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Objective:
-        """The student does what the teacher does, with more and more zeros."""
-        layers = sparse_layers(modules, source, self.include, self.exclude).chosen.values()
-        zeros = GrowingZeros([layer.weight for layer in layers], self._goes, self.shares())
+        """Return the objective: imitate the teacher with a growing share of zeros."""
+        layers = select_layers(modules, source, self.include, self.exclude).prunable.values()
+        zeros = GrowingZeros([layer.weight for layer in layers], self._pruned_mask, self.shares())
         return replace(super().objective(modules, source, teacher), constraint=zeros)
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
-        """Say how many weights are zero, and what was learnt."""
-        return (*zeros_told(made, self.pattern), *super().lines(made))
+    def lines(self, pruned: Bundle) -> tuple[str, ...]:
+        """Report the share of zeros, and the training."""
+        return (*describe_zeros(pruned, self.pattern), *super().lines(pruned))
 
-    def _goes(self, sizes: Tensor, share: float) -> Tensor:
-        return least(sizes, self.pattern, share, rows=False)
+    def _pruned_mask(self, sizes: Tensor, share: float) -> Tensor:
+        return smallest_mask(sizes, self.pattern, share, rows=False)

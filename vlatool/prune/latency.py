@@ -1,7 +1,8 @@
-"""Pruning to a latency: blocks, heads, neurons and channels go by what they take here or on a board, not by work."""
+"""Pruning to a latency: blocks, heads, neurons and channels are removed by their latency, here or on a board."""
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -13,29 +14,29 @@ from pydantic import Field, model_validator
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import DataError, RecipeError
 from vlatool.files.scratch import scratch_directory
-from vlatool.hardware.profile import Profile, load_profile, names, profile_file
+from vlatool.hardware.profile import Profile, load_profile, profile_file, profile_names
 from vlatool.latency_model.board import Candidate
-from vlatool.latency_model.measured import calibrations
+from vlatool.latency_model.board_measurements import calibrations
 from vlatool.machine.host import fingerprint, matches
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import Edit, edits_from
 from vlatool.module.feeds import unrecorded_note
 from vlatool.module.stage import ModuleChanges, ModuleStage
-from vlatool.prune._clock import BoardClock, Clock
-from vlatool.prune._prices import (
+from vlatool.prune._block_ranking import BlockRanking
+from vlatool.prune._latency_costs import (
     Stack,
-    edits_of,
-    is_inside_gone,
-    measured_prices,
+    first_kept_member,
+    is_inside_removed,
+    keep_edits,
+    measure_costs,
     prefix_of,
     rank_blocks,
     role_of,
-    staying,
 )
-from vlatool.prune._ranking import Ranking
+from vlatool.prune._latency_meter import LatencyMeter, LatencyPredictor
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune._trials import Trials
-from vlatool.prune._units import Group, Rank, Work, groups_of, nothing, rank_units, walks_of
+from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, no_units, rank_units, trace_walks
 from vlatool.prune.depth import PROTECTED
 from vlatool.stage.base import Context
 
@@ -43,22 +44,22 @@ if TYPE_CHECKING:
     from torch import nn
     from typing_extensions import Self
 
-AIM, CLOSE = 0.98, 0.04
-"""The share of the asked latency that is aimed at, and how far below it a result may stay."""
-ROUNDS = 8
-"""Of choosing and measuring, at most."""
-MOST_AT_ONCE = 1.5
-"""Factor by which a result may change what is aimed at: one that was disturbed is corrected by the next."""
+TARGET_SHARE, TOLERANCE = 0.98, 0.04
+"""Share of the requested latency to aim at, and how far below the request a result may lie."""
+MAX_ROUNDS = 8
+"""Largest number of rounds of selection and measurement."""
+MAX_CORRECTION = 1.5
+"""Largest factor by which one result may correct the goal: the next one corrects a disturbed one."""
 
 
 class LatencyPruning(ModuleStage):
-    """Remove what matters least for the milliseconds that it takes, until an inference takes as long as asked.
+    """Remove the parts of least importance for each millisecond, until an inference reaches the target latency.
 
     Milliseconds are measured on this machine in float32: without half of the units of each kind of layer, and without
-    one block of each stack, all in one run. What is removed is then measured as a whole, and chosen again, until the
-    latency lies within 4 % below the target. With ``--profile`` of another board nothing is measured: the same
-    exports are predicted for that board, with the uncertainty that its predictions have. ``gate`` ranks blocks and
-    units alike, by how much the action moves when one is scaled. Quantization comes afterwards, and makes it faster.
+    one block of each stack, all in one run. The selection is then measured as a whole, and repeated until the latency
+    lies within 4 % below the target. With ``--profile`` of another board nothing is measured: the same exports are
+    predicted for that board, with the uncertainty of such predictions. ``gate`` ranks blocks and units alike, by how
+    much the action changes when one is scaled. Quantize the result afterwards, which makes it faster.
     """
 
     target_ms: float = Field(gt=0, le=1e6, description="milliseconds that an inference may take, in float32")
@@ -80,16 +81,16 @@ class LatencyPruning(ModuleStage):
         """Return the stage that predicts for a board, or measures where the board is this machine.
 
         Raises:
-            RecipeError: when its profile cannot be found by its name, another board was named, or threads were.
+            RecipeError: when no profile has its name, another board was named, or ``threads`` was set.
         """
         if self.board:
             if load_profile(self.board) != profile:
-                said = f"--board {self.board} and --profile {profile.name} are two boards."
-                raise RecipeError(said, "name one of them")
+                message = f"--board {self.board} and --profile {profile.name} are different boards."
+                raise RecipeError(message, "name one of them")
             return self
         if matches(profile.model_strings, fingerprint()):
             return self
-        if profile.name not in names() or load_profile(profile.name) != profile:
+        if profile.name not in profile_names() or load_profile(profile.name) != profile:
             raise RecipeError(
                 f"The bundle records for which board it was pruned, and {profile.name} is not a known profile.",
                 "name its file: --board FILE, or add its folder to VLATOOL_PROFILES",
@@ -98,12 +99,12 @@ class LatencyPruning(ModuleStage):
         return self.model_copy(update={"board": profile.name})
 
     @model_validator(mode="after")
-    def _known(self) -> Self:
-        """Refuse an unknown board, an engine that it does not have, or threads: predictions are of whole boards.
+    def _check_board(self) -> Self:
+        """Refuse an unknown board, an engine that it lacks, or ``threads``: predictions are for whole boards.
 
         Raises:
-            ProfileError: naming those that there are.
-            RecipeError: for threads.
+            ProfileError: with the known boards or engines.
+            RecipeError: for ``threads``.
         """
         if self.board and not self.chosen:
             board = load_profile(self.board)
@@ -114,170 +115,176 @@ class LatencyPruning(ModuleStage):
     def _refuse_threads(self, board: str) -> None:
         if "threads" in self.model_fields_set and not self.chosen:
             raise RecipeError(
-                f"--threads {self.threads} is of measurements on this machine; {board} is predicted as a whole.",
-                "leave --threads out, or measure here: leave --profile and --board out",
+                f"--threads {self.threads} applies to measurements on this machine; {board} is predicted as a whole.",
+                "omit --threads, or measure here: omit --profile and --board",
             )
 
     def key(self, source_hash: str) -> str:
-        """Return the cache key, with what predictions rest on besides the model: the profile, and own measurements."""
+        """Return the cache key, with the other inputs of predictions: the profile, and own measurements."""
         if not self.board or self.chosen:
             return super().key(source_hash)
         files = (profile_file(self.board), *sorted(calibrations().glob("*.json")))
         return super().key(" ".join([source_hash, *map(hash_file, files)]))
 
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Return how large the modules are, and what was not measured."""
-        predicted = f"predicted, not measured: {self.target_ms:g} ms or up to {CLOSE:.0%} less on {self.board}"
+        """Report the size of the modules, and a latency that was only predicted."""
+        predicted = f"predicted, not measured: {self.target_ms:g} ms or up to {TOLERANCE:.0%} less on {self.board}"
         return (*super().lines(bundle), *([predicted] if self.board and not self.chosen else []))
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
-        """Choose the blocks and units that stay.
+        """Choose the blocks and units to keep.
 
         Raises:
-            RecipeError: when it is fast enough already, or cannot be made so fast.
+            RecipeError: when the policy is fast enough already, or cannot become fast enough.
             SourceError: when torch.export cannot trace a module.
-            DataError: when the latency is not met: it changes from run to run.
+            DataError: when the latency is not met because it varies from run to run.
         """
         if self.chosen:
-            return ModuleChanges(_edits_chosen(self.chosen))
+            return ModuleChanges(_parse_edits(self.chosen))
         if self.board:
             self._predict_whole(source, context)
         context.progress("tracing the policy", None)
-        walks = walks_of(modules, source)
-        groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
+        walks = trace_walks(modules, source)
+        groups = find_groups(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         if not groups:
-            raise nothing(source.manifest.name)
+            raise no_units(source.manifest.name)
         context.progress(f"ranking the units of {len(groups)} groups", None)
         context.messages.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
-        work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
+        work = Macs(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
         with scratch_directory() as scratch:
-            clock = self._clock(source, scratch, context)
-            edits = self._met(groups, blocks, work, clock, context)
+            meter = self._meter(source, scratch, context)
+            edits = self._meet_target(groups, blocks, work, meter, context)
         board = {"board": load_profile(self.board).name} if self.board else {}
         return ModuleChanges(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
 
     def _predict_whole(self, source: Bundle, context: Context) -> None:
-        """Say at once, and not after the ranking, that there is nothing to do."""
+        """Predict the unpruned policy before the ranking, in case the target is met already."""
         context.progress(f"predicting for {self.board}", None)
         with scratch_directory() as scratch:
-            whole, _ = self._clock(source, scratch, context).times([])
-        self._refuse_met(whole)
+            whole, _ = self._meter(source, scratch, context).times([])
+        self._refuse_if_met(whole)
 
-    def _clock(self, source: Bundle, scratch: Path, context: Context) -> Clock:
-        of = (source, scratch, self.engine, self.threads, self.made_by(), context)
-        return BoardClock(load_profile(self.board), *of) if self.board else Clock(*of)
+    def _meter(self, source: Bundle, scratch: Path, context: Context) -> LatencyMeter:
+        arguments = (source, scratch, self.engine, self.threads, self.made_by(), context)
+        return LatencyPredictor(load_profile(self.board), *arguments) if self.board else LatencyMeter(*arguments)
 
-    def _refuse_met(self, whole: float) -> None:
+    def _refuse_if_met(self, whole: float) -> None:
         if whole <= self.target_ms:
             here = f"takes {whole:.3g} ms here"
             takes = f"is predicted to take {whole:.3g} ms on {self.board}" if self.board else here
             raise RecipeError(f"An inference {takes} already; asked for {self.target_ms:g} ms.", "ask for less")
 
     def stacks(self, modules: Mapping[str, nn.Module], source: Bundle) -> list[Stack]:
-        """Return the stacks that may lose blocks, with the importance of these; none for a policy without blocks."""
+        """Return the stacks that may lose blocks, with the importance of each block; none for a policy without any."""
         if not self.blocks or self.rank != "gate":
             return []
         protected = Selection((), (), PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
         found = [
-            Stack(places, tuple(name for name, _ in blocks.named_children()))
-            for places, blocks in stacks_of(modules)
-            if self._chooses(places, blocks) and (self.include or not any(map(protected.protects, places.values())))
+            Stack(lists, tuple(name for name, _ in blocks.named_children()))
+            for lists, blocks in stacks_of(modules)
+            if self._may_remove(lists, blocks) and (self.include or not any(map(protected.protects, lists.values())))
         ]
         if found:
-            rank_blocks(found, Ranking(modules, source, self.samples))
+            rank_blocks(found, BlockRanking(modules, source, self.samples))
         return found
 
-    def _chooses(self, places: Mapping[str, str], blocks: nn.Module) -> bool:
-        """Return whether all weights of a stack may go: those that stay would have no block to stay in."""
+    def _may_remove(self, lists: Mapping[str, str], blocks: nn.Module) -> bool:
+        """Return whether all weights of a stack may be removed, since blocks are removed as a whole."""
         selection = Selection(self.include, self.exclude)
         weights = [weight for weight, _ in blocks.named_parameters()]
-        return all(selection.has((prefix_of(name) + weight,)) for name in places.values() for weight in weights)
+        return all(selection.selects((prefix_of(name) + weight,)) for name in lists.values() for weight in weights)
 
-    def _met(
-        self, groups: Sequence[Group], blocks: Sequence[Stack], work: Work, clock: Clock, context: Context
+    def _meet_target(
+        self, groups: Sequence[UnitGroup], blocks: Sequence[Stack], work: Macs, meter: LatencyMeter, context: Context
     ) -> tuple[Edit, ...]:
-        """Return edits that meet the target, choosing again as long as what was chosen does not."""
-        context.progress(f"what {len({role_of(group) for group in groups})} kinds of layers take", None)
-        whole, prices = measured_prices(groups, blocks, work, clock)
-        self._refuse_met(whole)
-        choice = _Choice(groups, blocks, work, prices, self.least)
-        trials = Trials(clock, [whole])
+        """Return edits that meet the target, selecting again until they do."""
+        context.progress(f"measuring {len({role_of(group) for group in groups})} kinds of layers", None)
+        whole, prices = measure_costs(groups, blocks, work, meter)
+        self._refuse_if_met(whole)
+        selector = _Selector(groups, blocks, work, prices, self.least)
+        trials = Trials(meter, [whole])
         wanted = 1.0
-        for number in range(ROUNDS):
-            goal = AIM * self.target_ms / trials.undisturbed * whole
-            edits = trials.untried(lambda share: choice.until(whole, share, self.target_ms), wanted * goal, whole)
-            if self._is_met(trials.measured(edits)):  # once may be luck
-                trials.measured(edits)
-            ms = trials.seen(edits, wanted)
-            context.progress(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / ROUNDS)
+        for number in range(MAX_ROUNDS):
+            goal = TARGET_SHARE * self.target_ms / trials.undisturbed_ms * whole
+            select = functools.partial(selector.select_until, whole, asked=self.target_ms)
+            edits = trials.next_choice(select, wanted * goal, whole)
+            if self._is_met(trials.measure(edits)):  # confirm with a second run
+                trials.measure(edits)
+            ms = trials.record_result(edits, wanted)
+            context.progress(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / MAX_ROUNDS)
             if self._is_met(ms):
                 return edits
-            next_one = AIM * self.target_ms / trials.for_each
-            wanted = min(MOST_AT_ONCE * wanted, max(wanted / MOST_AT_ONCE, next_one))
+            next_one = TARGET_SHARE * self.target_ms / trials.result_ratio
+            wanted = min(MAX_CORRECTION * wanted, max(wanted / MAX_CORRECTION, next_one))
         how, quiet = ("predicted", "") if self.board else ("measured", "let nothing else run meanwhile; ")
         raise DataError(
-            f"The latency of {self.target_ms:g} ms was not met within {CLOSE:.0%}; {how}: "
-            f"{', '.join(f'{ms:.3g}' for ms in trials.tried)} ms.",
+            f"The latency of {self.target_ms:g} ms was not met within {TOLERANCE:.0%}; {how}: "
+            f"{', '.join(f'{ms:.3g}' for ms in trials.results)} ms.",
             f"{quiet}let units go one by one: --multiple 1",
         )
 
     def _is_met(self, ms: float) -> bool:
-        return (1 - CLOSE) * self.target_ms <= ms <= self.target_ms
+        return (1 - TOLERANCE) * self.target_ms <= ms <= self.target_ms
 
 
-def _edits_chosen(text: str) -> tuple[Edit, ...]:
-    """Return the edits that an earlier run chose; there are some.
+def _parse_edits(text: str) -> tuple[Edit, ...]:
+    """Return the edits that an earlier run chose.
 
     Raises:
-        SourceError: when the text is no list of edits.
-        RecipeError: when it is an empty one.
+        SourceError: when the text is not a list of edits.
+        RecipeError: when it is an empty list.
     """
     edits = edits_from(text, "--chosen")
     if not edits:
-        raise RecipeError("--chosen is an empty list: nothing would be pruned.", "leave it out: it is chosen anew")
+        raise RecipeError("--chosen is an empty list: nothing would be pruned.", "omit it for a new selection")
     return edits
 
 
 @dataclass(frozen=True, order=True)
-class _Offer:
-    """What may go next: how much it matters for each millisecond that it saves, and what it is."""
+class _Candidate:
+    """Next candidate for removal: importance for each millisecond saved, milliseconds, and what is removed."""
 
-    price: float
+    cost: float
     ms: float
-    part: int
-    loses: tuple[int, ...]
+    index: int
+    removed: tuple[int, ...]
 
 
-class _Choice:
-    """Chooses what goes by prices that were measured.
+class _Selector:
+    """Selects units and blocks to remove by their measured costs.
 
     Args:
-        groups: Units that may go.
-        stacks: Blocks that may go.
-        work: Of the groups.
+        groups: Groups of removable units.
+        stacks: Stacks of removable blocks.
+        work: Counter of multiply-accumulates of the groups.
         prices: Role of a group -> milliseconds for a multiply-accumulate.
-        least: Share of each group that stays.
+        least: Least share of each group that stays.
     """
 
     def __init__(
-        self, groups: Sequence[Group], stacks: Sequence[Stack], work: Work, prices: Mapping[str, float], least: float
+        self,
+        groups: Sequence[UnitGroup],
+        stacks: Sequence[Stack],
+        work: Macs,
+        prices: Mapping[str, float],
+        least: float,
     ) -> None:
         self._groups, self._stacks, self._work, self._least = groups, stacks, work, least
         self._prices = [prices[role_of(group)] for group in groups]
         self._saved = [0.0] * len(groups)
 
-    def until(self, whole: float, goal: float, asked: float) -> tuple[Edit, ...]:
-        """Take away what matters least for the milliseconds that it saves, from all of it, until so many are left.
+    def select_until(self, whole: float, goal: float, asked: float) -> tuple[Edit, ...]:
+        """Remove the candidates of least importance for each millisecond, from the whole policy, until the goal.
 
         Args:
-            whole: Milliseconds of the whole policy, when the prices were measured.
-            goal: Those that are to be left.
-            asked: What the user asked for, which ``goal`` is a correction of.
+            whole: Milliseconds of the unpruned policy when the costs were measured.
+            goal: Milliseconds to reach.
+            asked: Milliseconds that the user requested, before the correction to ``goal``.
 
         Raises:
-            RecipeError: when no more may go before.
+            RecipeError: when the goal is out of reach.
         """
         self._saved = [0.0] * len(self._groups)
         for group in self._groups:
@@ -286,42 +293,44 @@ class _Choice:
             stack.keep = list(range(len(stack.blocks)))
         left = whole
         while left > goal:
-            offers = [*self._units(), *self._blocks()]
-            fit = [offer for offer in offers if left - offer.ms >= (1 - CLOSE) * goal]
-            if not offers:
+            candidates = [*self._units(), *self._blocks()]
+            fit = [candidate for candidate in candidates if left - candidate.ms >= (1 - TOLERANCE) * goal]
+            if not candidates:
+                reachable = left * TARGET_SHARE * asked / goal
                 raise RecipeError(
-                    f"No less than about {left * AIM * asked / goal:.3g} ms can be reached; asked for {asked:g}.",
+                    f"No less than about {reachable:.3g} ms can be reached; asked for {asked:g}.",
                     "ask for more, or let less stay (--least); quantization makes it faster, too",
                 )
-            offer = min(fit) if fit else min(offers, key=lambda offer: offer.ms)
-            self._take(offer)
-            left -= offer.ms
-        return edits_of(self._groups, self._stacks)
+            candidate = min(fit) if fit else min(candidates, key=lambda candidate: candidate.ms)
+            self._remove(candidate)
+            left -= candidate.ms
+        return keep_edits(self._groups, self._stacks)
 
-    def _units(self) -> Iterator[_Offer]:
-        """Yield the next units of each group that is not in a block that is gone."""
+    def _units(self) -> Iterator[_Candidate]:
+        """Yield the next units of each group outside of removed blocks."""
         for number, group in enumerate(self._groups):
-            if staying(group, self._stacks) is None:
+            if first_kept_member(group, self._stacks) is None:
                 continue
-            cost, loses = group.cheapest(self._least)
-            ms = self._prices[number] * self._work.without(number, group.stays - len(loses)) - self._saved[number]
-            if loses and ms > 0:
-                yield _Offer(cost / ms, ms, number, tuple(loses))
+            importance, removed = group.cheapest_units(self._least)
+            macs = self._work.saved_alone(number, group.remaining - len(removed))
+            ms = self._prices[number] * macs - self._saved[number]
+            if removed and ms > 0:
+                yield _Candidate(importance / ms, ms, number, tuple(removed))
 
-    def _blocks(self) -> Iterator[_Offer]:
+    def _blocks(self) -> Iterator[_Candidate]:
         """Yield the next block of each stack; the last one stays."""
-        for place, stack in enumerate(self._stacks):
-            if len(stack.keep) < 2 or is_inside_gone(stack, self._stacks):
+        for index, stack in enumerate(self._stacks):
+            if len(stack.keep) < 2 or is_inside_removed(stack, self._stacks):
                 continue
-            block = stack.least
-            inside = (number for number, group in enumerate(self._groups) if stack.is_block_of(group, block))
+            block = stack.least_important
+            inside = (number for number, group in enumerate(self._groups) if stack.contains(group, block))
             ms = stack.ms - sum(self._saved[number] for number in inside)
             if ms > 0:
-                yield _Offer(stack.importance[block] / ms, ms, len(self._groups) + place, (block,))
+                yield _Candidate(stack.importance[block] / ms, ms, len(self._groups) + index, (block,))
 
-    def _take(self, offer: _Offer) -> None:
-        if offer.part < len(self._groups):
-            self._groups[offer.part].without(offer.loses)
-            self._saved[offer.part] += offer.ms
+    def _remove(self, candidate: _Candidate) -> None:
+        if candidate.index < len(self._groups):
+            self._groups[candidate.index].remove(candidate.removed)
+            self._saved[candidate.index] += candidate.ms
         else:
-            self._stacks[offer.part - len(self._groups)].keep.remove(*offer.loses)
+            self._stacks[candidate.index - len(self._groups)].keep.remove(*candidate.removed)

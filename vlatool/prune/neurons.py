@@ -1,4 +1,4 @@
-"""Structured pruning by magnitude: whole neurons are removed, so that every engine is faster without sparse kernels."""
+"""Structured pruning by magnitude: remove whole neurons, which is faster on every engine without sparse kernels."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ ELEMENTWISE = (
     "CELU", "Dropout", "ELU", "GELU", "Hardsigmoid", "Hardswish", "Hardtanh", "Identity", "LeakyReLU", "Mish", "ReLU",
     "ReLU6", "SELU", "SiLU", "Sigmoid", "Softplus", "Softsign", "Tanh",
 )  # fmt: skip
-"""Modules of torch that treat every element alike, so that a neuron before them is one behind them."""
+"""Elementwise modules of torch: a neuron before them is a neuron after them."""
 
 
 class Neurons(ModuleStage):
     """Remove the neurons of least magnitude from the hidden layers of MLPs.
 
-    A hidden layer is what is between two Linear layers of an ``nn.Sequential`` with nothing but elementwise modules
-    between them. A neuron's magnitude is the product of the L2 norms of its incoming and of its outgoing weights: what
-    it can add to the output. Train the policy further afterwards (``vlatool distill weights`` takes the result).
+    A hidden layer lies between two Linear layers of an ``nn.Sequential`` with only elementwise modules between them. A
+    neuron's magnitude is the product of the L2 norms of its incoming and of its outgoing weights, which bounds its
+    contribution to the output. Train the policy afterwards (``vlatool distill weights`` takes the result).
     """
 
     ratio: float = Field(0.25, gt=0, lt=1, description="share of the neurons of each hidden layer to remove")
@@ -39,7 +39,7 @@ class Neurons(ModuleStage):
     exclude: tuple[str, ...] = Field((), description="globs of module names to leave as they are")
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
-        """Choose the neurons that stay.
+        """Choose the neurons to keep.
 
         Raises:
             RecipeError: when no hidden layer can be pruned, or a pattern matches none.
@@ -52,9 +52,9 @@ class Neurons(ModuleStage):
         selection.check(names, "hidden layer")
         edits: list[Edit] = []
         for graph, first, second, incoming, outgoing in layers:
-            if selection.has((first,)):
+            if selection.selects((first,)):
                 context.progress(f"pruning {first}", None)
-                keep = self._kept(incoming, outgoing)
+                keep = self._kept_neurons(incoming, outgoing)
                 edits += [Edit(graph, first, "outputs", keep), Edit(graph, second, "inputs", keep)]
         if not edits:
             raise RecipeError(
@@ -64,33 +64,33 @@ class Neurons(ModuleStage):
             )
         return ModuleChanges(tuple(edits))
 
-    def _kept(self, incoming: Any, outgoing: Any) -> tuple[int, ...]:
-        """Return the indices of the neurons that stay, in their order."""
+    def _kept_neurons(self, incoming: Any, outgoing: Any) -> tuple[int, ...]:
+        """Return the indices of the neurons to keep, in ascending order."""
         torch = require("torch", "build")
         size = incoming.out_features
         share = max(1, round(size * (1 - self.ratio)))
         count = min(size, max(self.multiple, self.multiple * round(share / self.multiple)))
         magnitude = incoming.weight.detach().double().norm(dim=1) * outgoing.weight.detach().double().norm(dim=0)
-        chosen = torch.argsort(magnitude, descending=True, stable=True)[:count]
-        return tuple(sorted(int(index) for index in chosen))
+        strongest = torch.argsort(magnitude, descending=True, stable=True)[:count]
+        return tuple(sorted(int(index) for index in strongest))
 
 
 def hidden_layers(module: nn.Module) -> Iterator[tuple[str, str, Any, Any]]:
-    """Yield (name, name of the next, Linear, next Linear) of each hidden layer; weights that others share are left."""
+    """Yield (name, name of the next, Linear, next Linear) of each hidden layer, except layers with shared weights."""
     torch = require("torch", "build")
-    held = [value for part in module.modules() for value in (*part._parameters.values(), *part._modules.values())]
-    seen = Counter(map(id, held))
+    children = [value for part in module.modules() for value in (*part._parameters.values(), *part._modules.values())]
+    uses = Counter(map(id, children))
     for name, part in module.named_modules():
         if type(part) is not torch.nn.Sequential:
             continue
         first: tuple[str, Any] | None = None
         for key, child in part._modules.items():
-            place = f"{name}.{key}" if name else key
+            path = f"{name}.{key}" if name else key
             if type(child) is torch.nn.Linear:
                 if first is not None and all(
-                    seen[id(weight)] < 2 for layer in (first[1], child) for weight in (layer, layer.weight)
+                    uses[id(weight)] < 2 for layer in (first[1], child) for weight in (layer, layer.weight)
                 ):
-                    yield first[0], place, first[1], child
-                first = place, child
+                    yield first[0], path, first[1], child
+                first = path, child
             elif type(child).__name__ not in ELEMENTWISE or not type(child).__module__.startswith("torch.nn"):
                 first = None

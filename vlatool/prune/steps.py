@@ -20,17 +20,16 @@ from vlatool.stage.base import Context
 if TYPE_CHECKING:
     from torch import nn
 
-SAME = 1e-6
-"""Relative difference of numbers in a schedule that were rounded otherwise."""
+ROUNDING_TOLERANCE = 1e-6
+"""Largest relative difference of equal numbers in a schedule after rounding."""
 
 
 class Steps(ModuleStage):
-    """Run the graph that a program repeats fewer times, with the time and the size of its steps to match.
+    """Repeat the graph of a denoising loop fewer times, with larger steps.
 
-    For policies that integrate a flow (Euler steps) and whose program says both: a ``schedule`` with the time of each
-    step, evenly spaced, and one with the size of the steps, always the same. ``[1.0, 0.9, ..., 0.1]`` and
-    ``[-0.1, ...]`` become ``[1.0, 0.5]`` and ``[-0.5, -0.5]``. Weights stay; ``vlatool distill policy`` then trains the
-    policy to reach in few steps what it reached in many.
+    For policies that integrate a flow (Euler steps) and whose program has both schedules: evenly spaced times, and a
+    constant step size. ``[1.0, 0.9, ..., 0.1]`` and ``[-0.1, ...]`` become ``[1.0, 0.5]`` and ``[-0.5, -0.5]``. Weights
+    stay; ``vlatool distill policy`` then trains the policy to reach the same result in fewer steps.
     """
 
     keeps_weights: ClassVar[bool] = True
@@ -38,13 +37,13 @@ class Steps(ModuleStage):
     to: int = Field(ge=1, le=1000, description="steps that stay")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """The program repeats a graph, in steps that can be larger."""
+        """Check that the program repeats a graph, in steps that can be larger."""
         super().check(source, profile)
         if source is not None:
             self._program(source.manifest.program)
 
     def in_parts(self) -> bool:
-        """No weight is needed."""
+        """Return True: no weight is needed."""
         return True
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
@@ -58,15 +57,15 @@ class Steps(ModuleStage):
 
     def _program(self, steps: Sequence[ProgramStep]) -> tuple[ProgramStep, ...]:
         if all(step.repeat == 1 for step in steps):
-            raise RecipeError("The policy repeats no graph: there are no denoising steps.", "prune something else")
-        return tuple(fewer(step, self.to) if step.repeat > 1 else step for step in steps)
+            raise RecipeError("The policy has no denoising steps: its program repeats no graph.", "use another method")
+        return tuple(with_fewer_steps(step, self.to) if step.repeat > 1 else step for step in steps)
 
 
-def fewer(step: ProgramStep, count: int) -> ProgramStep:
+def with_fewer_steps(step: ProgramStep, count: int) -> ProgramStep:
     """Return a step of a program that repeats its graph ``count`` times, over the same span of time.
 
     Raises:
-        RecipeError: when it has fewer steps now, or its schedule is not that of even steps.
+        RecipeError: when it already has no more steps, or its schedule is not evenly spaced.
     """
     if count >= step.repeat:
         raise RecipeError(
@@ -77,38 +76,40 @@ def fewer(step: ProgramStep, count: int) -> ProgramStep:
     uneven = [name for name in times if not _is_even(step.schedule[name], times[name])]
     if uneven:
         raise RecipeError(
-            f"The schedule of '{uneven[0]}' is neither one number nor evenly spaced; with fewer steps, it is unknown.",
+            f"The schedule of '{uneven[0]}' is neither constant nor evenly spaced; for fewer steps it is unknown.",
             "write the program with fewer steps in policy.yaml",
         )
     if not any(
-        math.isclose(abs(size), abs(apart), rel_tol=1e-3) for size in sizes.values() for apart in times.values()
+        math.isclose(abs(size), abs(spacing), rel_tol=1e-3) for size in sizes.values() for spacing in times.values()
     ):
         raise RecipeError(
-            f"The program of '{step.graph}' does not say how large its steps are: no schedule holds the distance of "
-            f"two times ({', '.join(f'{name}: {apart:.3g}' for name, apart in times.items()) or 'no times'}).",
+            f"The program of '{step.graph}' has no schedule of the step size, the distance between two times "
+            f"({', '.join(f'{name}: {spacing:.3g}' for name, spacing in times.items()) or 'no times'}).",
             "give the graph the size of its step as an input: schedule: {dt: [-0.1, ...]}",
         )
     larger = step.repeat / count
     schedule = {name: [size * larger] * count for name, size in sizes.items()} | {
-        name: [step.schedule[name][0] + apart * larger * turn for turn in range(count)] for name, apart in times.items()
+        name: [step.schedule[name][0] + spacing * larger * turn for turn in range(count)]
+        for name, spacing in times.items()
     }
-    return replace(step, repeat=count, schedule={name: _like(step, name, schedule[name]) for name in step.schedule})
+    stored = {name: _as_stored(step, name, schedule[name]) for name in step.schedule}
+    return replace(step, repeat=count, schedule=stored)
 
 
-def _like(step: ProgramStep, name: str, numbers: list[float]) -> list[float]:
-    """Return numbers for a schedule: whole ones where those before were, since a graph takes them as integers."""
+def _as_stored(step: ProgramStep, name: str, numbers: list[float]) -> list[float]:
+    """Return numbers for a schedule, as integers where the original ones are, since a graph takes them as integers."""
     if not all(isinstance(number, int) for number in step.schedule[name]):
         return numbers
-    if any(abs(number - round(number)) > SAME for number in numbers):
+    if any(abs(number - round(number)) > ROUNDING_TOLERANCE for number in numbers):
         raise RecipeError(
-            f"The schedule of '{name}' has whole numbers; with {len(numbers)} steps in the place of {step.repeat} they "
-            "would not be.",
+            f"The schedule of '{name}' has integers; with {len(numbers)} steps instead of {step.repeat} they would "
+            "become fractions.",
             f"ask for a divisor of {step.repeat}",
         )
     return [round(number) for number in numbers]
 
 
-def _is_even(numbers: Sequence[float], apart: float) -> bool:
-    """Return whether neighbours are all so far apart."""
-    scale = SAME * max(map(abs, numbers), default=0.0)
-    return all(abs(after - before - apart) <= scale for before, after in itertools.pairwise(numbers))
+def _is_even(numbers: Sequence[float], spacing: float) -> bool:
+    """Return whether the numbers are evenly spaced."""
+    scale = ROUNDING_TOLERANCE * max(map(abs, numbers), default=0.0)
+    return all(abs(after - before - spacing) <= scale for before, after in itertools.pairwise(numbers))

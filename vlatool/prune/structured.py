@@ -1,4 +1,4 @@
-"""Structured pruning: heads, neurons and channels go, wherever they are coupled, until the policy does less work."""
+"""Structured pruning: remove heads, neurons and channels with all coupled weights, until the policy does less work."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.module.axes import Walk
 from vlatool.module.feeds import unrecorded_note
 from vlatool.module.stage import ModuleChanges, ModuleStage
-from vlatool.prune._reached import SHORT, recorded, refuse_short, sentences
+from vlatool.prune._reduction_record import MIN_REACHED, describe_reduction, reduction_record, refuse_shortfall
 from vlatool.prune._selection import Selection
-from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
+from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, rank_units, trace_walks
 from vlatool.stage.base import Context
 from vlatool.stage.controls import PRUNED_KEY
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 class Structured(ModuleStage):
     """Remove the least important heads, neurons and channels, until a share of the multiply-accumulates is gone.
 
-    Which weights are coupled is found in a trace of the policy, through reshapes: heads go as a whole, with their rows
-    of the projections. What is normalised over, inputs, outputs and embeddings stay. ``gate`` ranks by how much the
-    action moves when a unit is scaled (one backward pass an observation); ``magnitude`` by the norms of what writes and
-    what reads a unit; ``random`` is the control. Train the result afterwards
-    (``vlatool distill policy`` takes it as it is).
+    Coupled weights are found in a trace of the policy, through reshapes: heads are removed as a whole, with their rows
+    of the projections. Normalised axes, inputs, outputs and embeddings stay. ``gate`` ranks by how much the action
+    changes when a unit is scaled (one backward pass for each observation); ``magnitude`` by the norms of the weights
+    that write and that read a unit; ``random`` is the control. Train the result afterwards (``vlatool distill policy``
+    takes it unchanged).
     """
 
     ratio: float = Field(0.3, gt=0, lt=1, description="share of the multiply-accumulates that goes")
@@ -40,15 +40,15 @@ class Structured(ModuleStage):
     exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
-        """Choose the units that stay.
+        """Choose the units to keep.
 
         Raises:
-            RecipeError: when all that could go is left out, or a pattern matches nothing.
+            RecipeError: when everything removable is excluded, or a pattern matches nothing.
             SourceError: when torch.export cannot trace a module.
         """
         context.progress("tracing the policy", None)
-        walks = walks_of(modules, source)
-        groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
+        walks = trace_walks(modules, source)
+        groups = find_groups(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         context.progress(f"ranking the units of {len(groups)} groups", None)
         if groups:
             context.messages.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
@@ -56,34 +56,34 @@ class Structured(ModuleStage):
         return self.choose(walks, groups, {step.graph: step.repeat for step in source.manifest.program}, context)
 
     def choose(
-        self, walks: Mapping[str, Walk], groups: Sequence[Group], runs: Mapping[str, int], context: Context
+        self, walks: Mapping[str, Walk], groups: Sequence[UnitGroup], runs: Mapping[str, int], context: Context
     ) -> ModuleChanges:
-        """Take units from ranked groups.
+        """Remove units from ranked groups.
 
         Args:
             walks: Graph name -> its axes.
-            groups: Of units, ranked.
-            runs: Graph name -> how often it runs in an inference.
-            context: For progress.
+            groups: Groups of units, ranked.
+            runs: Graph name -> number of runs in an inference.
+            context: Receiver of progress.
         """
-        work = Work(walks, runs, groups)
+        work = Macs(walks, runs, groups)
         self._remove(groups, work, context)
-        whole, left = [group.size for group in groups], [group.stays for group in groups]
-        record = recorded(self.ratio, work, whole, left, walks.values())
-        context.messages.extend(sentences(record))
-        edits = tuple(group.edit() for group in groups if group.stays < group.size)
+        whole, remaining = [group.size for group in groups], [group.remaining for group in groups]
+        record = reduction_record(self.ratio, work, whole, remaining, walks.values())
+        context.messages.extend(describe_reduction(record))
+        edits = tuple(group.edit() for group in groups if group.remaining < group.size)
         return ModuleChanges(edits, record={PRUNED_KEY: record})
 
     def accept(self, bundle: Bundle) -> None:
-        """Refuse what falls short of the ratio.
+        """Refuse a bundle that falls short of the ratio.
 
         Raises:
             FallsShort: by more than a tenth.
         """
-        refuse_short(bundle)
+        refuse_shortfall(bundle)
 
-    def _remove(self, groups: Sequence[Group], work: Work, context: Context) -> None:
-        """Take away units, those first that cost least for the work that they save, as long as there are any."""
+    def _remove(self, groups: Sequence[UnitGroup], work: Macs, context: Context) -> None:
+        """Remove units, in the order of importance for the work that they save, while there are any."""
         sizes = [group.size for group in groups]
         whole = left = work.macs(sizes)
         goal = whole * (1 - self.ratio)
@@ -92,14 +92,15 @@ class Structured(ModuleStage):
             context.progress("choosing what goes", min(1.0, (whole - left) / (whole - goal)))
             prices = []
             for number, group in enumerate(groups):
-                cost, loses = group.cheapest(self.least)
-                saved = work.saved(number, sizes[number] - len(loses), sizes)
-                prices += [(cost / saved, number, loses)] if saved > 0 else []
+                cost, removed = group.cheapest_units(self.least)
+                saved = work.savings(number, sizes[number] - len(removed), sizes)
+                prices += [(cost / saved, number, removed)] if saved > 0 else []
             if not prices:
                 return
             _, number, last = min(prices)
-            groups[number].without(last)
-            sizes[number] = groups[number].stays
+            groups[number].remove(last)
+            sizes[number] = groups[number].remaining
             before, left = left, work.macs(sizes)
-        if last and whole - left > (2 - SHORT) * self.ratio * whole and whole - before >= SHORT * self.ratio * whole:
-            groups[number].put_back(last)  # one step was too much, and nearly enough was gone before it
+        wanted = self.ratio * whole
+        if last and whole - left > (2 - MIN_REACHED) * wanted and whole - before >= MIN_REACHED * wanted:
+            groups[number].restore(last)  # the last step was too large, and the result before it is close enough

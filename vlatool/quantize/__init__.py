@@ -1,4 +1,4 @@
-"""Make a bundle of lower precision."""
+"""Quantization methods: from a bundle to one of lower precision."""
 
 from vlatool.quantize._base import Quantization
 

@@ -1,4 +1,4 @@
-"""What every quantization method does around its own work: select nodes, walk the graphs, finish the bundle."""
+"""Base of every quantization method: selects nodes, iterates over the graphs, finishes the bundle."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.data import calibration_recording, observations_for
 from vlatool.errors import BundleError, RecipeError, fix_for, suggest
 from vlatool.files.scratch import scratch_directory
-from vlatool.graph.files import foreign_errors, load, part_phases, read, save
+from vlatool.graph.files import foreign_errors, load, read, save, split_phases
 from vlatool.graph.layers import Layer, find_layers
-from vlatool.graph.nodes import FOLDED, matches
+from vlatool.graph.nodes import FOLDED_MODULE_KEY, matches
 from vlatool.graph.precision import FLOATS
-from vlatool.quantize._not_finite import finite_layers
+from vlatool.quantize.calibration.non_finite import finite_layers
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of
@@ -35,26 +35,26 @@ from vlatool.stage.products import int8_arithmetic
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
-Reduced = TypeVar("Reduced", bound="Quantization")
+StageT = TypeVar("StageT", bound="Quantization")
 QuantizeGraph = Callable[[str, Path, Path], str | None]
-"""Graph name, original file, new file -> dtype of what is not quantized (float32 when None)."""
+"""Graph name, original file, new file -> dtype of the rest that is not quantized (float32 when None)."""
 QUANTIZED_OPS = ("MatMul", "Gemm", "Conv")
 RECURRENT = ("GRU", "LSTM", "RNN")
-"""Operators that are several products and gates at once; those with int8 products are written in other ones."""
-TRAINED = "quantize.qat"
-"""Stage after which the command line quantizes at once."""
+"""Operators of several products and gates; their int8 counterparts consist of other operators."""
+TRAINING_STAGE = "quantize.qat"
+"""Training stage that the command line follows with quantization."""
 REDUCE_RANGE = (
-    "weights of which no pair saturates, for x86 processors without VNNI: exact at full speed there, with steps up to "
-    "1.4 times as large; without this option and its opposite, the board of --profile decides, or else this host"
+    "scale weights so that no pair of products saturates, for x86 processors without VNNI: exact at full speed there, "
+    "with steps up to 1.4 times as large; by default the board of --profile decides, or else this host"
 )
-REDUCED = (
+REDUCE_RANGE_NOTE = (
     "weights: no pair of products saturates on processors without VNNI (--no-reduce-range: all 8 bits, which are "
     "slower there in ONNX Runtime and wrong in OpenVINO)"
 )
 
 
 class Quantization(Transform):
-    """Options that every quantization method has."""
+    """Options shared by every quantization method."""
 
     runs_graphs: ClassVar[bool] = True
     include: tuple[str, ...] = Field((), description="globs of node names to quantize; all when empty")
@@ -65,7 +65,7 @@ class Quantization(Transform):
     graphs: tuple[str, ...] = Field((), description="globs of graph names to quantize; all when empty")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """There is a graph to quantize, every pattern for graphs matches one, and none of them is quantized already."""
+        """Check that every graph pattern matches a graph, and that no selected graph is quantized already."""
         if source is None:
             return
         if not source.manifest.graphs:
@@ -79,14 +79,14 @@ class Quantization(Transform):
         for name in self.chosen_graphs(source):
             graph = source.manifest.graphs[name]
             quantized = [kind.replace(" weights", " (weights)") for kind in graph.precision if kind not in FLOATS]
-            lower = quantized or [graph.compute]
-            if lower != ["float32"] and lower != [""]:
-                trained = any(entry.get("stage") == TRAINED for entry in history(source))
-                again = "quantize the float32 bundle that this one was made from, or leave the graph out with --graphs"
+            precisions = quantized or [graph.compute]
+            if precisions != ["float32"] and precisions != [""]:
+                trained = any(entry.get("stage") == TRAINING_STAGE for entry in history(source))
+                fix = "quantize the float32 bundle that this one was made from, or exclude the graph with --graphs"
                 raise BundleError(
-                    f"The graph '{name}' of {source.path} is {' and '.join(lower)} already; {self.name()} starts from "
-                    "float32.",
-                    "quantize qat has quantized it: this bundle is its result" if trained else again,
+                    f"The graph '{name}' of {source.path} is {' and '.join(precisions)} already; "
+                    f"{self.name()} starts from float32.",
+                    "quantize qat has quantized it: this bundle is its result" if trained else fix,
                 )
 
     def transform(
@@ -100,7 +100,7 @@ class Quantization(Transform):
     ) -> Bundle:
         """Run ``quantize(graph name, original file, new file)`` on each selected graph and finish the bundle.
 
-        A graph that shall compute in bfloat16 leaves its phases (see ``_phase``) to a float32 graph of its own.
+        The phases of a graph that computes in bfloat16 (``graph.phase``) move to a separate float32 graph.
         """
         bundle = source_of(source, self.name())
         self.check(bundle, None)
@@ -118,15 +118,15 @@ class Quantization(Transform):
                 else:
                     save(load(original), target)
                 if compute == "bfloat16":
-                    program, parted = part_phases(program, name, target)
-                    graphs.update({key: replace(part, opset=graph.opset) for key, part in parted.items()})
+                    program, phase_graphs = split_phases(program, name, target)
+                    graphs.update({key: replace(part, opset=graph.opset) for key, part in phase_graphs.items()})
                 shares = count_shares(target, context)
             if compute:
                 shares = {compute if key == "float32" else key: share for key, share in shares.items()}
             graphs[name] = Graph(graph.file, shares, graph.opset, compute or "")
         carry_over(bundle, out)
         context.progress("running the quantized graphs", None)
-        observations = self.golden(bundle)
+        observations = self.golden_observations(bundle)
         changes = {"program": program, "engine": engine or bundle.manifest.engine}
         made_by = made_by or self.made_by()
         return finish(
@@ -136,51 +136,51 @@ class Quantization(Transform):
 
     @property
     def recording(self) -> Path | None:
-        """The recording that golden observations come from; the bundle's own when None."""
+        """Recording of the golden observations; the bundle's own when None."""
         return getattr(self, "calibration", None)
 
-    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
-        """Return observations, the first of which become golden; on all of them the new bundle is held against it.
+    def golden_observations(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return observations to compare the new bundle with the old one on; the first become golden.
 
-        They are those that the stage was given, where it takes any: drawn ones, of which ids are zero, do not show all
-        that engines do wrong.
+        They are taken from the stage's own recording, where it has one: synthetic observations, whose ids are zero, do
+        not reveal every fault of an engine.
         """
         return observations_for(bundle, MAX_COMPARED, self.recording)
 
     def is_recorded(self, bundle: Bundle) -> bool:
-        """Say whether golden observations were recorded, not drawn."""
+        """Return whether golden observations are recorded instead of synthetic."""
         return calibration_recording(bundle, self.recording) is not None
 
     def chosen_graphs(self, bundle: Bundle) -> list[str]:
-        """Return the names of the graphs that are quantized."""
+        """Return the names of the graphs to quantize."""
         names = bundle.manifest.graphs
         return [name for name in names if not self.graphs or any(fnmatch.fnmatch(name, glob) for glob in self.graphs)]
 
-    def layers_of(self, bundle: Bundle, ops: Iterable[str], **kinds: bool) -> dict[str, list[Layer]]:
+    def selected_layers(self, bundle: Bundle, ops: Iterable[str], **kinds: bool) -> dict[str, list[Layer]]:
         """Return graph -> the selected layers; ``ops`` and ``kinds`` are those of ``find_layers``."""
         layers = {}
         for name in self.chosen_graphs(bundle):
             with foreign_errors(name):
                 layers[name] = find_layers(read(bundle.file(bundle.manifest.graphs[name].file)), ops, **kinds)
-        selected = self.selected([layer.name for graph in layers.values() for layer in graph], bundle, tuple(ops))
+        selected = self.select_nodes([layer.name for graph in layers.values() for layer in graph], bundle, tuple(ops))
         chosen = {name: [layer for layer in graph if layer.name in selected] for name, graph in layers.items()}
         finite = finite_layers(bundle, chosen)
         if not any(finite.values()):
             raise RecipeError(
-                f"Every layer of {bundle.path} that was chosen reads NaN or infinity, which an input of it takes.",
-                "choose others with --include, or quantize the weights alone: vlatool quantize weight-only",
+                f"Every selected layer of {bundle.path} reads NaN or infinity, which one of its inputs accepts.",
+                "select other layers with --include, or quantize only the weights: vlatool quantize weight-only",
             )
         return finite
 
-    def selected(self, names: Iterable[str], bundle: Bundle, ops: Sequence[str] = QUANTIZED_OPS) -> set[str]:
-        """Return which of those nodes are quantized, by include, exclude and parts.
+    def select_nodes(self, names: Iterable[str], bundle: Bundle, ops: Sequence[str] = QUANTIZED_OPS) -> set[str]:
+        """Return which of the nodes to quantize, by include, exclude and parts.
 
-        A pattern is held against the whole name (``blocks.0.mlp.fc1/MatMul``), the module's (``blocks.0.mlp.fc1``) and
-        that of a module that was folded into it.
+        A pattern is matched against the full name (``blocks.0.mlp.fc1/MatMul``), the name of the module
+        (``blocks.0.mlp.fc1``) and that of a module that was folded into it.
 
         Raises:
-            RecipeError: when a pattern matches no node, or a part is unknown, so that a typing error does not pass in
-                silence; when no node is left.
+            RecipeError: when a pattern matches no node or a part is unknown, so that a typo does not go unnoticed; when
+                no node is left.
         """
         candidates = list(names)
         if not candidates:
@@ -189,7 +189,7 @@ class Quantization(Transform):
                 "float32 weight.",
                 "look at --ops and --graphs, and at the precision of the graphs: vlatool inspect BUNDLE",
             )
-        folded = _folded(bundle) if self.include or self.exclude or self.parts else {}
+        folded = _folded_modules(bundle) if self.include or self.exclude or self.parts else {}
 
         def meets(name: str, patterns: tuple[str, ...]) -> bool:
             return matches(name, patterns) or (name in folded and matches(folded[name], patterns))
@@ -227,11 +227,11 @@ def check_ops(ops: Iterable[str]) -> None:
             )
 
 
-def left_whole(name: str, model: Any) -> list[str]:
-    """Say which recurrent layers of a graph keep their products in float32; nothing where there are none.
+def describe_float_layers(name: str, model: Any) -> list[str]:
+    """Describe the recurrent layers of a graph, whose products stay in float32; an empty list without such layers.
 
     Args:
-        name: Of the graph.
+        name: Name of the graph.
         model: An ``onnx.ModelProto``.
     """
     layers = [node.name for node in model.graph.node if node.op_type in RECURRENT]
@@ -243,12 +243,12 @@ def left_whole(name: str, model: Any) -> list[str]:
     ]
 
 
-def reduced_on_this_host(stage: Reduced, engine: str) -> Reduced:
+def fit_range_to_host(stage: StageT, engine: str) -> StageT:
     """Return a stage with ``reduce_range`` where int8 products saturate on this host, unless the option was given.
 
     Args:
-        stage: Has the option.
-        engine: What will run the bundle; the default engine when empty.
+        stage: Stage with the option.
+        engine: Engine that will run the bundle; the default one when empty.
     """
     if "reduce_range" in stage.model_fields_set or int8_arithmetic(engine) in (EXACT, UNKNOWN):
         return stage
@@ -256,8 +256,8 @@ def reduced_on_this_host(stage: Reduced, engine: str) -> Reduced:
 
 
 @contextlib.contextmanager
-def quiet_quantizer() -> Iterator[Path]:
-    """Yield a scratch directory; keep the quantizer's prints, log lines and warnings away from the user."""
+def silenced_quantizer() -> Iterator[Path]:
+    """Yield a scratch directory; suppress the quantizer's output, log lines and warnings."""
     logger = logging.getLogger()
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -273,13 +273,13 @@ def quiet_quantizer() -> Iterator[Path]:
         logger.setLevel(level)
 
 
-def _folded(bundle: Bundle) -> dict[str, str]:
+def _folded_modules(bundle: Bundle) -> dict[str, str]:
     """Return node -> ``MODULE/TYPE`` of the module that was folded into it when the policy was exported."""
     modules = {}
     for name, graph in bundle.manifest.graphs.items():
         with foreign_errors(name):
             for node in read(bundle.file(graph.file), weights=False).graph.node:
                 for note in node.metadata_props:
-                    if note.key == FOLDED:
+                    if note.key == FOLDED_MODULE_KEY:
                         modules[node.name] = f"{note.value}/{node.op_type}"
     return modules

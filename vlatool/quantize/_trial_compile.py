@@ -1,4 +1,4 @@
-"""Open a graph in a process of its own first: engines crash on some quantized graphs instead of refusing them."""
+"""Open a graph in a child process first: engines crash on some quantized graphs instead of refusing them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vlatool.errors import GraphError
 from vlatool.machine.processes import python_code
 from vlatool.runtime.engine import engine_class
 
-CODE = """
+CHILD_CODE = """
 import sys
 from pathlib import Path
 from vlatool.runtime.engine import engine_class
@@ -17,19 +17,19 @@ engine_class(sys.argv[1])(Path(sys.argv[2]), 1)
 """
 
 
-def open_apart(path: Path, engine: str, precision: str, remedy: str) -> None:
-    """Let a child open a graph.
+def open_in_child(path: Path, engine: str, precision: str, remedy: str) -> None:
+    """Open a graph in a child process.
 
     Args:
         path: The graph.
-        engine: The engine that shall run it; the default one when empty.
-        precision: What layers of it were quantized to.
-        remedy: What to do where the engine crashes.
+        engine: Engine that will run it; the default one when empty.
+        precision: Precision of its quantized layers.
+        remedy: Fix for the case that the engine crashes.
 
     Raises:
         GraphError: when the child was killed by a signal; a refusal is left to the engine's own message.
     """
-    done = subprocess.run(python_code(CODE, [engine, str(path)]), capture_output=True, check=False)
+    done = subprocess.run(python_code(CHILD_CODE, [engine, str(path)]), capture_output=True, check=False)
     if done.returncode < 0:
         title = engine_class(engine).title
         raise GraphError(

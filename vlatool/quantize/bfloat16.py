@@ -1,4 +1,4 @@
-"""bfloat16: what the processor's matrix units take, at half the bytes of float32."""
+"""bfloat16: the type of the processor's matrix units, at half the bytes of float32."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.graph.files import load, save
 from vlatool.quantize._base import Quantization
-from vlatool.quantize._conv1x1 import use_convolutions
+from vlatool.quantize.int8.convolutions import use_convolutions
 from vlatool.runtime.engine import computing, engine_class
 from vlatool.stage.base import Context
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 class Bfloat16(Quantization):
     """Compute in bfloat16 with OpenVINO; the weights stay float32 in the file.
 
-    Phases (what Sin and Cos take: positions, denoising time) stay in float32, in a graph of their own: bfloat16 has 8
-    significant bits, and a sine of a large argument would be noise.
+    Phases (arguments of Sin and Cos: positions, denoising time) stay in float32, in a separate graph: bfloat16 has 8
+    significant bits, and the sine of a large argument would be noise.
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "openvino", "numpy")
@@ -32,7 +32,7 @@ class Bfloat16(Quantization):
     )
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """The engine that computes so is installed."""
+        """Check that an engine for bfloat16 is installed."""
         super().check(source, profile)
         engine_class(computing("bfloat16")).library()
 

@@ -1,4 +1,4 @@
-"""Dynamic int8: weights ahead of time, activations at run time."""
+"""Dynamic int8: scales of weights ahead of time, of activations at run time."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
-from vlatool.graph.layers import Layer, check_weights, part_inner_gemms, split_gemm
+from vlatool.graph.layers import Layer, check_weights, copy_inner_gemm_weights, split_gemms
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.graph.qdq import quantize_weight
 from vlatool.machine.instruction_sets import saturates
 from vlatool.quantize._base import (
     REDUCE_RANGE,
-    REDUCED,
+    REDUCE_RANGE_NOTE,
     Quantization,
-    left_whole,
-    quiet_quantizer,
-    reduced_on_this_host,
+    describe_float_layers,
+    fit_range_to_host,
+    silenced_quantizer,
 )
 from vlatool.runtime.engines import build_tool
 from vlatool.stage.base import Context, source_of
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 OPS = ("MatMul", "Gemm")
 CODES, SCALES = "_quantized", "_scale"
-"""Endings of the names that ONNX Runtime's quantizer gives to what it stores of a weight."""
+"""Suffixes of the tensors that ONNX Runtime's quantizer stores for a weight."""
 
 
 class DynamicInt8(Quantization):
@@ -52,11 +52,11 @@ class DynamicInt8(Quantization):
         """Quantize every selected graph."""
         bundle = source_of(source, self.name())
         self.check(bundle, None)
-        layers = self.layers_of(bundle, OPS)
+        layers = self.selected_layers(bundle, OPS)
 
         def quantize(name: str, original: Path, target: Path) -> None:
             model = load(original)
-            context.messages.extend(left_whole(name, model))
+            context.messages.extend(describe_float_layers(name, model))
             self._quantize(model, target, layers[name])
 
         return self.transform(bundle, out, context, quantize)
@@ -64,10 +64,10 @@ class DynamicInt8(Quantization):
     def _quantize(self, model: Any, target: Path, layers: list[Layer]) -> None:
         quantization, names = build_tool("quantization"), {layer.name for layer in layers}
         check_weights(model, layers)
-        split_gemm(model)  # ONNX Runtime's own way turns a weight in place for each of its readers
-        part_inner_gemms(model)
+        split_gemms(model)  # ONNX Runtime's own rewrite transposes a weight in place for each of its readers
+        copy_inner_gemm_weights(model)
         excluded = [node.name for node in model.graph.node if node.op_type in OPS and node.name not in names]
-        with quiet_quantizer() as scratch:
+        with silenced_quantizer() as scratch:
             quantization.quantize_dynamic(
                 model,
                 scratch / "model.onnx",
@@ -83,14 +83,14 @@ class DynamicInt8(Quantization):
                 raise GraphError(
                     f"ONNX Runtime's quantizer leaves {len(left)} of {len(names)} layers in float32: "
                     f"{', '.join(left[:3])}.",
-                    "leave them out: " + " ".join(f"--exclude '{name}'" for name in left[:3]),
+                    "exclude them: " + " ".join(f"--exclude '{name}'" for name in left[:3]),
                 )
             if self.reduce_range:
                 self._fit_pairs(quantized, OnnxGraph(model))
             save(quantized, target)
 
     def _fit_pairs(self, quantized: Any, original: OnnxGraph) -> None:
-        """Replace the codes of weights and their scales by those of which no pair saturates, in place."""
+        """Replace the codes and scales of weights by ones of which no pair saturates, in place."""
         graph = OnnxGraph(quantized)
         for name in [name.removesuffix(CODES) for name in graph.constants if name.endswith(CODES)]:
             values = original.array(name)
@@ -103,16 +103,16 @@ class DynamicInt8(Quantization):
                 tensor.CopyFrom(stored)
 
     def on_this_host(self) -> Self:
-        """Write weights that do not saturate where this host would."""
-        return reduced_on_this_host(self, "")
+        """Use weights without saturation where this host saturates."""
+        return fit_range_to_host(self, "")
 
     def on(self, profile: Profile) -> Self:
-        """Write weights that do not saturate where the board would."""
+        """Use weights without saturation where the board saturates."""
         features = profile.units[profile.engines[profile.engine].unit].isa
         if "reduce_range" in self.model_fields_set or not saturates(features):
             return self
         return self.model_copy(update={"reduce_range": True})
 
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Say that the weights were made for processors without VNNI."""
-        return (REDUCED,) if self.reduce_range else ()
+        """Report that the weights are meant for processors without VNNI."""
+        return (REDUCE_RANGE_NOTE,) if self.reduce_range else ()

@@ -1,4 +1,4 @@
-"""float16: half the bytes of float32, and what GPUs and TensorRT compute fastest without calibration."""
+"""float16: half the bytes of float32, and the fastest type of GPUs and TensorRT without calibration."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from vlatool.graph.layers import check_opset
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.machine.engine_calls import engine_call
 from vlatool.quantize._base import Quantization
-from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
-from vlatool.quantize._moments import recorded_moments
-from vlatool.quantize._overflow import find_beyond
-from vlatool.quantize._trial_compile import open_apart
-from vlatool.quantize._underflow import find_small, too_small
+from vlatool.quantize._trial_compile import open_in_child
+from vlatool.quantize.calibration.samples import recorded_moments
+from vlatool.quantize.floats.float16_graph import FLOAT16_MAX, nodes_touching, phase_nodes, to_float16, weight_losses
+from vlatool.quantize.floats.overflow import find_overflows
+from vlatool.quantize.floats.underflow import measure_sizes, underflow_nodes
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of
 
-APART = "leave layers beside a Transpose in float32 with --exclude, or use another method"
+CRASH_FIX = "leave layers beside a Transpose in float32 with --exclude, or use another method"
 
-LOWEST_OPSET = 10
-"""``IsInf``, by which values beyond float16 are found, came with opset 10."""
-MOVED = 0.02
-"""Relative L2 change of what a graph gives above which every small number is kept, and that is told."""
-BEYOND_ALL = 1e9
-"""What stands for a change that is not finite."""
+MIN_OPSET = 10
+"""First opset with ``IsInf``, which the search for values beyond float16 needs."""
+MAX_CHANGE = 0.02
+"""Relative L2 change of a graph's outputs above which all small values stay float32, and the change is reported."""
+NON_FINITE_CHANGE = 1e9
+"""Number that stands for a change that is not finite."""
 
 
 class Float16(Quantization):
     """Store weights and compute in float16; inputs and outputs stay float32.
 
-    For GPUs and TensorRT, and for half the file: ONNX Runtime on a processor runs the result too, but casts most of it
-    back to float32. In float32 stay excluded nodes, phases (what leads to Sin and Cos) and indices, constants beyond
-    65504, and every value that goes beyond it on calibration data, with the nodes that give and read it; likewise what
-    is so small that float16 loses it, where that changes what a node computes. Sums inside a product are not watched:
-    an engine that adds up in float16 can overflow where the result does not.
+    For GPUs and TensorRT, and for half the file size: ONNX Runtime runs the result on a CPU, too, but casts most of it
+    back to float32. These stay in float32: excluded nodes, phases (arguments of Sin and Cos), indices, constants beyond
+    65504, values that exceed it on calibration data with the nodes that produce and read them, and values so small that
+    their loss in float16 would change the result of a node. Sums inside a product are not observed: an engine that
+    accumulates in float16 can overflow even where the result does not.
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
@@ -56,83 +56,84 @@ class Float16(Quantization):
         return (self.calibration,) if self.calibration else ()
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
-        """Look for values beyond float16, then convert every selected graph."""
+        """Find values beyond float16, then convert every selected graph."""
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         chosen = self.chosen_graphs(bundle)
         candidates = []
         for name in chosen:
             model = load(bundle.file(bundle.manifest.graphs[name].file))
-            check_opset(OnnxGraph(model).opset, "float16", LOWEST_OPSET)
+            check_opset(OnnxGraph(model).opset, "float16", MIN_OPSET)
             candidates += [node.name for node in model.graph.node]
-        selected = self.selected(candidates, bundle)
+        selected = self.select_nodes(candidates, bundle)
         samples = SampleSet()
         recording = calibration_recording(bundle, self.calibration)
 
-        def seen(samples: SampleSet) -> Iterable[Moment | Mapping[str, Any]]:
+        def observations(samples: SampleSet) -> Iterable[Moment | Mapping[str, Any]]:
             if recording is None:
                 return samples.watch(synthetic_observations(bundle, self.samples))
             return recorded_moments(bundle, recording, recording.spread(self.samples), samples)
 
-        beyond = find_beyond(bundle, chosen, seen(samples), LARGEST, context)
+        overflows = find_overflows(bundle, chosen, observations(samples), FLOAT16_MAX, context)
         report: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": [], "moved": {}}
-        for graph, values in beyond.items():
-            for value, excess in values.items():
-                size = float(f"{excess.largest:.4g}")
-                report["beyond"].append({"graph": graph, "value": value, "sample": excess.sample, "largest": size})
+        for graph, values in overflows.items():
+            for value, overflow in values.items():
+                size = float(f"{overflow.largest:.4g}")
+                report["beyond"].append({"graph": graph, "value": value, "sample": overflow.sample, "largest": size})
                 context.progress(
-                    f"{value} reaches {size:g} in sample {excess.sample}, beyond float16: it stays float32", None
+                    f"{value} reaches {size:g} in sample {overflow.sample}, beyond float16: it stays float32", None
                 )
 
-        small = find_small(bundle, chosen, seen(SampleSet()), context)
+        sizes = measure_sizes(bundle, chosen, observations(SampleSet()), context)
 
         def convert(name: str, original: Path, target: Path) -> None:
             model = load(original)
             always = {node.name for node in model.graph.node} - selected
-            always |= phase_nodes(model) | around(model, beyond.get(name, {}))
-            always.update(look_at_weights(model, always).beyond)
+            always |= phase_nodes(model) | nodes_touching(model, overflows.get(name, {}))
+            always.update(weight_losses(model, always).overflowing)
             for strict in (False, True):
-                kept = always | too_small(model, small[name], always, strict)
-                moved = _written(original, target, kept, small[name].feeds)
-                if moved <= MOVED:
+                kept = always | underflow_nodes(model, sizes[name], always, strict)
+                change = _convert_and_compare(original, target, kept, sizes[name].feeds)
+                if change <= MAX_CHANGE:
                     break
             report["kept"] += len(kept)
-            report["subnormal_weights"] += look_at_weights(model, kept).subnormal
-            report["moved"][name] = float(f"{moved:.2g}")
+            report["subnormal_weights"] += weight_losses(model, kept).subnormal
+            report["moved"][name] = float(f"{change:.2g}")
 
         made_by = {**self.made_by(calibration=samples), "float16": report}
         return self.transform(bundle, out, context, convert, made_by=made_by)
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
-        """Return what a person wants to know about the new bundle."""
-        report = made.manifest.made_by["float16"]
+    def lines(self, quantized: Bundle) -> tuple[str, ...]:
+        """Return a summary of the new bundle for the user."""
+        report = quantized.manifest.made_by["float16"]
         small = report["subnormal_weights"]
-        lines = [f"{report['kept']} nodes stay float32; {small} weights are too small for all their bits"]
-        for graph, moved in report["moved"].items():
-            if moved > MOVED:
-                lines.append(f"{graph}: what it gives moves by up to {moved:.2g} (relative L2) on calibration data")
-        for excess in report["beyond"]:
-            where = f"{excess['graph']}/{excess['value']} reaches {excess['largest']:g} in sample {excess['sample']}"
-            lines.append(f"{where}: beyond float16, so its nodes stay float32")
+        lines = [f"{report['kept']} nodes stay float32; {small} weights are subnormal in float16 and lose bits"]
+        for graph, change in report["moved"].items():
+            if change > MAX_CHANGE:
+                lines.append(f"{graph}: its outputs change by up to {change:.2g} (relative L2) on calibration data")
+        for overflow in report["beyond"]:
+            value = f"{overflow['graph']}/{overflow['value']}"
+            where = f"reaches {overflow['largest']:g} in sample {overflow['sample']}"
+            lines.append(f"{value} {where}: beyond float16, so its nodes stay float32")
         return tuple(lines)
 
 
-def _written(original: Path, target: Path, kept: set[str], feeds: Sequence[Mapping[str, Any]]) -> float:
-    """Write a graph in float16 apart from some nodes; return the largest relative L2 change of what it gives."""
+def _convert_and_compare(original: Path, target: Path, kept: set[str], feeds: Sequence[Mapping[str, Any]]) -> float:
+    """Write a graph in float16 except for some nodes; return the largest relative L2 change of its outputs."""
     save(to_float16(load(original), kept), target)
     try:
-        open_apart(target, "", "float16", APART)
-    except GraphError:  # with what is transposed in float32 it does not
+        open_in_child(target, "", "float16", CRASH_FIX)
+    except GraphError:  # it does not crash with Transpose in float32
         model = load(original)
         kept |= {node.name for node in model.graph.node if node.op_type == "Transpose"}
         save(to_float16(model, kept), target)
-        open_apart(target, "", "float16", APART)
+        open_in_child(target, "", "float16", CRASH_FIX)
     before, after = engine_class()(original, 1), engine_class()(target, 1)
-    moved = 0.0
-    for fed in feeds:
+    change = 0.0
+    for feed in feeds:
         with engine_call(engine_class(), f"ran {target.name}"):
-            expected, got = before.run(fed), after.run(fed)
+            expected, got = before.run(feed), after.run(feed)
         floats = [name for name, value in expected.items() if value.dtype.kind == "f"]
         errors = [relative_error(got[name], expected[name]) for name in floats]
-        moved = max([moved, *(error if error == error else math.inf for error in errors)])
-    return min(moved, BEYOND_ALL)
+        change = max([change, *(error if error == error else math.inf for error in errors)])
+    return min(change, NON_FINITE_CHANGE)

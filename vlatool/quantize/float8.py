@@ -12,32 +12,32 @@ from vlatool.errors import require
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import Style, calibrated_values
 from vlatool.quantize._base import QUANTIZED_OPS, check_ops
-from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._float8_qdq import Float8Writer
+from vlatool.quantize._calibrated_base import CalibratedQuantization
+from vlatool.quantize.floats.float8_qdq import Float8Writer
 from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
 
-class Float8(Calibrated):
+class Float8(CalibratedQuantization):
     """Quantize MatMul, Gemm and Conv to float8 (E4M3) in QDQ form, for TensorRT on Jetson Thor and newer GPUs.
 
     Weights have one scale for each output channel, activations one for all, from the largest magnitude on calibration
-    data. No such GPU was at hand: what is checked here is the numbers, in ONNX Runtime on the processor, which computes
-    float8 values in float32 and gains no time. E4M3 has 4 significant bits: where activations have no outliers, int8
-    with a range of its own loses less.
+    data. No such GPU was available: only the numbers are tested, in ONNX Runtime on a CPU, which computes float8 values
+    in float32 and gains no time. E4M3 has 4 significant bits: where activations have no outliers, int8 with a
+    calibrated range loses less.
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "ml_dtypes", "numpy")
-    without: ClassVar[str] = ", or use quantize.float16, which needs none"
+    alternative: ClassVar[str] = ", or use quantize.float16, which needs none"
 
     per_channel: bool = Field(True, description="one weight scale for each output channel")
     attention: bool = Field(False, description="also quantize the products inside attention (of two activations)")
     ops: tuple[str, ...] = Field(QUANTIZED_OPS, description="operator types to quantize")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """The operators are ones that can be quantized, and there is calibration data."""
+        """Check that the operators can be quantized, and that there is calibration data."""
         check_ops(self.ops)
         super().check(source, profile)
 
@@ -46,7 +46,7 @@ class Float8(Calibrated):
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         require("ml_dtypes", "build")
-        layers, samples = self.layers_of(bundle, self.ops, attention=self.attention), SampleSet()
+        layers, samples = self.selected_layers(bundle, self.ops, attention=self.attention), SampleSet()
         values = {name: calibrated_values(graph, Style(), {}) for name, graph in layers.items()}
         statistics = self.statistics(bundle, values, samples, context)
 

@@ -1,4 +1,4 @@
-"""Quantization-aware training: weights learn to be rounded, then they are."""
+"""Quantization-aware training: weights adapt to rounding before they are quantized."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ else:
 
 
 class Qat(ImitationStage):
-    """Train a policy while its products are rounded, so that quantization afterwards costs less accuracy.
+    """Train a policy with rounded products, so that quantization afterwards costs less accuracy.
 
-    The teacher is the policy in float32 before any edit, or ``--teacher``: no labels are needed. What is trained are
-    the weights; they are rounded to the same grid as by ``quantize static-int8`` (int8, with activations) or
-    ``quantize weight-only`` (int4, in blocks of 32). The command quantizes them by that method when they are trained:
-    what it writes is a quantized bundle, and nothing else is to be done (a recipe names both). Ranges of
-    activations are taken from what the training saw, too: up to 128 observations, spread over its episodes, stay in the
-    bundle (``data/played.npz``) and calibrate beside the recorded ones. Try the methods alone first: they take seconds,
-    and most policies lose nothing.
+    The teacher is the policy in float32 before any edit, or ``--teacher``: no labels are needed. Weights are trained
+    while rounded to the grid of ``quantize static-int8`` (int8, with activations) or ``quantize weight-only`` (int4, in
+    blocks of 32). The command then quantizes them by that method: it writes a quantized bundle, and nothing else is
+    left to do (a recipe names both stages). Ranges of activations come from the training, too: up to 128 observations,
+    spread over its episodes, stay in the bundle (``data/played.npz``) and calibrate together with the recorded ones.
+    Try the methods alone first: they take seconds, and most policies lose nothing.
     """
 
     changed_first: ClassVar[bool] = False
@@ -45,18 +44,18 @@ class Qat(ImitationStage):
     )
 
     def compute_context(self) -> contextlib.AbstractContextManager[Any]:
-        """Products are rounded."""
+        """Return a context in which products are rounded."""
         rounded: contextlib.AbstractContextManager[Any] = fake_quantization(self.weights)
         return rounded
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """What follows takes the layout."""
+        """Check that the stages that follow take the layout."""
         for name, options in self.following_stages():
             build_stage(name, options)
         super().check(source, profile)
 
     def following_stages(self) -> tuple[tuple[str, dict[str, Any]], ...]:
-        """Export, and quantize to the grid that the weights were trained for, in the layout that was asked for."""
+        """Return the stages that export and quantize to the trained grid, in the requested layout."""
         layout = {"layout": self.layout} if "layout" in self.model_fields_set else {}
         if self.weights == "int4":
             blocks = {"bits": 4, "block": BLOCK, "search": False}

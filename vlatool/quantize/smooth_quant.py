@@ -16,12 +16,12 @@ from vlatool.errors import GraphError
 from vlatool.graph.files import foreign_errors, load, save
 from vlatool.graph.nodes import reads
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.quantize._calibrate import calibrate
-from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._moments import recorded_moments
-from vlatool.quantize._ranges import Statistics
-from vlatool.quantize._smooth_groups import Edit, Group, find_groups
-from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
+from vlatool.quantize._calibrated_base import CalibratedQuantization
+from vlatool.quantize.calibration.activation_statistics import calibrate
+from vlatool.quantize.calibration.ranges import Statistics
+from vlatool.quantize.calibration.samples import recorded_moments
+from vlatool.quantize.int8.smoothing_groups import ConstantEdit, SmoothingGroup, find_groups
+from vlatool.quantize.int8.smoothing_scales import PeakExcess, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.runtime.golden import load_golden
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of
@@ -30,12 +30,12 @@ Array = NDArray[Any]
 
 OPS = ("MatMul", "Gemm")
 REPORT = "reports/smooth_quant.json"
-SAME = 1e-4
-"""Largest relative L2 difference of the golden action to the source's: float32 rounding, and nothing else."""
+MAX_CHANGE = 1e-4
+"""Largest relative L2 difference of the golden action from the source's: no more than float32 rounding."""
 
 
 def _alpha(value: Any) -> str:
-    """Take a number from 0 to 1, or ``auto``, and return it as text."""
+    """Validate a number from 0 to 1, or ``auto``, and return it as text."""
     text = str(value).strip()
     if text == "auto":
         return text
@@ -48,13 +48,13 @@ def _alpha(value: Any) -> str:
     return repr(number)
 
 
-class SmoothQuant(Calibrated):
-    """Move outlier channels of activations into the weights that read them; the result computes the same in float32.
+class SmoothQuant(CalibratedQuantization):
+    """Move outlier channels of activations into the weights that read them; the result is equivalent in float32.
 
     Run a quantization after it. Each input channel of a MatMul or Gemm is divided by a scale and its row of the weight
-    multiplied by it (Xiao et al., SmoothQuant, 2022). The division costs nothing where it goes into constants before
-    the layer: LayerNormalization, RMSNorm's weight, a linear layer, through ReLU, sums, and products with other
-    activations. What GELU or attention give can be divided only by a Mul of its own (--insert).
+    multiplied by it (Xiao et al., SmoothQuant, 2022). The division costs nothing where constants before the layer
+    absorb it: those of LayerNormalization, RMSNorm or a linear layer, through ReLU, sums, and products with other
+    activations. Outputs of GELU or attention can be divided only by an inserted Mul (--insert).
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
@@ -72,11 +72,11 @@ class SmoothQuant(Calibrated):
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         groups, samples = {}, SampleSet()
-        for name, layers in self.layers_of(bundle, OPS).items():
+        for name, layers in self.selected_layers(bundle, OPS).items():
             with foreign_errors(name):
                 groups[name] = find_groups(load(bundle.file(bundle.manifest.graphs[name].file)), layers)
         values = {name: [value for group in members for value in group.activations] for name, members in groups.items()}
-        recording, chosen = self.chosen(bundle)
+        recording, chosen = self.calibration_samples(bundle)
         halves = self._halves(chosen)
         peaks = []
         for numbers in halves:
@@ -87,7 +87,7 @@ class SmoothQuant(Calibrated):
         def smooth(name: str, original: Path, target: Path) -> None:
             model = load(original)
             for group in groups[name]:
-                note = self._smooth(model, group, _joint(peaks, name, group), sum(map(len, halves)))
+                note = self._smooth(model, group, _group_peaks(peaks, name, group), sum(map(len, halves)))
                 notes.append({"graph": name, **note})
             save(model, target)
 
@@ -99,37 +99,37 @@ class SmoothQuant(Calibrated):
 
     @property
     def recording(self) -> None:
-        """That of the bundle which is smoothed: its golden action must stay."""
+        """None, for that of the smoothed bundle: its golden action must not change."""
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
-        """Return what a person wants to know about the new bundle."""
-        groups = json.loads((made.path / REPORT).read_text(encoding="utf-8"))["groups"]
+    def lines(self, smoothed: Bundle) -> tuple[str, ...]:
+        """Return a summary of the new bundle for the user."""
+        groups = json.loads((smoothed.path / REPORT).read_text(encoding="utf-8"))["groups"]
         count = {how: sum(group["how"] == how for group in groups) for how in ("folded", "inserted", "left")}
         layers = sum(len(group["layers"]) for group in groups if group["how"] != "left")
-        text = f"smoothed what {layers} layers read: {count['folded']} activations folded, {count['inserted']} inserted"
+        text = f"smoothed the inputs of {layers} layers: {count['folded']} scales folded, {count['inserted']} inserted"
         blocked = sum(group["why"] == "only a Mul of its own could divide it" for group in groups)
-        more = f" ({blocked} of them for want of --insert)" if blocked else ""
-        return (f"{text}, {count['left']} left as they are{more}",)
+        more = f" ({blocked} of them need --insert)" if blocked else ""
+        return (f"{text}, {count['left']} unchanged{more}",)
 
     def _halves(self, numbers: list[int]) -> list[list[int]]:
-        """Return all samples, or for ``auto`` every other one and the rest, whose peaks are compared."""
+        """Return all samples in one part; for ``auto`` in two interleaved halves, whose peaks are compared."""
         if self.alpha != "auto" or len(numbers) < 2:
             return [numbers]
         return [numbers[::2], numbers[1::2]]
 
-    def _smooth(self, model: Any, group: Group, halves: list[Array], samples: int) -> dict[str, Any]:
-        """Smooth one activation in place and return what was done.
+    def _smooth(self, model: Any, group: SmoothingGroup, halves: list[Array], samples: int) -> dict[str, Any]:
+        """Smooth one activation in place and return a record of it.
 
         Args:
             model: An ``onnx.ModelProto``.
-            group: What is smoothed.
+            group: Activation and layers to smooth.
             halves: Largest magnitude of each channel, for each part of the calibration.
-            samples: How many there were.
+            samples: Number of calibration samples.
         """
         peaks = np.maximum.reduce(halves)
-        unseen = Unseen.between(halves[0], halves[-1], samples)
-        middle = float(np.median(peaks))
-        ratio = float(peaks.max()) / middle if middle else 0.0
+        excess = PeakExcess.between(halves[0], halves[-1], samples)
+        median = float(np.median(peaks))
+        ratio = float(peaks.max()) / median if median else 0.0
         note = {"value": group.value, "layers": [layer.name for layer in group.layers], "outliers": round(ratio, 3)}
         if ratio < self.outliers:
             return {**note, "how": "left", "why": "it has no outlier channels"}
@@ -139,14 +139,14 @@ class SmoothQuant(Calibrated):
         weights = [writer.weight(layer.weight, layer.axis) for layer in group.layers]
         alpha: float | None
         if self.alpha == "auto":
-            alpha, scales = best_alpha(peaks, weights, unseen)
+            alpha, scales = best_alpha(peaks, weights, excess)
         else:
             alpha = float(self.alpha)
             scales = smooth_scales(peaks, weight_peaks(weights), alpha)
         if alpha is None:
             return {**note, "how": "left", "why": "no alpha lowers the estimated error"}
-        plain = int8_loss(peaks, weights, np.ones_like(scales), unseen)
-        gain = int8_loss(peaks, weights, scales, unseen) / plain if plain else 1.0
+        plain = int8_loss(peaks, weights, np.ones_like(scales), excess)
+        gain = int8_loss(peaks, weights, scales, excess) / plain if plain else 1.0
         writer.apply(group, scales)
         how = "folded" if group.edits else "inserted"
         return {**note, "how": how, "why": "", "alpha": alpha, "estimated_loss": float(f"{gain:.4g}")}
@@ -159,15 +159,15 @@ class _Writer(OnnxGraph):
         """Return a weight as (inputs, outputs)."""
         return self.array(name) if axis == 1 else self.array(name).T
 
-    def apply(self, group: Group, scales: Array) -> None:
+    def apply(self, group: SmoothingGroup, scales: Array) -> None:
         """Divide the value of a group by the scales and multiply its weights by them."""
         names = {layer.name for layer in group.layers}
         layers = {node.name: node for node in self.graph.node if node.name in names}
         for edit in group.edits:
             self._multiply(edit, scales)
         for layer in group.layers:
-            self._multiply(Edit(layers[layer.name].output[0], 1, 1 - layer.axis, power=1), scales)
-        if not group.edits:  # a Mul of its own before the layers
+            self._multiply(ConstantEdit(layers[layer.name].output[0], 1, 1 - layer.axis, power=1), scales)
+        if not group.edits:  # insert a Mul before the layers
             value, smooth = group.value, f"{group.value}.smooth"
             factors = self.add(f"{smooth}.scale", _reciprocals(scales))
             for node in layers.values():
@@ -175,21 +175,21 @@ class _Writer(OnnxGraph):
             first = next(iter(layers.values()))
             self.insert_before(first, self.node("Mul", [value, factors], [smooth], f"{value}/smooth"))
 
-    def _multiply(self, edit: Edit, scales: Array) -> None:
+    def _multiply(self, edit: ConstantEdit, scales: Array) -> None:
         node = self.producers[edit.node]
-        name = self._own(node, edit.position)
+        name = self._unshare(node, edit.position)
         values = self.array(name)
         if edit.width and values.shape[-1:] != (edit.width,):
             values = np.broadcast_to(values, (*values.shape[:-1], edit.width))
         values = np.array(values, np.float32)
         axis = edit.axis % values.ndim
-        place = (*(slice(None),) * axis, slice(edit.start, edit.start + len(scales)))
+        index = (*(slice(None),) * axis, slice(edit.start, edit.start + len(scales)))
         factors = scales if edit.power > 0 else _reciprocals(scales)
-        values[place] *= factors.reshape(-1, *(1,) * (values.ndim - 1 - axis))
+        values[index] *= factors.reshape(-1, *(1,) * (values.ndim - 1 - axis))
         self.constants[name].CopyFrom(self.onnx.numpy_helper.from_array(values, name))
 
-    def _own(self, node: Any, position: int) -> str:
-        """Return the name of a constant that this node alone reads, in this place alone; copy a shared one."""
+    def _unshare(self, node: Any, position: int) -> str:
+        """Return the name of a constant that only this input of the node reads; copy a shared one."""
         name = str(node.input[position])
         if sum(list(reads(reader)).count(name) for reader in self.graph.node) > 1:
             node.input[position] = self.add_tensor(self.constants[name], f"{name}.{node.name}.{position}")
@@ -207,8 +207,8 @@ def _peaks(statistics: dict[str, dict[str, Statistics]]) -> dict[str, dict[str, 
     }
 
 
-def _joint(peaks: list[dict[str, dict[str, Array]]], graph: str, group: Group) -> list[Array]:
-    """Return the largest magnitudes over all that the group reads, for each part of the calibration."""
+def _group_peaks(peaks: list[dict[str, dict[str, Array]]], graph: str, group: SmoothingGroup) -> list[Array]:
+    """Return the largest magnitudes over all inputs of the group, for each part of the calibration."""
     return [np.maximum.reduce([half[graph][name] for name in group.activations]) for half in peaks]
 
 
@@ -222,8 +222,8 @@ def _check_same(source: Bundle, smoothed: Bundle) -> None:
     if before is None or after is None or not _equal(before[:2], after[:2]):
         return
     error = relative_error(after[2], before[2])
-    if not error <= SAME:
-        raise GraphError(f"Smoothing changed the golden action by {error:.3g}; allowed: {SAME:g}.", "report this")
+    if not error <= MAX_CHANGE:
+        raise GraphError(f"Smoothing changed the golden action by {error:.3g}; allowed: {MAX_CHANGE:g}.", "report this")
 
 
 def _equal(first: Iterable[dict[str, Any]], second: Iterable[dict[str, Any]]) -> bool:

@@ -1,4 +1,4 @@
-"""Static int8: weights and activation ranges ahead of time."""
+"""Static int8: scales of weights and activations ahead of time."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from vlatool.graph.layers import (
     Style,
     calibrated_values,
     check_weights,
-    convolved,
+    convolution_inputs,
     find_layers,
-    hoisted,
-    split_gemm,
+    hoisted_values,
+    split_gemms,
 )
 from vlatool.graph.qdq import Range, insert_qdq
 from vlatool.machine.instruction_sets import saturates
 from vlatool.quantize._base import (
     QUANTIZED_OPS,
     REDUCE_RANGE,
-    REDUCED,
+    REDUCE_RANGE_NOTE,
     check_ops,
-    left_whole,
-    reduced_on_this_host,
+    describe_float_layers,
+    fit_range_to_host,
 )
-from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._conv1x1 import use_convolutions
-from vlatool.quantize._early import quantize_early
-from vlatool.quantize._frames import fold_frames
-from vlatool.quantize._integer_matmul import use_integer_matmul
-from vlatool.quantize._ranges import Statistics, choose_range
-from vlatool.quantize._reductions import keep_axes
-from vlatool.quantize._trial_compile import open_apart
+from vlatool.quantize._calibrated_base import CalibratedQuantization
+from vlatool.quantize._trial_compile import open_in_child
+from vlatool.quantize.calibration.ranges import Statistics, choose_range
+from vlatool.quantize.int8.convolutions import use_convolutions
+from vlatool.quantize.int8.frame_normalization import fold_normalization
+from vlatool.quantize.int8.integer_matmul import use_integer_matmul
+from vlatool.quantize.int8.quantizer_hoisting import hoist_quantizers
+from vlatool.quantize.int8.reductions import keep_reduced_axes
 from vlatool.runtime.engine import (
     DEFAULT_ENGINE,
     STANDARD_LAYOUT,
@@ -60,19 +60,19 @@ else:
     LayoutName = Literal[tuple(layouts())]
 
 
-FEWER = "quantize fewer: leave out --elementwise or --attention, or use --exclude"
+CRASH_FIX = "quantize fewer: leave out --elementwise or --attention, or use --exclude"
 
 
-class StaticInt8(Calibrated):
+class StaticInt8(CalibratedQuantization):
     """Quantize MatMul, Gemm and Conv to int8 with activation ranges from calibration data.
 
-    The default is what ONNX Runtime computes fastest on an x86 processor: uint8 activations, symmetric int8 weights,
-    its own integer MatMul. ``openvino`` writes standard QDQ operators where OpenVINO wants them; ``qdq`` with ``int8``
-    activations is what TensorRT and ARM take.
+    The default is the fastest form for ONNX Runtime on an x86 processor: uint8 activations, symmetric int8 weights, its
+    own integer MatMul. ``openvino`` writes standard QDQ operators where OpenVINO expects them; ``qdq`` with ``int8``
+    activations is the form for TensorRT and ARM.
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
-    without: ClassVar[str] = ", or use quantize.dynamic_int8, which needs none"
+    alternative: ClassVar[str] = ", or use quantize.dynamic_int8, which needs none"
 
     method: Literal["minmax", "entropy", "percentile", "mse"] = Field(
         "minmax", description="how activation ranges are chosen"
@@ -101,65 +101,65 @@ class StaticInt8(Calibrated):
     ops: tuple[str, ...] = Field(QUANTIZED_OPS, description="operator types to quantize")
 
     @property
-    def form(self) -> Int8Layout:
-        """What the layout writes."""
+    def int8_layout(self) -> Int8Layout:
+        """Properties of the layout."""
         return layouts()[self.layout][0]
 
     @property
     def engine(self) -> str:
-        """The engine that the layout is for; empty for any that runs standard operators, and for the default one."""
+        """Engine of the layout; empty for any engine that runs standard operators, and for the default one."""
         name = layouts()[self.layout][1]
         return "" if name == DEFAULT_ENGINE else name
 
     @property
     def style(self) -> Style:
-        """How layers are written."""
-        form = self.form
+        """Style of the quantized layers."""
+        layout = self.int8_layout
         kind: Literal["uint8", "int8", "symmetric"] = "uint8"
         if self.activations != "auto":
             kind = self.activations
-        elif form.symmetric and not self.convolutions:
+        elif layout.symmetric and not self.convolutions:
             kind = "symmetric"
-        second = form.integer and kind == "uint8"
+        second = layout.integer and kind == "uint8"
         return Style(
-            kind, self.per_channel, self.reduce_range, form.fuses_convolutions, hoist=form.symmetric,
-            signed_second=second, unsigned_convolutions=form.symmetric,
+            kind, self.per_channel, self.reduce_range, layout.fuses_convolutions, hoist=layout.symmetric,
+            signed_second=second, unsigned_convolutions=layout.symmetric
         )  # fmt: skip
 
     def on(self, profile: Profile) -> Self:
-        """Write the layout and the activations that the board's preferred engine takes."""
+        """Use layout and activations of the board's preferred engine."""
         options = dict(class_for(profile.engine).int8)
         if saturates(profile.units[profile.engines[profile.engine].unit].isa):
             options["reduce_range"] = True
         return self.model_copy(update={name: how for name, how in options.items() if name not in self.model_fields_set})
 
     def on_this_host(self) -> Self:
-        """Write weights that do not saturate where this host would; the standard layout may be for any board."""
+        """Use weights without saturation where this host saturates; the standard layout may be for any board."""
         if self.layout == STANDARD_LAYOUT:
             return self
-        return reduced_on_this_host(self, self.engine)
+        return fit_range_to_host(self, self.engine)
 
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Say that the weights were made for processors without VNNI."""
-        return (REDUCED,) if self.reduce_range else ()
+        """Report that the weights are meant for processors without VNNI."""
+        return (REDUCE_RANGE_NOTE,) if self.reduce_range else ()
 
     def used_packages(self) -> tuple[str, ...]:
-        """The engine too that the layout is for."""
+        """Packages of the stage, with the engine of the layout."""
         return (*self.packages, engine_class(self.engine).package) if self.engine else self.packages
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """The operators are ones that can be quantized, the layout can compute so, and there is calibration data."""
+        """Check that operators and layout fit the options, and that there is calibration data."""
         check_ops(self.ops)
         library: type[Engine] = engine_class(self.engine)
         if self.compute not in library.computes:
             raise RecipeError(
                 f"The layout {self.layout} does not compute in {self.compute}.",
-                f"use layout {_other(lambda layout, library: self.compute in library.computes)}",
+                f"use layout {_capable_layouts(lambda layout, library: self.compute in library.computes)}",
             )
-        if self.convolutions and not self.form.convolutions:
+        if self.convolutions and not self.int8_layout.convolutions:
             raise RecipeError(
-                f"The layout {self.layout} has no use for convolutions.",
-                f"use layout {_other(lambda layout, library: layout.convolutions)}",
+                f"The layout {self.layout} does not use convolutions.",
+                f"use layout {_capable_layouts(lambda layout, library: layout.convolutions)}",
             )
         if self.engine:
             library.library()
@@ -171,41 +171,41 @@ class StaticInt8(Calibrated):
         self.check(bundle, None)
         layers, values = self.plan(bundle)
         samples = SampleSet()
-        statistics = self.statistics(bundle, values, samples, context, _of_sums_alone(layers))
-        layers = {name: _with_ranges(chosen, statistics[name]) for name, chosen in layers.items()}
+        statistics = self.statistics(bundle, values, samples, context, _values_read_by_sums_only(layers))
+        layers = {name: _finite_layers(chosen, statistics[name]) for name, chosen in layers.items()}
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
-            context.messages.extend(left_whole(name, model))
+            context.messages.extend(describe_float_layers(name, model))
             pixels: dict[str, Range] = {}
-            if self.form.integer:
-                split_gemm(model)
+            if self.int8_layout.integer:
+                split_gemms(model)
                 if self.style.activations == "uint8":
-                    pixels = fold_frames(model, {layer.name for layer in layers[name]})
-            chosen = self._rewritten(model, layers[name])
-            unsigned = convolved(chosen, self.style, hoisted(model, chosen, self.style))
+                    pixels = fold_normalization(model, {layer.name for layer in layers[name]})
+            chosen = self._layers_after_split(model, layers[name])
+            unsigned = convolution_inputs(chosen, self.style, hoisted_values(model, chosen, self.style))
             insert_qdq(model, chosen, {**self.ranges(statistics[name], unsigned), **pixels}, self.style)
-            if self.form.integer:
-                quantize_early(model)
+            if self.int8_layout.integer:
+                hoist_quantizers(model)
                 use_integer_matmul(model)
-            if self.form.symmetric:
-                keep_axes(model)
+            if self.int8_layout.symmetric:
+                keep_reduced_axes(model)
             if self.convolutions:
                 use_convolutions(model)
             save(model, target)
-            if self.form.crashes and (self.elementwise or self.attention or self.convolutions):
-                open_apart(target, self.engine, "int8", FEWER)
+            if self.int8_layout.crashes and (self.elementwise or self.attention or self.convolutions):
+                open_in_child(target, self.engine, "int8", CRASH_FIX)
             return "" if self.compute == "float32" else self.compute
 
         made_by = self.made_by(calibration=samples)
         return self.transform(bundle, out, context, quantize, self.engine, made_by)
 
     def ranges(self, statistics: Mapping[str, Statistics], unsigned: Collection[str] = ()) -> dict[str, Range]:
-        """Return value -> (low, high) that activations are quantized over.
+        """Return value -> quantization range (low, high).
 
         Args:
-            statistics: Of each value.
-            unsigned: Values that are written as uint8 where others are symmetric.
+            statistics: Statistics of each value.
+            unsigned: Values that are uint8 where others are symmetric.
         """
         kind = self.style.activations
         symmetric = {name: kind in ("int8", "symmetric") and name not in unsigned for name in statistics}
@@ -215,26 +215,26 @@ class StaticInt8(Calibrated):
         }
 
     def plan(self, bundle: Bundle) -> tuple[dict[str, list[Layer]], dict[str, list[str]]]:
-        """Return graph -> layers that are quantized, and graph -> values whose ranges that needs."""
-        layers = self.layers_of(bundle, self.ops, attention=self.attention, elementwise=self.elementwise)
+        """Return graph -> layers to quantize, and graph -> values whose ranges they need."""
+        layers = self.selected_layers(bundle, self.ops, attention=self.attention, elementwise=self.elementwise)
         values = {}
         for name, chosen in layers.items():
             model = read(bundle.file(bundle.manifest.graphs[name].file))
             check_weights(model, chosen)
-            values[name] = calibrated_values(chosen, self.style, hoisted(model, chosen, self.style))
+            values[name] = calibrated_values(chosen, self.style, hoisted_values(model, chosen, self.style))
         return layers, values
 
-    def _rewritten(self, model: Any, layers: list[Layer]) -> list[Layer]:
-        """Return the layers as they are after Gemm became MatMul."""
-        if not self.form.integer:
+    def _layers_after_split(self, model: Any, layers: list[Layer]) -> list[Layer]:
+        """Return the layers after Gemm became MatMul."""
+        if not self.int8_layout.integer:
             return layers
         names = {layer.name for layer in layers}
         again = find_layers(model, QUANTIZED_OPS, attention=self.attention)
         return [layer for layer in again if layer.name in names] + [layer for layer in layers if layer.kind == "Add"]
 
 
-def _of_sums_alone(layers: Mapping[str, list[Layer]]) -> dict[str, set[str]]:
-    """Return graph -> values that only sums of two activations read: a sum that has no range stays float32."""
+def _values_read_by_sums_only(layers: Mapping[str, list[Layer]]) -> dict[str, set[str]]:
+    """Return graph -> values that only sums of two activations read: a sum without a range stays float32."""
     read = {
         name: [{value for layer in chosen if (layer.kind == "Add") is sums for value in layer.activations}
                for sums in (True, False)]
@@ -243,13 +243,13 @@ def _of_sums_alone(layers: Mapping[str, list[Layer]]) -> dict[str, set[str]]:
     return {name: sums - others for name, (sums, others) in read.items()}
 
 
-def _with_ranges(layers: list[Layer], statistics: Mapping[str, Statistics]) -> list[Layer]:
-    """Return the layers whose activations were finite: a mask of -infinity, or an input that takes it, makes others."""
+def _finite_layers(layers: list[Layer], statistics: Mapping[str, Statistics]) -> list[Layer]:
+    """Return the layers with finite activations: a mask of -infinity, or an input that takes it, excludes others."""
     infinite = {name for name, seen in statistics.items() if not seen.finite}
     return [layer for layer in layers if infinite.isdisjoint(layer.activations)]
 
 
-def _other(fits: Callable[[Int8Layout, type[Engine]], bool]) -> str:
-    """Return the layouts that can do something, in words."""
+def _capable_layouts(fits: Callable[[Int8Layout, type[Engine]], bool]) -> str:
+    """Return the names of the layouts that fit, joined by "or"."""
     names = [name for name, (layout, engine) in layouts().items() if fits(layout, engine_class(engine))]
     return " or ".join(names) or "none"

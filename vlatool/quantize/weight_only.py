@@ -22,12 +22,12 @@ from vlatool.graph.precision import precision_shares
 from vlatool.module.origin import factory_of
 from vlatool.module.sharded_weights import takes_shards
 from vlatool.module.to_onnx import IMPORTS
-from vlatool.quantize._compute import records_of
-from vlatool.quantize._records import Record
-from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, weights_fingerprint
-from vlatool.quantize._stream import Written, work_root, write_records
-from vlatool.quantize._weight_options import WeightOptions
-from vlatool.quantize._weights_plan import WeightsPlan, make_plan
+from vlatool.quantize.streamed.graph_templates import BLOCKED_OPSET, load_templates, weights_fingerprint
+from vlatool.quantize.streamed.options import WeightOptions
+from vlatool.quantize.streamed.record_file import RecordFile, work_root, write_records
+from vlatool.quantize.streamed.records import Record
+from vlatool.quantize.streamed.tensor_jobs import records_for
+from vlatool.quantize.streamed.weights_plan import WeightsPlan, make_plan
 from vlatool.runtime.engine import STANDARD_LAYOUT, class_for
 from vlatool.stage.base import Context, SampleSet, source_of
 from vlatool.stage.finish import SEED, carry_over, finish, history
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
 
     from vlatool.hardware.profile import Profile
 
-WEIGHTS = "graphs/weights.data"
-LOSSES = "reports/weights.json"
-RUN_BELOW = 1 << 30
-"""Bytes of weights up to which the new bundle is run, when ``verify`` is ``auto``."""
-WORTH_PROCESSES = 1 << 25
-"""Parameters from which processes are started."""
-CALIBRATED = ("gptq", "awq")
+WEIGHTS_FILE = "graphs/weights.data"
+LOSS_REPORT = "reports/weights.json"
+MAX_RUN_BYTES = 1 << 30
+"""Bytes of weights below which the new bundle is run, when ``verify`` is ``auto``."""
+MIN_PARALLEL_WEIGHTS = 1 << 25
+"""Parameters from which worker processes are worth starting."""
+CALIBRATED_METHODS = ("gptq", "awq")
 
 
 class WeightOnly(WeightOptions):
@@ -52,16 +52,16 @@ class WeightOnly(WeightOptions):
 
     Works on one tensor at a time, so that a policy of billions of parameters needs little memory: a policy whose
     policy.yaml has ``weights`` is read from its safetensors shards, without a float32 export. Every weight is compared
-    with what its stored codes mean. A run that was killed goes on where it was.
+    with its dequantized codes. A killed run is resumed by the next one.
     """
 
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnx-ir", "onnxscript", "numpy")
     imports: ClassVar[tuple[str, ...]] = IMPORTS
     streams: ClassVar[bool] = True
-    """Takes a source bundle whose policy describes its shards, without an export before."""
+    """Whether the stage takes a source bundle whose policy describes its shards, without an export."""
 
     def on(self, profile: Profile) -> Self:
-        """Write standard operators where the board's preferred engine takes those alone."""
+        """Use standard operators where the board's preferred engine takes only those."""
         standard = class_for(profile.engine).int8.get("layout") == STANDARD_LAYOUT
         change = {"layout": STANDARD_LAYOUT} if standard and "layout" not in self.model_fields_set else {}
         return self.model_copy(update=change)
@@ -71,7 +71,7 @@ class WeightOnly(WeightOptions):
         return (self.calibration,) if self.calibration else ()
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """There is something to quantize, and calibration data for the methods that need it."""
+        """Check that there is something to quantize, and calibration data for the methods that need it."""
         if self.calibration and not self.calibration.exists():
             raise DataError(
                 f"The calibration file {self.calibration} does not exist.",
@@ -79,7 +79,7 @@ class WeightOnly(WeightOptions):
             )
         if source is None:
             return
-        if self.method in CALIBRATED and not recorded_observations(source, 1, self.calibration):
+        if self.method in CALIBRATED_METHODS and not recorded_observations(source, 1, self.calibration):
             raise DataError(
                 f"{source.path} carries no calibration data, which the method {self.method} needs.",
                 "pass --calibration FILE.npz, or use --method rtn or hqq, which need none",
@@ -93,7 +93,7 @@ class WeightOnly(WeightOptions):
             )
 
     def runs(self, source: Bundle | None) -> str:
-        """A policy without graphs is exported here."""
+        """Return the factory of a policy without graphs, which this stage exports."""
         return factory_of(source)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
@@ -104,31 +104,33 @@ class WeightOnly(WeightOptions):
             require(package, "build")
         context.progress("reading the graphs", None)
         (out / "graphs").mkdir()
-        plan = make_plan(skeletons_of(bundle, BLOCKED_OPSET), self, bundle, WEIGHTS)
-        samples = SampleSet() if self.method in CALIBRATED else None
-        with work_directory(self.work(bundle)) as place:
-            records = self._records(plan, bundle, place, samples)
-            written = write_records(records, self._identity(plan, bundle), place, _processes(records), context.progress)
-            link(written.path, out / WEIGHTS)
-            made = self._finish(plan, bundle, out, written, samples, context)
-            remove_work(place)
-        return made
+        plan = make_plan(load_templates(bundle, BLOCKED_OPSET), self, bundle, WEIGHTS_FILE)
+        samples = SampleSet() if self.method in CALIBRATED_METHODS else None
+        with work_directory(self.work(bundle)) as directory:
+            records = self._records(plan, bundle, directory, samples)
+            written = write_records(
+                records, self._identity(plan, bundle), directory, _processes(records), context.progress
+            )
+            link(written.path, out / WEIGHTS_FILE)
+            quantized = self._finish(plan, bundle, out, written, samples, context)
+            remove_work(directory)
+        return quantized
 
     def _finish(
         self,
         plan: WeightsPlan,
         bundle: Bundle,
         out: Path,
-        written: Written,
+        written: RecordFile,
         samples: SampleSet | None,
         context: Context,
     ) -> Bundle:
-        """Write the graphs and everything else beside the weights, and verify."""
+        """Write the graphs and all other files, and verify."""
         opsets = plan.save(out)
         carry_over(bundle, out)
-        made_by = {**self.made_by(calibration=samples), **_summarize(written, out / LOSSES)}
+        made_by = {**self.made_by(calibration=samples), **_summarize(written, out / LOSS_REPORT)}
         context.progress("counting", None)
-        runs = self.verify == "run" or (self.verify == "auto" and written.bytes < RUN_BELOW)
+        runs = self.verify == "run" or (self.verify == "auto" and written.bytes < MAX_RUN_BYTES)
         graphs = {}
         for name, opset in opsets.items():
             file = out / f"graphs/{name}.onnx"
@@ -137,47 +139,49 @@ class WeightOnly(WeightOptions):
         if runs:
             context.progress("running the quantized graphs", None)
             return finish(
-                bundle, out, made_by=made_by, graphs=graphs, observations=self.golden(bundle),
+                bundle, out, made_by=made_by, graphs=graphs, observations=self.golden_observations(bundle),
                 recorded=self.is_recorded(bundle),
             )  # fmt: skip
-        return _sealed(bundle, out, written, made_by, graphs)
+        return _seal(bundle, out, written, made_by, graphs)
 
     def work(self, source: Bundle) -> Path:
-        """Return the directory in which unfinished work on a source is kept."""
+        """Return the directory of unfinished work on a source."""
         weights = hashlib.sha256(f"{self.key(source.hash)} {weights_fingerprint(source)}".encode()).hexdigest()
         return work_root() / f"{self.name()}-{weights[:16]}"
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
-        """Return what a person wants to know about the new bundle."""
-        report = json.loads((made.path / LOSSES).read_text(encoding="utf-8"))
+    def lines(self, quantized: Bundle) -> tuple[str, ...]:
+        """Return a summary of the new bundle for the user."""
+        report = json.loads((quantized.path / LOSS_REPORT).read_text(encoding="utf-8"))
         again = f", {report['resumed']} of them from the run before" if report["resumed"] else ""
         if not report["layers"]:
             return ("no layer was quantized",)
         return (
             f"{len(report['layers'])} weights in int{self.bits}, blocks of {self.block}{again}; relative L2 error: "
             f"mean {report['mean']:.4f}, largest {report['max']:.4f} ({report['worst']})",
-            *self._undecided(report["layers"]),
+            *self._underdetermined_layers(report["layers"]),
         )
 
-    def _undecided(self, layers: list[dict[str, Any]]) -> Iterator[str]:
-        """Warn of layers with more inputs than the samples give rows: the rounding fits these, and others at random."""
-        few = [note for note in layers if note.get("rows", math.inf) < note.get("inputs", 0)]
-        if few:
-            worst = max(few, key=lambda note: note["inputs"] / note["rows"])
-            others = f" (as {len(few) - 1} others)" if few[1:] else ""
+    def _underdetermined_layers(self, layers: list[dict[str, Any]]) -> Iterator[str]:
+        """Warn of layers with more inputs than rows of activations, whose rounding is underdetermined."""
+        underdetermined = [note for note in layers if note.get("rows", math.inf) < note.get("inputs", 0)]
+        if underdetermined:
+            worst = max(underdetermined, key=lambda note: note["inputs"] / note["rows"])
+            others = f" (as {len(underdetermined) - 1} others)" if underdetermined[1:] else ""
             yield (
                 f"warning: {worst['layer']} has {worst['inputs']} inputs, the samples give it {worst['rows']} rows: "
                 f"too few to decide how {self.method} rounds it{others}; record more and raise --samples, or use "
                 "--method rtn"
             )
 
-    def _records(self, plan: WeightsPlan, bundle: Bundle, place: Path, samples: SampleSet | None) -> list[Record]:
+    def _records(self, plan: WeightsPlan, bundle: Bundle, directory: Path, samples: SampleSet | None) -> list[Record]:
         if samples is not None:
-            from vlatool.quantize._calibrated import calibrated_records
+            from vlatool.quantize.streamed.sequential_calibration import calibrated_records
 
-            return calibrated_records(plan, bundle, self, place, samples)
-        tolerance = self.form.largest_error
-        return [record for task in plan.tasks for record in records_of(task, self.form, self.choose, tolerance)]
+            return calibrated_records(plan, bundle, self, directory, samples)
+        tolerance = self.block_format.largest_error
+        return [
+            record for task in plan.tasks for record in records_for(task, self.block_format, self.choose, tolerance)
+        ]
 
     def _identity(self, plan: WeightsPlan, bundle: Bundle) -> str:
         content = [self.key(bundle.hash), weights_fingerprint(bundle), plan.identity()]
@@ -185,13 +189,13 @@ class WeightOnly(WeightOptions):
 
 
 def _processes(records: list[Record]) -> int:
-    """Return how many processes compute: one more than cores, since each waits for the disk at times."""
+    """Return the number of worker processes: one more than cores, since workers wait for the disk at times."""
     work = sum(record.weights for record in records if record.portable)
-    return min(len(os.sched_getaffinity(0)), 8) + 1 if work >= WORTH_PROCESSES else 0
+    return min(len(os.sched_getaffinity(0)), 8) + 1 if work >= MIN_PARALLEL_WEIGHTS else 0
 
 
-def _summarize(written: Written, file: Path) -> dict[str, Any]:
-    """Write the loss of every layer to ``reports/weights.json``; return what the manifest says of it."""
+def _summarize(written: RecordFile, file: Path) -> dict[str, Any]:
+    """Write the loss of every layer to ``reports/weights.json``; return its entries for the manifest."""
     layers = [note for note in written.notes if "error" in note]
     errors = [note["error"] for note in layers]
     worst = max(layers, key=lambda note: note["error"])["layer"] if layers else ""
@@ -205,12 +209,12 @@ def _summarize(written: Written, file: Path) -> dict[str, Any]:
     return {"weights_sha256": digest, "weight_error": summary}
 
 
-def _sealed(bundle: Bundle, out: Path, written: Written, made_by: dict[str, Any], graphs: dict[str, Graph]) -> Bundle:
-    """Write the manifest without running the graphs; the large file was hashed while it was written."""
-    files = {WEIGHTS: FileRecord(written.sha256, written.bytes)}
+def _seal(bundle: Bundle, out: Path, written: RecordFile, made_by: dict[str, Any], graphs: dict[str, Graph]) -> Bundle:
+    """Write the manifest without running the graphs; the large file was hashed during writing."""
+    files = {WEIGHTS_FILE: FileRecord(written.sha256, written.bytes)}
     for path in sorted(path for folder in ("assets", "data", "graphs") for path in (out / folder).rglob("*")):
         name = path.relative_to(out).as_posix()
-        if path.is_file() and name != WEIGHTS:
+        if path.is_file() and name != WEIGHTS_FILE:
             files[name] = FileRecord(hash_file(path), path.stat().st_size)
     origin = {key: value for key, value in bundle.manifest.source.items() if key != "arguments"}
     hashes = {name: record.sha256 for name, record in files.items() if name.startswith("graphs/")}

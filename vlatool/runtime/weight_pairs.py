@@ -191,7 +191,7 @@ def _met(model: bytes | OpenFile, name: str, weight: _Weight, nodes: list[_Node]
     values = np.frombuffer(model[weight.start : weight.end], np.int8).reshape(weight.shape)
     orders = {_order(node, names, len(weight.shape)) for node, names in readers}
     orders.discard(("", 0))
-    return bool(readers) and None not in orders and all(pairs.fit(values, *order) for order in orders if order)
+    return bool(readers) and None not in orders and all(pairs.pairs_fit(values, *order) for order in orders if order)
 
 
 def _readers(name: str, nodes: list[_Node]) -> Iterator[tuple[_Node, tuple[str, ...]]]:

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-BLOCKED = -1e4  # additive mask value that exists in float16 too
+MASK_VALUE = -1e4  # additive mask value that exists in float16 too
 
 
 def split_heads(tokens: Tensor, heads: int) -> Tensor:
@@ -43,7 +43,7 @@ def _repeat_heads(tensor: Tensor, groups: int) -> Tensor:
 
 def additive(visible: Tensor, dtype: torch.dtype) -> Tensor:
     """Bool mask (True: may be seen) -> additive mask of ``dtype``."""
-    return visible.logical_not().to(dtype) * BLOCKED
+    return visible.logical_not().to(dtype) * MASK_VALUE
 
 
 def sinusoid(time: Tensor, width: int, shortest: float = 4e-3, longest: float = 4.0) -> Tensor:
@@ -69,8 +69,8 @@ class Feedforward(nn.Module):
     """Linear, GELU, linear.
 
     Args:
-        width: Of input and output.
-        hidden: Of the layer between.
+        width: Width of input and output.
+        hidden: Width of the hidden layer.
         approximate: ``"none"`` (exact) or ``"tanh"``.
     """
 
@@ -133,10 +133,10 @@ class EncoderBlock(nn.Module):
     """Pre-norm transformer block: self-attention and a GELU feed-forward, each with a residual.
 
     Args:
-        width: Of the tokens.
-        heads: Of the attention.
-        hidden: Of the feed-forward.
-        approximate: Of the GELU.
+        width: Width of the tokens.
+        heads: Number of attention heads.
+        hidden: Hidden width of the feed-forward.
+        approximate: Approximation of the GELU.
         gains: Whether each branch ends in a learned gain, as in DINOv2.
     """
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 Module = TypeVar("Module", bound=nn.Module)
 NORMS = (nn.LayerNorm, nn.RMSNorm, nn.BatchNorm2d)
-SMALL = 0.02
+INIT_STD = 0.02
 
 
 class Constants(nn.Module):
@@ -91,6 +91,6 @@ def _draw(parameter: Tensor, seed: int, name: str, centre: float) -> None:
         return
     digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
     stream = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
-    deviation = SMALL if parameter.ndim == 1 else 1 / math.sqrt(parameter[0].numel())
+    deviation = INIT_STD if parameter.ndim == 1 else 1 / math.sqrt(parameter[0].numel())
     values = torch.randn(parameter.shape, generator=stream, dtype=torch.float32)
     parameter.copy_(values.mul_(deviation).add_(centre))

@@ -16,9 +16,9 @@ class ExpertShape:
     """Shape of the expert.
 
     Args:
-        width: Of the action tokens.
+        width: Width of the action tokens.
         depth: Number of blocks.
-        heads: Of each attention.
+        heads: Number of attention heads.
         hidden: Of each feed-forward.
         context: Width of the context tokens.
         chunk: Actions in a chunk.

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from vlatool.samples._blocks import BLOCKED, GatedFeedforward, attend, split_heads
+from vlatool.samples._blocks import MASK_VALUE, GatedFeedforward, attend, split_heads
 from vlatool.samples._build import Constants
 
 Angles = tuple[Tensor, Tensor]
@@ -19,14 +19,14 @@ class DecoderShape:
     """Shape of a decoder.
 
     Args:
-        width: Of the tokens.
+        width: Width of the tokens.
         layers: Number of layers.
         heads: Query heads.
         shared_heads: Key/value heads.
-        head_width: Of each head.
-        hidden: Of each feed-forward.
-        base: Of the rotary positions.
-        epsilon: Of the RMS norms.
+        head_width: Width of each head.
+        hidden: Hidden width of each feed-forward.
+        base: Base of the rotary positions.
+        epsilon: Epsilon of the RMS norms.
     """
 
     width: int
@@ -49,8 +49,8 @@ class Rotary(Constants):
 
     Args:
         length: Number of positions.
-        width: Of a head.
-        base: Of the geometric series of wave lengths.
+        width: Width of a head.
+        base: Base of the geometric series of wave lengths.
     """
 
     cosines: Tensor
@@ -98,7 +98,7 @@ class Causal(Constants):
 
     def reset_constants(self) -> None:
         """Block everything above the diagonal."""
-        self.mask.copy_(torch.full(self.mask.shape, BLOCKED).triu(1))
+        self.mask.copy_(torch.full(self.mask.shape, MASK_VALUE).triu(1))
 
     def forward(self) -> Tensor:
         """() -> (length, length)."""

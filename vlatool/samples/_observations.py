@@ -56,6 +56,6 @@ def smooth_image(height: int, width: int, random: np.random.Generator) -> NDArra
 
 def _interpolation(length: int, cells: int) -> NDArray[np.float64]:
     """(length, cells + 1): weights of the grid points at each pixel."""
-    places = np.linspace(0, cells, length)[:, None]
-    weights: NDArray[np.float64] = np.maximum(0.0, 1.0 - np.abs(places - np.arange(cells + 1)))
+    positions = np.linspace(0, cells, length)[:, None]
+    weights: NDArray[np.float64] = np.maximum(0.0, 1.0 - np.abs(positions - np.arange(cells + 1)))
     return weights

@@ -23,8 +23,8 @@ class SmolShape:
         vision: Encoder without registers.
         shuffle: Side of the square of patches that becomes one token.
         language: Layers of the prefix.
-        expert_width: Of the action tokens.
-        expert_hidden: Of each feed-forward of the expert.
+        expert_width: Width of the action tokens.
+        expert_hidden: Hidden width of each feed-forward of the expert.
         vocabulary: Number of token ids; id 0 is padding.
         words: Number of instruction tokens.
         state: Elements of the robot's state.

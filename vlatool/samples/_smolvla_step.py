@@ -15,7 +15,7 @@ from vlatool.samples._smolvla import SmolShape
 
 @dataclass(frozen=True)
 class Sight:
-    """What the action tokens see: one object for all layers of a step.
+    """Context of the action tokens: one object for all layers of a step.
 
     Args:
         own: Angles of positions counted from the first action.

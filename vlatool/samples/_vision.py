@@ -49,12 +49,12 @@ class VisionShape:
     Args:
         pixels: Height and width of the image.
         patch: Height and width of a patch.
-        width: Of the tokens.
+        width: Width of the tokens.
         depth: Number of blocks.
-        heads: Of each attention.
-        hidden: Of each feed-forward.
+        heads: Number of attention heads.
+        hidden: Hidden width of each feed-forward.
         registers: Learned tokens in front of the patches (class token included).
-        approximate: Of the GELU.
+        approximate: Approximation of the GELU.
         gains: Whether blocks have learned gains (DINOv2).
         colours: Mean and deviation of the channels.
     """

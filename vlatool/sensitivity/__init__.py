@@ -1,1 +1,1 @@
-"""What each layer costs in accuracy when it is quantized."""
+"""Sensitivity of the accuracy to quantization of each layer."""

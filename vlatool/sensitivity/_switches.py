@@ -1,8 +1,8 @@
-"""A float32 graph in which every layer can be switched to int8 by an input of its own.
+"""A float32 graph in which a separate input switches each layer to int8.
 
-Each layer becomes an ``If`` on a boolean scalar: one branch quantizes and dequantizes what the layer reads, as the int8
-graph does, the other is the float layer as it was. One session then serves all choices of layers, and the constants of
-the branch that is not taken cost nothing.
+Each layer becomes an ``If`` on a boolean scalar: one branch quantizes and dequantizes the inputs of the layer, as the
+int8 graph does, the other is the original float layer. One session then serves all combinations of layers, and the
+constants of the branch that is not taken cost nothing.
 """
 
 from __future__ import annotations
@@ -14,47 +14,47 @@ from typing import Any
 
 from vlatool.errors import GraphError
 from vlatool.graph.files import load
-from vlatool.graph.layers import Layer, Style, calibrated_values, hoisted
+from vlatool.graph.layers import Layer, Style, calibrated_values, hoisted_values
 from vlatool.graph.onnx_graph import FLOAT, OnnxGraph
 from vlatool.graph.qdq import Range, insert_qdq
 
-FLAG = "int8."
+FLAG_PREFIX = "int8."
 """Prefix of the name of the input that switches a layer."""
 
 
 def add_switches(
     path: Path, layers: Iterable[Layer], ranges: Mapping[str, Range] | None, style: Style
 ) -> tuple[Any, dict[str, str]]:
-    """Return the graph with its switches, and layer name -> name of the boolean input of shape () that switches it.
+    """Return the graph with switches, and layer name -> name of its boolean input of shape ().
 
     Args:
         path: A float32 ONNX file.
-        layers: From ``find_layers`` of that file.
-        ranges: Value name -> (low, high), of every value that ``calibrated_values`` names; when None, ranges are taken
-            from the values at run time (uint8, DynamicQuantizeLinear).
-        style: How the int8 graph writes its layers.
+        layers: Layers from ``find_layers`` of that file.
+        ranges: Value name -> (low, high), for every value of ``calibrated_values``; when None, ranges are computed at
+            run time (uint8, DynamicQuantizeLinear).
+        style: Quantization style of the layers.
 
     Raises:
         GraphError: when a range is missing, or a weight holds NaN or infinity.
     """
-    chosen = list(layers)
-    written = load(path)
-    moved = hoisted(written, chosen, style)
+    selected = list(layers)
+    quantized = load(path)
+    hoisted = hoisted_values(quantized, selected, style)
     plain = replace(style, hoist=False)
     known: dict[str, Range] = {}
-    for name in calibrated_values(chosen, plain, {}):
-        source = moved.get(name, name)
+    for name in calibrated_values(selected, plain, {}):
+        source = hoisted.get(name, name)
         if ranges is not None and source not in ranges:
             raise GraphError(f"The value '{source}' of {path.name} has no range.", "calibrate with the same stage")
         known[name] = (0.0, 1.0) if ranges is None else ranges[source]
-    insert_qdq(written, chosen, known, plain)
-    pairs = _Pairs(written, dynamic=ranges is None)
+    insert_qdq(quantized, selected, known, plain)
+    pairs = _Pairs(quantized, dynamic=ranges is None)
     model = load(path)
-    return model, _Writer(model, {layer.name: layer for layer in chosen}, pairs, plain).write()
+    return model, _Writer(model, {layer.name: layer for layer in selected}, pairs, plain).write()
 
 
 class _Pairs(OnnxGraph):
-    """The quantize-dequantize nodes of an int8 graph, copied to where they are needed."""
+    """Copies of the quantize-dequantize nodes of an int8 graph."""
 
     def __init__(self, model: Any, *, dynamic: bool) -> None:
         super().__init__(model)
@@ -62,14 +62,14 @@ class _Pairs(OnnxGraph):
         self.nodes = {node.name: node for node in model.graph.node}
         self.used: dict[str, Any] = {}
 
-    def of_input(self, layer: str, index: int, source: str, suffix: str) -> tuple[list[Any], str]:
-        """Return the nodes before an input of a layer, and the name they give; none when it is read as it is.
+    def input_pair(self, layer: str, index: int, source: str, suffix: str) -> tuple[list[Any], str]:
+        """Return the nodes before an input of a layer, and the name of their output; none for an unquantized input.
 
         Args:
             layer: Name of the node.
-            index: Which of its inputs.
-            source: What the copied QuantizeLinear reads.
-            suffix: Makes the names of the copies unique.
+            index: Index of the input.
+            source: Input of the copied QuantizeLinear.
+            suffix: Suffix that makes the names of the copies unique.
         """
         node = self.nodes[layer]
         last = self.producers.get(node.input[index])
@@ -82,8 +82,8 @@ class _Pairs(OnnxGraph):
         copy = self._copy(last, list(last.input), f"{last.output[0]}{suffix}")
         return [copy], copy.output[0]
 
-    def of_output(self, name: str, suffix: str) -> tuple[list[Any], str]:
-        """Return the pair that quantizes what a convolution gives, and the name it gives."""
+    def output_pair(self, name: str, suffix: str) -> tuple[list[Any], str]:
+        """Return the pair that quantizes the output of a convolution, and the name of its output."""
         first = next(node for node in self.readers[name] if node.op_type == "QuantizeLinear")
         return self._pair(first, self.readers[first.output[0]][0], name, suffix)
 
@@ -114,7 +114,7 @@ class _Writer(OnnxGraph):
         self.layers, self.pairs = layers, pairs
         self.nodes: list[Any] = []
         self.rerouted: dict[str, str] = {}
-        self.flags = {name: f"{FLAG}{number}" for number, name in enumerate(layers)}
+        self.flags = {name: f"{FLAG_PREFIX}{number}" for number, name in enumerate(layers)}
         convolutions = [layer for layer in layers.values() if layer.kind == "Conv" and style.fused_convolutions]
         self.fused = {layer.output: layer for layer in convolutions if layer.output not in self.outputs}
 
@@ -122,30 +122,30 @@ class _Writer(OnnxGraph):
         """Rebuild the list of nodes; return layer name -> flag."""
         for node in self.graph.node:
             node.input[:] = [self.rerouted.get(name, name) for name in node.input]
-            self.nodes.append(self._switched(node) if node.name in self.layers else node)
+            self.nodes.append(self._as_if(node) if node.name in self.layers else node)
             if node.output[0] in self.fused:
-                self._output(self.fused[node.output[0]])
+                self._switch_output(self.fused[node.output[0]])
         self.replace_nodes(self.nodes)
         self.graph.initializer.extend(self.pairs.used.values())
         info, boolean = self.onnx.helper.make_tensor_value_info, self.onnx.TensorProto.BOOL
         self.graph.input.extend(info(flag, boolean, []) for flag in self.flags.values())
         return dict(self.flags)
 
-    def _switched(self, node: Any) -> Any:
+    def _as_if(self, node: Any) -> Any:
         """Return the layer as an ``If``."""
         flag = self.flags[node.name]
         before: list[Any] = []
         inputs = list(node.input)
         for index, name in enumerate(node.input):
-            nodes, value = self.pairs.of_input(node.name, index, name, f"@{flag}.{index}")
+            nodes, value = self.pairs.input_pair(node.name, index, name, f"@{flag}.{index}")
             before += nodes
             inputs[index] = value or name
         return self._if(flag, node, inputs, before)
 
-    def _output(self, layer: Layer) -> None:
-        """Let all later readers of a convolution's output read what its flag makes of it."""
+    def _switch_output(self, layer: Layer) -> None:
+        """Redirect all later readers of a convolution's output to the switched output."""
         flag, target = self.flags[layer.name], f"{layer.output}@switched"
-        before, value = self.pairs.of_output(layer.output, f"@{flag}.out")
+        before, value = self.pairs.output_pair(layer.output, f"@{flag}.out")
         node = self.node("Identity", [layer.output], [target], f"{layer.name}@out")
         self.nodes.append(self._if(flag, node, [value], before))
         self.rerouted[layer.output] = target

@@ -1,4 +1,4 @@
-"""What each layer costs when it alone is int8: error of the actions, on recorded observations."""
+"""Sensitivity of each layer: error of the actions with only this layer in int8, on recorded observations."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ from vlatool.sensitivity._switches import add_switches
 from vlatool.stage.base import Context, SampleSet
 
 Array = NDArray[Any]
-Place = tuple[str, str]
+LayerId = tuple[str, str]
 """Graph name and layer name."""
 
 
 @dataclass(frozen=True)
 class LayerError:
-    """What int8 in one layer, or in a group of layers, does to the actions.
+    """Effect of int8 in one layer, or in a group of layers, on the actions.
 
     Args:
         name: Node name, for example ``blocks.3.attn.out/MatMul``; names joined by ``+`` for a group.
-        graph: Name of the graph that it is in.
+        graph: Name of its graph.
         error: Relative L2 error of the raw action output, mean over the observations.
         elements: Label -> mean |error| in physical units (un-normalised); empty for discrete actions.
         flips: Share of steps whose gripper element changes sign, or (discrete) whose largest logit is another one; 0
             when there is none.
         jump: ``|d' - d|₂ / |d|₂`` with ``d`` the raw last step minus the first of a chunk, mean over the observations:
-            how far the place where the next chunk begins moves. 0 for chunks of one step and for discrete actions.
+            how far the start of the next chunk moves. 0 for chunks of one step and for discrete actions.
         macs_share: Share of the graph's multiply-accumulates (0-1); NaN when they cannot be counted.
-        samples: Observations that it was measured on.
+        samples: Number of observations of the measurement.
     """
 
     name: str
@@ -72,19 +72,19 @@ def sensitivities(
     *,
     seconds: float = math.inf,
 ) -> list[LayerError]:
-    """Measure every layer that a stage would quantize, alone in int8 and all else in float32; the worst first.
+    """Measure every layer that a stage would quantize, with only this layer in int8; the worst first.
 
-    The noise of each observation is drawn from the same seed. What a policy keeps is what it kept of the observations
-    before, in float32; zero where the observations are no recording's.
+    The noise of each observation is drawn from the same seed. The state of a policy is that after the earlier
+    observations in float32; zero where the observations are not from a recording.
 
     Args:
         bundle: A float32 bundle.
-        stage: Which layers, and how they are written.
-        ranges: Graph -> value -> (low, high), as ``ranges_of`` gives; calibrated as the stage does when None. A graph
-            that is absent gets its ranges at run time, as dynamic int8 does.
+        stage: Stage that selects the layers and their style.
+        ranges: Graph -> value -> (low, high), from ``ranges_of``; calibrated as the stage does when None. A missing
+            graph gets its ranges at run time, as in dynamic int8.
         observations: Raw observations, at least one.
-        context: For progress.
-        seconds: No further observation is begun that would not end within them; the first one always is.
+        context: Receiver of progress.
+        seconds: Time limit; no further observation is started that would exceed it, except the first one.
 
     Raises:
         DataError: when there is no observation, or one does not fit the spec.
@@ -92,11 +92,11 @@ def sensitivities(
     """
     known = ranges_of(bundle, stage, context) if ranges is None else ranges
     with Switchboard(bundle, stage, known) as board:
-        return board.errors([(place,) for place in board.shares], observations, context, seconds=seconds)
+        return board.errors([(layer_id,) for layer_id in board.shares], observations, context, seconds=seconds)
 
 
 def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, dict[str, Range]]:
-    """Return graph -> value -> (low, high) that the stage quantizes activations over, from its calibration data.
+    """Return graph -> value -> range (low, high) of the stage, from its calibration data.
 
     Raises:
         DataError: when the bundle has no calibration data, or a sample does not fit.
@@ -107,42 +107,42 @@ def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, 
     return {graph: stage.ranges(values) for graph, values in statistics.items()}
 
 
-class _Tape:
-    """What the graphs gave in the float run of an observation, up to the first graph that is now another one."""
+class _OutputTape:
+    """Outputs of the graphs in the float run of an observation, reusable up to the first changed graph."""
 
     def __init__(self) -> None:
         self.recorded: list[Mapping[str, Array]] = []
         self.recording = True
-        self.place = 0
+        self.position = 0
         self.changed = False
 
     def start(self, *, recording: bool) -> None:
-        self.recording, self.place, self.changed = recording, 0, recording
+        self.recording, self.position, self.changed = recording, 0, recording
         if recording:
             self.recorded.clear()
 
 
-class _Switchable:
-    """A session of a graph with switches; while nothing before it has changed, it gives what it gave before."""
+class _SwitchableSession:
+    """A session of a graph with switches; it replays its outputs while nothing before it has changed."""
 
-    def __init__(self, session: Any, flags: Mapping[str, str], tape: _Tape) -> None:
+    def __init__(self, session: Any, flags: Mapping[str, str], tape: _OutputTape) -> None:
         self._session, self._flags, self._tape = session, flags, tape
         self._off = dict.fromkeys(flags.values(), np.array(False))
         self._set = self._off
         self._active = False
 
     def switch(self, layers: Iterable[str]) -> None:
-        """Compute those layers in int8 and all others in float32."""
+        """Switch the given layers to int8 and all others to float32."""
         on = {self._flags[name]: np.array(True) for name in layers}
         self._set, self._active = {**self._off, **on}, bool(on)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run the graph as it is switched."""
+        """Run the graph with its current switches."""
         tape = self._tape
         tape.changed = tape.changed or self._active
         if not tape.changed:
-            tape.place += 1
-            return tape.recorded[tape.place - 1]
+            tape.position += 1
+            return tape.recorded[tape.position - 1]
         with engine_call(type(self._session), "ran a graph with switches"):
             outputs: Mapping[str, Any] = self._session.run({**feeds, **self._set})
         if tape.recording:
@@ -151,13 +151,13 @@ class _Switchable:
 
 
 class Switchboard:
-    """A float32 policy in which any choice of layers can be computed in int8; a context manager.
+    """A float32 policy in which any combination of layers can be computed in int8; a context manager.
 
     Args:
         bundle: A float32 bundle.
-        stage: Which layers, and how they are written.
-        ranges: As ``ranges_of`` gives.
-        threads: Intra-op threads; the cores that this process may use when None.
+        stage: Stage that selects the layers and their style.
+        ranges: Ranges from ``ranges_of``.
+        threads: Number of intra-op threads; the cores that this process may use when None.
     """
 
     def __init__(
@@ -169,10 +169,10 @@ class Switchboard:
     ) -> None:
         self._opened = contextlib.ExitStack()
         folder = self._opened.enter_context(scratch_directory())
-        self._tape = _Tape()
-        self._sessions: dict[str, _Switchable] = {}
-        self._kept: Mapping[str, Array] = {}
-        self.shares: dict[Place, float] = {}
+        self._tape = _OutputTape()
+        self._sessions: dict[str, _SwitchableSession] = {}
+        self._state: Mapping[str, Array] = {}
+        self.shares: dict[LayerId, float] = {}
         with foreign_errors("main"):
             layers, _ = stage.plan(bundle)
         for name, graph in bundle.manifest.graphs.items():
@@ -185,7 +185,7 @@ class Switchboard:
                     path = folder / f"{name}.onnx"
                     save(model, path)
             with engine_call(of_branches(), f"opened the graph '{name}' with switches"):
-                self._sessions[name] = _Switchable(of_branches()(path, threads), flags, self._tape)
+                self._sessions[name] = _SwitchableSession(of_branches()(path, threads), flags, self._tape)
         self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), DEFAULT_ENGINE)
 
     def __enter__(self) -> Switchboard:
@@ -195,39 +195,39 @@ class Switchboard:
         self._opened.close()
 
     def reference(self, observation: Mapping[str, Any]) -> Action:
-        """Run in float32, and keep what the graphs gave for the ``run`` calls that follow."""
+        """Run in float32, and keep the outputs of the graphs for the following calls of ``run``."""
         return self._infer((), observation, recording=True)
 
-    def run(self, places: Iterable[Place], observation: Mapping[str, Any]) -> Action:
-        """Run the observation of the last ``reference`` with those layers in int8."""
-        return self._infer(places, observation, recording=False)
+    def run(self, layers: Iterable[LayerId], observation: Mapping[str, Any]) -> Action:
+        """Run the observation of the last ``reference`` with the given layers in int8."""
+        return self._infer(layers, observation, recording=False)
 
-    def _infer(self, places: Iterable[Place], observation: Mapping[str, Any], *, recording: bool) -> Action:
-        chosen = list(places)
+    def _infer(self, layers: Iterable[LayerId], observation: Mapping[str, Any], *, recording: bool) -> Action:
+        selected = list(layers)
         for name, session in self._sessions.items():
-            session.switch([layer for graph, layer in chosen if graph == name])
+            session.switch([layer for graph, layer in selected if graph == name])
         self._tape.start(recording=recording)
         self.policy.reset()
-        if self._kept:
-            self.policy.program.kept = dict(self._kept)
+        if self._state:
+            self.policy.program.kept = dict(self._state)
         return self.policy.infer(observation)
 
-    def _led_to(self, observations: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-        """Yield observations; until the next one, each run is given what the policy keeps before it."""
+    def _with_state(self, observations: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+        """Yield observations; until the next one, each run starts from the policy's state before it."""
         if not (self.policy.program.keeps and isinstance(observations, Observations)):
             yield from observations
             return
         for moment in observations.with_history():
-            self._kept = {} if moment.begins else self._kept
+            self._state = {} if moment.begins else self._state
             if moment.counts:
                 yield moment.observation
             self.reference(moment.observation)
-            self._kept = self.policy.program.kept
-        self._kept = {}
+            self._state = self.policy.program.kept
+        self._state = {}
 
     def errors(
         self,
-        groups: Sequence[Sequence[Place]],
+        groups: Sequence[Sequence[LayerId]],
         observations: Sequence[Mapping[str, Any]],
         context: Context,
         *,
@@ -247,7 +247,7 @@ class Switchboard:
         spec = self.policy.spec.action
         rows: list[list[tuple[Array, ...]]] = [[] for _ in groups]
         start = time.monotonic()
-        for number, observation in enumerate(self._led_to(observations)):
+        for number, observation in enumerate(self._with_state(observations)):
             if number and (time.monotonic() - start) * (number + 1) / number > seconds:
                 break
             reference = self.reference(observation)
@@ -258,13 +258,13 @@ class Switchboard:
         layers = [self._error(group, row) for group, row in zip(groups, rows, strict=True)]
         return sorted(layers, key=lambda layer: -layer.error) if ordered else layers
 
-    def _error(self, group: Sequence[Place], rows: list[tuple[Array, ...]]) -> LayerError:
+    def _error(self, group: Sequence[LayerId], rows: list[tuple[Array, ...]]) -> LayerError:
         spec = self.policy.spec.action
         errors, flips, jumps, elements = (np.mean([row[index] for row in rows], axis=0) for index in range(4))
         labels = spec.labels or tuple(str(index) for index in range(spec.width))
         named = {} if spec.kind == "discrete" else dict(zip(labels, elements.tolist(), strict=True))
         graphs = ", ".join(dict.fromkeys(graph for graph, _ in group))
-        share = float(sum(self.shares[place] for place in group))
+        share = float(sum(self.shares[layer_id] for layer_id in group))
         name = "+".join(layer for _, layer in group)
         return LayerError(name, graphs, float(errors), named, float(flips), float(jumps), share, len(rows))
 

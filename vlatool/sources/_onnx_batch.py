@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from vlatool.errors import require
-from vlatool.graph.nodes import free_name, rename_reads
+from vlatool.graph.nodes import rename_reads, unique_name
 
 AXES_AS_INPUT = 13
 """Opset from which Squeeze and Unsqueeze have their axes as an input."""
@@ -32,14 +32,14 @@ def add_batch_axes(model: Any, opset: int) -> list[str]:
     if not inputs and not outputs:
         return []
     taken = stored | {name for node in graph.node for name in (*node.input, *node.output)}
-    axes = free_name("batch_axis", 0, taken)
+    axes = unique_name("batch_axis", 0, taken)
     before, after = [], []
     for value in inputs:
-        inner = free_name(f"{value.name}_observed", 0, taken)
+        inner = unique_name(f"{value.name}_observed", 0, taken)
         rename_reads(graph, value.name, inner)
         before.append(_moved("Squeeze", value.name, inner, f"{value.name}/Squeeze", axes, opset))
     for value in outputs:
-        inner = free_name(f"{value.name}_given", 0, taken)
+        inner = unique_name(f"{value.name}_given", 0, taken)
         rename_reads(graph, value.name, inner)
         for node in graph.node:
             node.output[:] = [inner if name == value.name else name for name in node.output]

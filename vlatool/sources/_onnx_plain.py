@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import require
+from vlatool.graph.gemm_factors import FACTORS, extract_gemm_factors
 from vlatool.graph.nodes import name_nodes, read_names, reads
-from vlatool.graph.plain_gemms import FACTORS, plain_gemms
 
 MOVERS = ("Identity", "Cast", "Transpose", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Split")
 """Operators through which exporters let a weight go on its way to a layer."""
@@ -84,7 +84,7 @@ def _dense(sparse: Any) -> Any:
 def _with_plain_gemms(model: Any) -> Any:
     ir = require("onnx_ir", "build")
     changed = ir.from_proto(model)
-    return ir.to_proto(changed) if plain_gemms(changed) else model
+    return ir.to_proto(changed) if extract_gemm_factors(changed) else model
 
 
 def _drop_unread(graph: Any) -> None:

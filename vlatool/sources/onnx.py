@@ -16,11 +16,11 @@ from vlatool.bundle.manifest import Graph, Manifest
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, InputError, SourceError, require, suggest
-from vlatool.graph.as_float32 import ROUNDING, as_float32, float32_text
-from vlatool.graph.draws import refuse_drawing_file
 from vlatool.graph.files import save
-from vlatool.graph.layers import LOWEST_OPSET
+from vlatool.graph.float32_conversion import ROUNDING, as_float32, describe_conversion
+from vlatool.graph.layers import MIN_OPSET
 from vlatool.graph.onnx_graph import type_name
+from vlatool.graph.random_ops import refuse_random_file
 from vlatool.machine.engine_calls import REMEDY, engine_call
 from vlatool.module.description import FILE, Description, copy_assets, read_description
 from vlatool.module.source import Source
@@ -120,7 +120,7 @@ class OnnxFile(Source):
                 complete_outputs(model, file, _tensors(model.graph.input))
         described = description or self._described(model)
         _check_names(model, described.spec)
-        refuse_drawing_file(model, self.model)
+        refuse_random_file(model, self.model)
         copy_assets(described, out)
         manifest = described.manifest()
         options = {"opset": self.opset, "shape": list(self.shape)}
@@ -141,7 +141,7 @@ class OnnxFile(Source):
                 "leave --shape out, or change them there",
             )
         if gone := as_float32(model):
-            context.messages.append(float32_text(gone))
+            context.messages.append(describe_conversion(gone))
         declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
         fixed = axes_text(fix_axes(model, declared or shapes_from(self.shape), declared is not None, str(self.model)))
         further = [] if description else add_batch_axes(model, opset_of(model))
@@ -160,7 +160,7 @@ class OnnxFile(Source):
             SourceError: when it cannot be converted, or computes something else than the file.
         """
         opset, file = opset_of(model), out / "graphs/main.onnx"
-        wanted = self.opset or max(opset, LOWEST_OPSET if opset else 0)
+        wanted = self.opset or max(opset, MIN_OPSET if opset else 0)
         save(model, file)
         before, unbatched = self._before(file, changes.further)
         if wanted != opset:
@@ -172,7 +172,7 @@ class OnnxFile(Source):
             except InputError as error:
                 if self.opset:
                     raise
-                words = f"opset {opset} stays, in which nothing can be quantized to int8 ({LOWEST_OPSET} or later): "
+                words = f"opset {opset} stays, in which nothing can be quantized to int8 ({MIN_OPSET} or later): "
                 context.messages.append(f"{words}{error.message}")
                 save(model, file)
         self._compare(before, unbatched, out, manifest, changes.tolerance)

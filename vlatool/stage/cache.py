@@ -24,7 +24,7 @@ from vlatool.files.locks import exclusive_lock
 from vlatool.files.ownership import LEDGER, cached_hash, read_listing
 from vlatool.files.resumable_work import LOCK
 from vlatool.files.user_files import DRAFT_NAME, remove_stale_drafts
-from vlatool.graph.stored import is_workload
+from vlatool.graph.workload_file import is_workload
 
 STREAMS, WORKLOADS = "streams", "workloads"
 NAMES = {

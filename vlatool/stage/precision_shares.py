@@ -10,11 +10,11 @@ import numpy as np
 
 from vlatool.errors import VlatoolError, require
 from vlatool.files.scratch import scratch_directory
-from vlatool.graph.files import write_beside
-from vlatool.graph.flat import named_everywhere
+from vlatool.graph.control_flow import with_unique_names
+from vlatool.graph.files import write_linked
 from vlatool.graph.onnx_graph import type_name
 from vlatool.graph.precision import shares_and_unknown
-from vlatool.graph.seen import Seen, note_seen, read_seen
+from vlatool.graph.run_shapes import RunShapes, read_run_shapes, write_run_shapes
 from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.engines import traced
@@ -38,8 +38,8 @@ def count_shares(path: Path, context: Context) -> dict[str, float]:
     seen = _run(path) if unknown else {}
     if not seen.keys().isdisjoint(unknown):
         model = require("onnx", "build").load(str(path), load_external_data=False)
-        wanted = {*unknown, *read_seen(model)}  # what the graph before it noted holds for layers that are the same
-        note_seen(model, {name: node for name, node in seen.items() if name in wanted})
+        wanted = {*unknown, *read_run_shapes(model)}  # shapes of an earlier graph hold for layers that are the same
+        write_run_shapes(model, {name: node for name, node in seen.items() if name in wanted})
         path.write_bytes(model.SerializeToString())
         shares, unknown = shares_and_unknown(path)
     if unknown:
@@ -49,20 +49,20 @@ def count_shares(path: Path, context: Context) -> dict[str, float]:
     return shares
 
 
-def _run(path: Path) -> dict[str, Seen]:
+def _run(path: Path) -> dict[str, RunShapes]:
     """Return node -> what one run shows; nothing where the graph does not run on drawn inputs."""
     onnx = require("onnx", "build")
-    model = named_everywhere(onnx.load(str(path), load_external_data=False))
+    model = with_unique_names(onnx.load(str(path), load_external_data=False))
     stored = {tensor.name for tensor in model.graph.initializer}
     with scratch_directory() as scratch, contextlib.suppress(VlatoolError):
-        copy = write_beside(model, path, scratch / path.name)
+        copy = write_linked(model, path, scratch / path.name)
         with engine_call(engine_class(), f"ran {path.name} to see its shapes"):
             session = traced(copy, scratch / "trace")
             try:
                 session.run(_draw_inputs([value for value in model.graph.input if value.name not in stored]))
             except Exception:  # the seam: what ONNX Runtime refuses, and types that numpy lacks, is not counted
                 return {}
-            return {name: Seen(*ran) for name, ran in session.ran().items()}
+            return {name: RunShapes(*ran) for name, ran in session.ran().items()}
     return {}
 
 

@@ -32,7 +32,7 @@ class Percentile:
     Args:
         percent: 0-100.
         value: The order statistic; NaN when the series is too short to say anything of this percentile.
-        bound: What the percentile of all calls does not exceed, at ``confidence``; NaN as above.
+        bound: Upper bound of the percentile of all calls, at ``confidence``; NaN as above.
         needed: Independent calls from which there is a bound.
         effective_sample_size: Independent calls that the series is worth.
     """
@@ -68,11 +68,11 @@ def percentile(
         samples: In the order in which they were taken, any unit.
         processes: Which process each call was made in; all in one when None.
         percent: Above 0 and below 100.
-        confidence: Of the bound, one-sided.
+        confidence: One-sided confidence of the bound.
         most: Independent calls that the series is worth at most, where something else than the order tells.
 
     Raises:
-        ValueError: when there is no sample, one is not finite, or the percentage is none.
+        ValueError: when there is no sample, one is not finite, or the percentage is invalid.
 
     Example:
         >>> percentile([1.0] * 64, 90).known, percentile([1.0] * 40, 90).known
@@ -90,7 +90,7 @@ def percentile(
         return Percentile(percent, math.nan, math.nan, needed, size, confidence)
     ordered = np.sort(series)
     count = len(ordered)
-    allowed = exceeding(int(size), share, confidence) / int(size)  # of the calls, beyond the bound
+    allowed = required_exceedances(int(size), share, confidence) / int(size)  # of the calls, beyond the bound
     value = ordered[min(count - 1, max(0, math.ceil(share * count) - 1))]
     bound = ordered[min(count - 1, count - 1 - math.floor(allowed * count))]
     return Percentile(percent, float(value), float(max(bound, value)), needed, size, confidence)
@@ -103,7 +103,7 @@ def proven_above(
     confidence: float = CONFIDENCE,
     processes: Sequence[int] | None = None,
 ) -> bool:
-    """Say whether a percentile of all calls is above a limit, with confidence: too many of these calls were.
+    """Return whether a percentile of all calls is above a limit, with confidence: too many of these calls were.
 
     Example:
         >>> proven_above([9.0] * 5 + [1.0] * 60, 99, 5.0), proven_above([9.0] * 1 + [1.0] * 60, 99, 5.0)
@@ -118,7 +118,7 @@ def proven_above(
     return bool(1 - fewer <= 1 - confidence)
 
 
-def exceeding(count: int, share: float, confidence: float = CONFIDENCE) -> int:
+def required_exceedances(count: int, share: float, confidence: float = CONFIDENCE) -> int:
     """Return how many of ``count`` calls may exceed the bound of a percentile; -1 when none of them is enough.
 
     The largest t with P(at most t of n exceed) <= 1 - confidence, where each exceeds with chance ``1 - share``.
@@ -132,15 +132,15 @@ def floor(share: float, confidence: float = CONFIDENCE) -> int:
     One, and not none: a single stall would otherwise decide (the floors of loadgen, 64 for p90 and 662 for p99).
     """
     low, high = 1, 1
-    while exceeding(high, share, confidence) < 1:
+    while required_exceedances(high, share, confidence) < 1:
         low, high = high, high * 2
     while low + 1 < high:
         middle = (low + high) // 2
-        low, high = (low, middle) if exceeding(middle, share, confidence) >= 1 else (middle, high)
+        low, high = (low, middle) if required_exceedances(middle, share, confidence) >= 1 else (middle, high)
     return high
 
 
-def independent(series: Array) -> float:
+def effective_calls(series: Array) -> float:
     """Return how many independent calls a series is worth: n (1 - r) / (1 + r), r the lag-1 correlation of the ranks.
 
     That is exact for a first-order autoregression; ranks keep one long stall from hiding what the others do. A series
@@ -169,7 +169,7 @@ def effective_sample_size(series: Array, share: float, processes: Sequence[int] 
     neighbours do not show (Kish's design effect 1 + (m - 1) rho; rho by one-way analysis of variance of which calls
     exceed the percentile).
     """
-    worth = independent(series)
+    worth = effective_calls(series)
     if processes is None or len(set(processes)) < 2:
         return worth
     exceeds = (series > np.quantile(series, share)).astype(np.float64)

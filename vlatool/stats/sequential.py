@@ -6,8 +6,8 @@ Neither: more processes. The error probability is shared out over the interim an
 those of the exact signed-rank distribution, so the stated error holds for any symmetric noise however few processes
 there are.
 
-Several statistics of the same processes (``jointly``) fail when one of them does and pass when all do. Between equal
-bundles each is symmetric, whatever it is: swapping the two turns its sign.
+Several statistics of the same processes (``judge_jointly``) fail when one of them does and pass when all do. Between
+equal bundles each is symmetric, whatever it is: swapping the two turns its sign.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vlatool.stats.signed_rank import fewest, hodges_lehmann, lower_bound, upper_bound
+from vlatool.stats.signed_rank import hodges_lehmann, lower_bound, min_differences, upper_bound
 
 INTERIM_ANALYSES = (10, 20, 40)
 ALPHA = 0.01
@@ -30,12 +30,12 @@ DRAWS = 1000
 
 @dataclass(frozen=True)
 class Decision:
-    """What the processes say.
+    """Decision from the processes.
 
     Args:
         verdict: ``pass``, ``fail`` or ``inconclusive``.
         ratio: Candidate over baseline, Hodges-Lehmann centre; 1.1 is a tenth slower.
-        low, high: What it lies between, each bound at the error of one analysis.
+        low, high: Bounds of the ratio, each at the error of one analysis.
         margin: The largest slowdown that passes, a share.
         processes: How many were measured.
         spread: Standard deviation of the log ratios of single processes.
@@ -79,26 +79,26 @@ def reach(processes: int, alpha: float) -> float:
     A shift of all differences shifts the bound alike, so it is a quantile of the bound on normal noise: of ``DRAWS``
     draws, seeded. The spread is taken as known.
     """
-    if processes < fewest(alpha):
+    if processes < min_differences(alpha):
         return math.inf
     noise = np.random.default_rng(0).normal(size=(DRAWS, processes))
     return float(np.quantile([-lower_bound(sample, alpha) for sample in noise], POWER))
 
 
-def judged(
+def judge(
     log_ratios: Sequence[float], margin: float, alpha: float = ALPHA / len(INTERIM_ANALYSES), sharing: int = 1
 ) -> Decision:
     """Judge the processes that there are.
 
     Args:
-        log_ratios: Of each process, natural logarithm of candidate over baseline.
+        log_ratios: Natural logarithm of candidate over baseline of each process.
         margin: The largest slowdown that passes, a share above -1.
         alpha: Chance of a false verdict of this analysis, on either side.
         sharing: Statistics of which one alone makes a gate fail, while all of them must pass: they share the error of a
             failure, and each may keep that of a pass.
 
     Raises:
-        ValueError: when there is no ratio or one is not finite, or the margin is none.
+        ValueError: when there is no ratio or one is not finite, or the margin is invalid.
     """
     if not margin > -1:
         raise ValueError(f"the margin is {margin}; allowed: above -1")
@@ -111,7 +111,7 @@ def judged(
     return Decision(verdict, math.exp(centre), math.exp(low), math.exp(high), margin, count, spread, alpha / sharing)
 
 
-def jointly(
+def judge_jointly(
     measure: Callable[[int], Sequence[float]],
     statistics: int,
     margin: float,
@@ -134,14 +134,14 @@ def jointly(
         ValueError: when the interim analyses do not ascend, or the first is too early to decide anything.
     """
     after = tuple(interim_analyses)
-    least = fewest(alpha / statistics / len(after)) if after else 1
+    least = min_differences(alpha / statistics / len(after)) if after else 1
     if not after or list(after) != sorted(set(after)) or after[0] < least:
         raise ValueError(f"the interim analyses are {after}; allowed: ascending numbers from {least}")
     processes: list[Sequence[float]] = []
     for count in after:
         while len(processes) < count:
             processes.append(measure(len(processes)))
-        decisions = [judged(ratios, margin, alpha / len(after), statistics) for ratios in zip(*processes, strict=True)]
+        decisions = [judge(ratios, margin, alpha / len(after), statistics) for ratios in zip(*processes, strict=True)]
         verdicts = {decision.verdict for decision in decisions}
         if "fail" in verdicts or "inconclusive" not in verdicts:
             break

@@ -54,7 +54,7 @@ def upper_bound(differences: Sequence[float] | Array, alpha: float) -> float:
     return -lower_bound(-np.asarray(differences, np.float64), alpha)
 
 
-def fewest(alpha: float) -> int:
+def min_differences(alpha: float) -> int:
     """Return the smallest number of pairs that has a bound at all: 2^-n <= alpha.
 
     Raises:

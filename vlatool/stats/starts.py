@@ -14,23 +14,23 @@ from collections.abc import Hashable, Sequence
 
 from vlatool.stats.intervals import wilson
 
-FEWEST = 8
+MIN_DISTINCT_STARTS = 8
 """Distinct starts below which episodes that repeat them decide nothing."""
 Counts = tuple[int, int, int]
 """Lost, won, pairs."""
 
 
-def distinct(starts: Sequence[Hashable]) -> int:
+def distinct_starts(starts: Sequence[Hashable]) -> int:
     """Return how many starts there are."""
     return len(set(starts))
 
 
-def too_few(starts: Sequence[Hashable]) -> bool:
+def has_too_few_starts(starts: Sequence[Hashable]) -> bool:
     """Return whether episodes repeat their starts, and have too few of them to decide anything."""
-    return distinct(starts) < min(FEWEST, len(starts))
+    return distinct_starts(starts) < min(MIN_DISTINCT_STARTS, len(starts))
 
 
-def independent(starts: Sequence[Hashable]) -> int:
+def independent_starts(starts: Sequence[Hashable]) -> int:
     """Return the effective number of episodes, from 1; that of the episodes where no start is repeated.
 
     Example:
@@ -40,11 +40,11 @@ def independent(starts: Sequence[Hashable]) -> int:
     return max(1, math.floor(len(starts) ** 2 / sum(times**2 for times in Counter(starts).values())))
 
 
-def reduced(lost: int, won: int, pairs: int, size: int) -> tuple[Counts, Counts]:
+def reduce_counts(lost: int, won: int, pairs: int, size: int) -> tuple[Counts, Counts]:
     """Return the counts of ``pairs`` pairs as those of ``size``: with the least drop, and with the largest.
 
     Args:
-        lost, won, pairs: What was seen.
+        lost, won, pairs: Observed counts.
         size: Independent pairs that they are worth, at most ``pairs``.
 
     Example:
@@ -63,6 +63,6 @@ def wilson_of(wins: int, starts: Sequence[Hashable]) -> tuple[float, float]:
         wins: Episodes that succeed.
         starts: Of each episode; as many as there are episodes, from 1.
     """
-    size = independent(starts)
+    size = independent_starts(starts)
     share = wins * size / len(starts)
     return wilson(math.floor(share), size)[0], wilson(math.ceil(share), size)[1]

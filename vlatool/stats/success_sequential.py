@@ -40,7 +40,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.stats.starts import Counts, reduced
+from vlatool.stats.starts import Counts, reduce_counts
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ ALPHA = 0.025
 """Chance of a false verdict over all interim analyses, on either side: a two-sided interval of 95 %."""
 ANALYSES = 10
 """Interim analyses, evenly spaced, the last one included."""
-FUTILE = 0.1
+FUTILITY = 0.1
 """Chance of a verdict below which no more pairs are played."""
 GO_ON = "go on"
 _WINDOW = 6.0
@@ -61,14 +61,14 @@ _GRID = 801
 
 @dataclass(frozen=True)
 class Decision:
-    """What the pairs say.
+    """Decision from the pairs.
 
     Args:
         verdict: ``pass``, ``fail``, ``inconclusive`` or, while more pairs may decide, ``go on``.
         drop: Seen, a share; positive is worse than the baseline. One that ended a comparison early tends to overstate.
-        low, high: What it lies between, each bound with confidence ``1 - alpha`` over all interim analyses.
+        low, high: Bounds of the drop, each with confidence ``1 - alpha`` over all interim analyses.
         limit: The largest drop that passes, a share.
-        lost, won, pairs: What was seen.
+        lost, won, pairs: Observed counts.
         most: Pairs that would have been played without interim analyses.
     """
 
@@ -107,7 +107,7 @@ class Plan:
     limit: float
     interim_analyses: tuple[int, ...]
     alpha: float = ALPHA
-    futile: float = FUTILE
+    futile: float = FUTILITY
 
     def __post_init__(self) -> None:
         """Refuse what decides nothing.
@@ -133,19 +133,19 @@ class Plan:
     @property
     def levels(self) -> tuple[float, ...]:
         """Error of each interim analysis alone, on either side."""
-        return spent_in_turns(tuple(after / self.most for after in self.interim_analyses), self.alpha)
+        return spending_levels(tuple(after / self.most for after in self.interim_analyses), self.alpha)
 
     def verdict(self, lost: int, won: int, pairs: int, size: int | None = None) -> str:
         """Return ``pass``, ``fail``, ``inconclusive`` or ``go on``, without the interval; see ``judge``.
 
         Raises:
-            ValueError: when no interim analysis has so many pairs, or the counts are none.
+            ValueError: when no interim analysis has so many pairs, or the counts are invalid.
         """
         level = self._level(lost, won, pairs)
-        least, largest = reduced(lost, won, pairs, size or pairs)
+        least, largest = reduce_counts(lost, won, pairs, size or pairs)
         if _drop(least) > self.limit and exact_p(*least, self.limit) <= level:
             return "fail"
-        if _drop(largest) < self.limit and exact_p(*_turned(largest), -self.limit) <= level:
+        if _drop(largest) < self.limit and exact_p(*_swap(largest), -self.limit) <= level:
             return "pass"
         return "inconclusive" if pairs == self.most or self._futile(lost, won, pairs) else GO_ON
 
@@ -159,7 +159,7 @@ class Plan:
             size: Independent pairs that they are worth (``starts.independent``); all of them when None.
 
         Raises:
-            ValueError: when no interim analysis has so many pairs, or the counts are none.
+            ValueError: when no interim analysis has so many pairs, or the counts are invalid.
 
         Example:
             >>> comparison = plan(limit=0.03, most=1000)
@@ -179,11 +179,11 @@ class Plan:
         wherever the comparison ended. It agrees with the verdict: above the limit is fail, not above it is pass.
 
         Raises:
-            ValueError: when no interim analysis has so many pairs, or the counts are none.
+            ValueError: when no interim analysis has so many pairs, or the counts are invalid.
         """
         level = self._level(lost, won, pairs)
-        least, largest = reduced(lost, won, pairs, size or pairs)
-        high = -_lower_bound(*_turned(largest), level, -self.limit)
+        least, largest = reduce_counts(lost, won, pairs, size or pairs)
+        high = -_lower_bound(*_swap(largest), level, -self.limit)
         return (lost - won) / pairs, _lower_bound(*least, level, self.limit), high
 
     def _level(self, lost: int, won: int, pairs: int) -> float:
@@ -214,7 +214,7 @@ class Plan:
 
 
 def plan(
-    limit: float, most: int, alpha: float = ALPHA, tasks: int = 1, analyses: int = ANALYSES, futile: float = FUTILE
+    limit: float, most: int, alpha: float = ALPHA, tasks: int = 1, analyses: int = ANALYSES, futile: float = FUTILITY
 ) -> Plan:
     """Return a plan with evenly spaced interim analyses.
 
@@ -227,7 +227,7 @@ def plan(
         futile: Chance of a verdict below which the comparison ends as inconclusive; 0 plays all pairs.
 
     Raises:
-        ValueError: when one of them is none.
+        ValueError: when one of them is invalid.
 
     Example:
         >>> plan(limit=0.01, most=500, tasks=8, analyses=4).interim_analyses
@@ -241,7 +241,7 @@ def plan(
 
 
 @functools.lru_cache(maxsize=64)
-def spent_in_turns(times: tuple[float, ...], alpha: float) -> tuple[float, ...]:
+def spending_levels(times: tuple[float, ...], alpha: float) -> tuple[float, ...]:
     """Return the one-sided level of each interim analysis that together spend ``alpha`` in proportion to time.
 
     The density of the sum of what has not crossed a bound yet is carried from analysis to analysis (Armitage, McPherson
@@ -257,7 +257,7 @@ def spent_in_turns(times: tuple[float, ...], alpha: float) -> tuple[float, ...]:
     """
     from scipy.special import ndtr
 
-    places, mass, before = np.zeros(1), np.ones(1), 0.0  # of the sum of increments, whose variance is the time
+    grid, mass, before = np.zeros(1), np.ones(1), 0.0  # of the sum of increments, whose variance is the time
     levels = []
     for time in times:
         step = time - before
@@ -265,16 +265,16 @@ def spent_in_turns(times: tuple[float, ...], alpha: float) -> tuple[float, ...]:
         reached = low
         while high - reached > 1e-10:
             middle = (reached + high) / 2
-            if float(mass @ ndtr((places - middle) / math.sqrt(step))) > alpha * step:
+            if float(mass @ ndtr((grid - middle) / math.sqrt(step))) > alpha * step:
                 reached = middle
             else:
                 high = middle
         levels.append(float(ndtr(-high / math.sqrt(time))))
         further = np.linspace(low, high, _GRID)
-        density = np.exp(-((further[:, None] - places) ** 2) / (2 * step)) @ mass / math.sqrt(2 * math.pi * step)
+        density = np.exp(-((further[:, None] - grid) ** 2) / (2 * step)) @ mass / math.sqrt(2 * math.pi * step)
         weights = np.ones(_GRID)
         weights[1:-1:2], weights[2:-1:2] = 4, 2
-        places, mass, before = further, density * weights * (further[1] - further[0]) / 3, time
+        grid, mass, before = further, density * weights * (further[1] - further[0]) / 3, time
     return tuple(levels)
 
 
@@ -284,7 +284,7 @@ def exact_p(lost: int, won: int, pairs: int, drop: float) -> float:
     See the head of the module. That of one as small is ``exact_p(won, lost, pairs, -drop)``.
 
     Args:
-        lost, won, pairs: What was seen.
+        lost, won, pairs: Observed counts.
         drop: A share above -1 and below 1.
 
     Example:
@@ -293,7 +293,7 @@ def exact_p(lost: int, won: int, pairs: int, drop: float) -> float:
     """
     from scipy.special import bdtrc, gammaln, xlog1py, xlogy
 
-    rate = math.sqrt(2 * float(_restricted(lost, won, pairs, drop)) + drop)
+    rate = math.sqrt(2 * float(_restricted_estimate(lost, won, pairs, drop)) + drop)
     away = 0.5 / math.sqrt(pairs)  # a standard error of the root of a share
     least = max(abs(drop), 1e-9)
     rates = np.clip(np.array([max(0.0, rate - away), rate, rate + away]) ** 2, least, 1)[:, None]
@@ -304,11 +304,11 @@ def exact_p(lost: int, won: int, pairs: int, drop: float) -> float:
     ways = gammaln(pairs + 1) - gammaln(discordant + 1) - gammaln(pairs - discordant + 1)
     chances = np.exp(ways + xlogy(discordant, rates) + xlog1py(pairs - discordant, -rates))
     lose = np.clip((rates + drop) / (2 * rates), 0, 1)  # share of the discordant pairs that are lost
-    beyond = bdtrc(_fewest_lost(lost, won, pairs, drop, discordant) - 1, discordant, lose)
+    beyond = bdtrc(_min_lost(lost, won, pairs, drop, discordant) - 1, discordant, lose)
     return min(1.0, float((chances * beyond).sum(axis=1).max()))
 
 
-def _fewest_lost(lost: int, won: int, pairs: int, drop: float, discordant: NDArray[np.int64]) -> NDArray[np.int64]:
+def _min_lost(lost: int, won: int, pairs: int, drop: float, discordant: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return, for each number of discordant pairs, how many must be lost for a score as large as the one seen.
 
     One more than there are, where it is never as large. The score grows with each pair that is lost instead of won.
@@ -324,11 +324,11 @@ def _fewest_lost(lost: int, won: int, pairs: int, drop: float, discordant: NDArr
 
 def _score(lost: int | NDArray[np.int64], won: int | NDArray[np.int64], pairs: int, drop: float) -> Array:
     """Return Tango's score statistic (1998): the drop seen less ``drop``, by its standard error if that were true."""
-    variance = pairs * (2 * _restricted(lost, won, pairs, drop) + drop * (1 - drop))
+    variance = pairs * (2 * _restricted_estimate(lost, won, pairs, drop) + drop * (1 - drop))
     return np.asarray((lost - won - pairs * drop) / np.sqrt(np.maximum(variance, 1e-12)))
 
 
-def _restricted(lost: int | NDArray[np.int64], won: int | NDArray[np.int64], pairs: int, drop: float) -> Array:
+def _restricted_estimate(lost: int | NDArray[np.int64], won: int | NDArray[np.int64], pairs: int, drop: float) -> Array:
     """Return the maximum likelihood estimate of the chance to win when the true drop is ``drop`` (Tango 1998)."""
     linear = (2 * pairs - lost + won) * drop - (lost + won)
     root = np.sqrt(np.maximum(linear * linear + 8 * pairs * won * drop * (1 - drop), 0.0))
@@ -364,7 +364,7 @@ def _drop(counts: Counts) -> float:
     return (lost - won) / pairs
 
 
-def _turned(counts: Counts) -> Counts:
+def _swap(counts: Counts) -> Counts:
     lost, won, pairs = counts
     return won, lost, pairs
 
@@ -379,7 +379,7 @@ def exact_drop(
 
     Args:
         lost, won, pairs: Counts; pairs from 1.
-        confidence: Of the interval.
+        confidence: Confidence of the interval.
         size: Independent pairs that they are worth (``starts.independent``); all of them when None.
 
     Example:

@@ -5,7 +5,7 @@ One file for each source. ``open_all`` gives the readers of this machine and wha
 
 from vlatool.telemetry._open import open_all
 from vlatool.telemetry._reading import DEGREE, THROTTLE, Absent, Reader, Reading, Run
-from vlatool.telemetry._summary import Counted, Energy, Gauge, Recorded, Series, collect, summarise
+from vlatool.telemetry._summary import Change, Energy, Gauge, Series, Summary, collect, summarise
 from vlatool.telemetry._total import Total, totals
 from vlatool.telemetry.recorder import Recorder
 
@@ -13,15 +13,15 @@ __all__ = [
     "DEGREE",
     "THROTTLE",
     "Absent",
-    "Counted",
+    "Change",
     "Energy",
     "Gauge",
     "Reader",
     "Reading",
-    "Recorded",
     "Recorder",
     "Run",
     "Series",
+    "Summary",
     "Total",
     "collect",
     "open_all",

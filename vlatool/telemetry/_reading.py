@@ -1,4 +1,4 @@
-"""What a reader gives: readings with units, or the reason why there are none.
+"""Readings with units, or the reason why there are none; base classes of readers.
 
 A reading that cannot be taken is left out; it is never 0 and never NaN.
 """
@@ -30,9 +30,9 @@ SECOND = "s"
 SHARE = "share"
 COUNT = "count"
 THROTTLE = "throttle"
-"""Of a counter: throttle events. Of a gauge: 1 while the machine is throttled for this reason, else 0."""
-COLDEST = -200.0
-"""Below this in degC a thermal zone is powered off: Jetsons show -256."""
+"""Unit of throttling. Counter: throttle events. Gauge: 1 while the machine is throttled for this reason, else 0."""
+MIN_TEMPERATURE = -200.0
+"""Temperature in degC below which a thermal zone is powered off: Jetsons show -256."""
 COMMAND_TIMEOUT_S = 2.0
 
 
@@ -44,9 +44,9 @@ class Reading:
         name: Reader and thing, ``ina.VDD_IN``.
         value: A finite number in ``unit``.
         unit: ``W``, ``J``, ``degC``, ``MHz``, ``MB`` (10^6 bytes), ``s``, ``share`` (0 to 1), ``count``, ``throttle``.
-        kind: ``gauge``: the value means something. ``counter``: only differences mean something.
-        wraps: The value at which a counter starts again from zero; None when it does not.
-        note: What the number is, in words, where the name does not say it.
+        kind: ``gauge``: the value is meaningful. ``counter``: only differences are meaningful.
+        wraps: Value at which a counter restarts from zero; None when it does not.
+        note: Description of the value, where the name does not suffice.
 
     Raises:
         ValueError: when the value is not finite.
@@ -66,11 +66,11 @@ class Reading:
 
 @dataclass(frozen=True)
 class Absent:
-    """What is unmeasured, and why.
+    """An unmeasured source or reading.
 
     Args:
         reader: Name of the reader, or of the reading.
-        reason: Why it cannot be read and what to do about it, in words.
+        reason: Why it cannot be read and what to do about it.
     """
 
     reader: str
@@ -82,40 +82,40 @@ class Reader(ABC):
 
     name: ClassVar[str]
     period_s: ClassVar[float] = 0.0
-    """Seconds between two reads at the least: a reader that starts a process would disturb what is measured."""
+    """Least seconds between two reads: a reader that starts a process would disturb the measurement."""
     fallback_for: ClassVar[str] = ""
-    """The reader that this one stands in for; it is opened only when that one is absent."""
+    """Name of the reader that this one replaces when it is absent."""
 
     @classmethod
     @abstractmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> Reader | Absent:
         """Return a reader of the machine whose file system is below ``root``, or why there is none.
 
-        ``run`` is what runs commands. Without it commands run on this machine, and not at all for another root.
+        ``run`` runs commands. By default commands run on this machine, and not at all for another root.
         """
 
     @abstractmethod
     def read(self) -> list[Reading]:
-        """Return what can be read now; less than before when something fails. Never raises."""
+        """Return the readings that are available now, fewer when something fails. Never raises."""
 
     def absent(self) -> list[Absent]:
-        """Return the parts that this source could have and has not."""
+        """Return missing parts of this source."""
         return []
 
     def or_absent(self: R, reason: str) -> R | Absent:
-        """Return this reader, or why it is absent where it reads nothing."""
+        """Return this reader, or an ``Absent`` with the reason when it reads nothing."""
         return self if self.read() else Absent(self.name, reason)
 
 
 @dataclass(frozen=True)
 class NumberFile:
-    """A file that holds one whole number.
+    """A file that holds one integer.
 
     Args:
-        name, unit, kind, wraps, note: Of the reading.
-        path: Relative to the root of the file system.
-        factor: From the number to the unit.
-        least: The smallest value that means something.
+        name, unit, kind, wraps, note: Fields of the reading.
+        path: Path relative to the root of the file system.
+        factor: Factor from the number to the unit.
+        minimum: Smallest meaningful value.
     """
 
     name: str
@@ -125,7 +125,7 @@ class NumberFile:
     kind: Kind = "gauge"
     wraps: float | None = None
     note: str = ""
-    least: float = -math.inf
+    minimum: float = -math.inf
 
 
 class FileReader(Reader):
@@ -137,11 +137,11 @@ class FileReader(Reader):
 
     def read(self) -> list[Reading]:
         """Return a reading of every file that can be read now."""
-        values = [(file, scaled(self._root, file.path, file.factor)) for file in self._files]
+        values = [(file, number(self._root, file.path, file.factor)) for file in self._files]
         return [
             Reading(file.name, value, file.unit, file.kind, file.wraps, file.note)
             for file, value in values
-            if value is not None and value >= file.least
+            if value is not None and value >= file.minimum
         ]
 
 
@@ -153,23 +153,23 @@ class CommandReader(Reader):
 
 
 def gauge(name: str, value: float | None, unit: str, note: str = "") -> list[Reading]:
-    """Return one gauge; nothing when there is no finite value."""
-    return _known(name, value, unit, "gauge", None, note)
+    """Return one gauge; an empty list without a finite value."""
+    return _finite(name, value, unit, "gauge", None, note)
 
 
 def counter(name: str, value: float | None, unit: str, wraps: float | None = None, note: str = "") -> list[Reading]:
-    """Return one counter; nothing when there is no finite value."""
-    return _known(name, value, unit, "counter", wraps, note)
+    """Return one counter; an empty list without a finite value."""
+    return _finite(name, value, unit, "counter", wraps, note)
 
 
-def _known(name: str, value: float | None, unit: str, kind: Kind, wraps: float | None, note: str) -> list[Reading]:
+def _finite(name: str, value: float | None, unit: str, kind: Kind, wraps: float | None, note: str) -> list[Reading]:
     if value is None or not math.isfinite(value):
         return []
     return [Reading(name, value, unit, kind, wraps, note)]
 
 
-def scaled(root: Path, path: str, factor: float) -> float | None:
-    """Return a file that holds one whole number, times ``factor``; None when there is none."""
+def number(root: Path, path: str, factor: float) -> float | None:
+    """Return the integer in a file, times ``factor``; None when there is none."""
     try:
         number = read_number(root, path)
         return None if number is None else number * factor
@@ -177,7 +177,7 @@ def scaled(root: Path, path: str, factor: float) -> float | None:
         return None
 
 
-def listed(root: Path, folder: str, pattern: str) -> list[str]:
+def find(root: Path, folder: str, pattern: str) -> list[str]:
     """Return the entries of a folder that match, relative to ``root``; ``hwmon2`` comes before ``hwmon10``."""
     try:
         paths = [path.relative_to(root).as_posix() for path in (root / folder).glob(pattern)]
@@ -187,7 +187,7 @@ def listed(root: Path, folder: str, pattern: str) -> list[str]:
 
 
 def run_command(command: Sequence[str]) -> str | None:
-    """Run a command on this machine for at most two seconds and return what it printed; None when it fails."""
+    """Run a command on this machine for at most two seconds and return its output; None when it fails."""
     try:
         done = subprocess.run(
             list(command), stdin=subprocess.DEVNULL, capture_output=True, timeout=COMMAND_TIMEOUT_S, check=False
@@ -198,7 +198,7 @@ def run_command(command: Sequence[str]) -> str | None:
 
 
 def runner(root: Path, run: Run | None) -> Run:
-    """Return what runs commands for ``root``: ``run`` when given, this machine for its own root, else nothing."""
+    """Return the function that runs commands for ``root``: ``run``, or this machine for its own root, or none."""
     if run is not None:
         return run
     return run_command if root == ROOT else lambda command: None

@@ -1,4 +1,4 @@
-"""From samples to a summary: gauges, differences of counters, energy, throttling; pure functions."""
+"""Summary of samples: gauges, differences of counters, energy, throttling; pure functions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vlatool.telemetry._total import Total, totals
 
 NO_POWER = (
     "no reading is known to be the power of the board, so energy is unmeasured; "
-    "see what the power readers say, or measure at the supply"
+    "check the power readers, or measure at the supply"
 )
 
 
@@ -59,8 +59,8 @@ class Gauge:
 
 
 @dataclass(frozen=True)
-class Counted:
-    """How far a counter moved, in ``unit``, during ``seconds``."""
+class Change:
+    """Change of a counter, in ``unit``, during ``seconds``."""
 
     unit: str
     difference: float
@@ -76,10 +76,10 @@ class Energy:
         joules: Energy from the first to the last sample.
         mean_w: The same over ``seconds``.
         seconds: Time between the first and the last sample.
-        label: What it is the energy of, and what that leaves out.
+        label: Description of the consumer, with exclusions.
         source: ``counter`` or ``power samples`` (trapezoid rule).
-        names: The readings that were added.
-        samples: How many samples each of them gave.
+        names: Names of the added readings.
+        samples: Number of samples of each reading.
     """
 
     joules: float
@@ -92,17 +92,17 @@ class Energy:
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """What was measured during a run, and what was not.
+class Summary:
+    """Telemetry of a run.
 
     Args:
         seconds: Time between the first and the last sample.
-        energy: Of the board or its processor, then of the graphics cards, where measured; they are not added, and the
-            label says which one it is. Empty when unmeasured.
-        throttled: Whether a throttle counter moved or a throttle bit was set; None when nothing tells.
-        throttling: What throttled, in words.
+        energy: Energy of the board or its processor, then of the graphics cards, where measured; they are not added,
+            and have labels. Empty when unmeasured.
+        throttled: Whether a throttle counter moved or a throttle bit was set; None when unknown.
+        throttling: Descriptions of what throttled.
         gauges: Name -> gauge.
-        counters: Name -> how far it moved.
+        counters: Name -> change.
         unmeasured: What could not be measured, and why.
     """
 
@@ -111,7 +111,7 @@ class Recorded:
     throttled: bool | None
     throttling: tuple[str, ...]
     gauges: Mapping[str, Gauge]
-    counters: Mapping[str, Counted]
+    counters: Mapping[str, Change]
     unmeasured: tuple[Absent, ...]
 
 
@@ -123,12 +123,12 @@ def collect(samples: Iterable[tuple[float, Reading]]) -> dict[str, Series]:
     return series
 
 
-def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> Recorded:
+def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> Summary:
     """Return the summary of a run.
 
     Args:
         samples: The series by name, as from ``collect``.
-        absent: What could not be read, to be handed on.
+        absent: What could not be read, to be included.
 
     Example:
         >>> watts = [Reading("ina.VDD_IN", value, "W", "gauge") for value in (5.0, 7.0)]
@@ -138,20 +138,20 @@ def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> R
     """
     missing = list(absent)
     gauges = {name: _gauge(series) for name, series in samples.items() if series.first.kind == "gauge"}
-    counters: dict[str, Counted] = {}
+    counters: dict[str, Change] = {}
     for name, series in samples.items():
         if series.first.kind == "counter":
             moved = _difference(series)
             if isinstance(moved, str):
                 missing.append(Absent(name, moved))
             else:
-                counters[name] = Counted(series.first.unit, moved, series.times[-1] - series.times[0], series.note)
+                counters[name] = Change(series.first.unit, moved, series.times[-1] - series.times[0], series.note)
     energies = [_energy(total, samples) for total in totals(series.first for series in samples.values())]
     missing += [energy for energy in energies if isinstance(energy, Absent)]
     missing += [] if energies else [Absent("energy", NO_POWER)]
-    throttled, throttling = _throttled(gauges, counters)
+    throttled, throttling = _throttling(gauges, counters)
     times = [time_s for series in samples.values() for time_s in (series.times[0], series.times[-1])]
-    return Recorded(
+    return Summary(
         seconds=max(times) - min(times) if times else 0.0,
         energy=tuple(energy for energy in energies if isinstance(energy, Energy)),
         throttled=throttled,
@@ -163,9 +163,9 @@ def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> R
 
 
 def difference(values: Sequence[float], wraps: float | None) -> float | None:
-    """Add up how far a counter moved from sample to sample.
+    """Add up the changes of a counter from sample to sample.
 
-    A step back is one wrap-around when the counter has one. Several wrap-arounds between two samples cannot be seen:
+    A decrease is one wrap-around when the counter has one. Several wrap-arounds between two samples are undetectable:
     the difference is then too small by a multiple of ``wraps``, so sample more often than the counter wraps.
 
     Returns:
@@ -188,7 +188,7 @@ def difference(values: Sequence[float], wraps: float | None) -> float | None:
 
 def _difference(series: Series) -> float | str:
     if len(series.values) < 2:
-        return "read once only, and of a counter only differences mean something"
+        return "read only once, and only differences of a counter are meaningful"
     moved = difference(series.values, series.first.wraps)
     return "the counter went back during the run (its driver was loaded again)" if moved is None else moved
 
@@ -201,7 +201,7 @@ def _gauge(series: Series) -> Gauge:
 
 
 def _energy(total: Total, samples: Mapping[str, Series]) -> Energy | Absent:
-    """Integrate over the moments at which all parts of the total were read."""
+    """Integrate over the times at which all parts of the total were read."""
     parts = [dict(zip(samples[name].times, samples[name].values, strict=True)) for name in total.names]
     times = sorted(set.intersection(*(set(part) for part in parts)))
     if len(times) < 2:
@@ -227,7 +227,7 @@ def _trapezoid(times: Sequence[float], watts: Sequence[float]) -> float:
     return sum((after - before) * (first + second) / 2 for (before, after), (first, second) in steps)
 
 
-def _throttled(gauges: Mapping[str, Gauge], counters: Mapping[str, Counted]) -> tuple[bool | None, tuple[str, ...]]:
+def _throttling(gauges: Mapping[str, Gauge], counters: Mapping[str, Change]) -> tuple[bool | None, tuple[str, ...]]:
     flags = [(flag.note or name, flag.max) for name, flag in gauges.items() if flag.unit == THROTTLE]
     events = [(event.note or name, event.difference) for name, event in counters.items() if event.unit == THROTTLE]
     if not flags and not events:

@@ -1,4 +1,4 @@
-"""Which readings are the power of the board, and what that number leaves out.
+"""Readings that add up to the power of the board, and what the sum excludes.
 
 Rails overlap: the input rail of a Jetson holds all others, so they are never added to it (jetson_stats #51).
 """
@@ -30,9 +30,9 @@ class Total:
     """Readings that add up to the power of something.
 
     Args:
-        names: The readings to add.
+        names: Readings to add.
         unit: ``J`` for energy counters, ``W`` for power.
-        label: What the sum is, and what it leaves out.
+        label: Description of the sum, with exclusions.
     """
 
     names: tuple[str, ...]
@@ -41,9 +41,9 @@ class Total:
 
 
 def totals(readings: Iterable[Reading]) -> list[Total]:
-    """Pick what can be added: the board or its processor first, then the graphics cards, which are never added to it.
+    """Return the totals: the board or its processor first, then the graphics cards, which are never added to it.
 
-    ``readings`` are all that were seen, one of each name. Empty when no reading is known to be a whole.
+    ``readings`` are all readings, one for each name. Empty when no reading is known to be a total.
     """
     units = {reading.name: reading.unit for reading in readings if reading.unit in (WATT, JOULE)}
     board = [total for total in (_jetson(units), _pmic(units), _package(units)) if total is not None]

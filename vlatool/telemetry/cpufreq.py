@@ -1,4 +1,4 @@
-"""Clocks of the processor, and how often an x86 processor throttled because it was hot.
+"""Clocks of the processor, and thermal throttle events of x86 processors.
 
 Sources: ``Documentation/admin-guide/pm/cpufreq.rst`` (``scaling_cur_freq`` in kHz) and
 ``Documentation/admin-guide/thermal/intel_thermal_throttle.rst`` of Linux (``thermal_throttle/*_throttle_count``).
@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT
-from vlatool.telemetry._reading import MEGAHERTZ, THROTTLE, Absent, Reader, Reading, Run, counter, gauge, listed, scaled
+from vlatool.telemetry._reading import MEGAHERTZ, THROTTLE, Absent, Reader, Reading, Run, counter, find, gauge, number
 
 CPUS = "sys/devices/system/cpu"
 COUNT = re.compile(r"/(core|package)_throttle_count$")
@@ -23,24 +23,23 @@ NO_COUNTS = (
 class CpufreqReader(Reader):
     """Clock of every policy in MHz, as ``cpufreq.policyN``, and throttle events of the cores and of the package.
 
-    On a Jetson ``scaling_cur_freq`` may show the clock that was asked for while the firmware holds a lower one. The
-    events are added up over the logical processors; siblings count the same event, so only whether the sum moved is
-    exact.
+    On a Jetson ``scaling_cur_freq`` may show the requested clock while the firmware enforces a lower one. The events
+    are added up over the logical processors; siblings count the same event, so only whether the sum moved is exact.
     """
 
     name = "cpufreq"
 
     def __init__(self, root: Path, policies: list[str], counts: list[str]) -> None:
         self._root = root
-        self._policies = {f"cpufreq.{place.rpartition('/')[2]}": f"{place}/scaling_cur_freq" for place in policies}
+        self._policies = {f"cpufreq.{folder.rpartition('/')[2]}": f"{folder}/scaling_cur_freq" for folder in policies}
         self._counts = {path: part[1] for path in counts if (part := COUNT.search(path))}
         self._last: dict[str, float] = {}
 
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> CpufreqReader | Absent:
         """Find policies and counters; absent where there are neither."""
-        policies = listed(root, f"{CPUS}/cpufreq", "policy*")
-        counts = listed(root, CPUS, "cpu[0-9]*/thermal_throttle/*_throttle_count")
+        policies = find(root, f"{CPUS}/cpufreq", "policy*")
+        counts = find(root, CPUS, "cpu[0-9]*/thermal_throttle/*_throttle_count")
         return cls(root, policies, counts).or_absent(
             "neither clocks nor throttle counters are visible (virtual machine or container)"
         )
@@ -49,9 +48,9 @@ class CpufreqReader(Reader):
         """Return clocks in MHz and the sums of the throttle counters."""
         readings: list[Reading] = []
         for name, path in self._policies.items():
-            readings += gauge(name, scaled(self._root, path, 1e-3), MEGAHERTZ)
+            readings += gauge(name, number(self._root, path, 1e-3), MEGAHERTZ)
         for path in self._counts:
-            if (value := scaled(self._root, path, 1.0)) is not None:
+            if (value := number(self._root, path, 1.0)) is not None:
                 self._last[path] = value
         for part in ("core", "package"):
             known = [value for path, value in self._last.items() if self._counts[path] == part]

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT
-from vlatool.telemetry._reading import MEGAHERTZ, SHARE, Absent, FileReader, NumberFile, Run, listed
+from vlatool.telemetry._reading import MEGAHERTZ, SHARE, Absent, FileReader, NumberFile, Run, find
 
 GPU = re.compile(r"\.(gpu|ga10b|gp10b|gv11b)$|^gpu-gpc-\d+$")
 """``17000000.gpu`` and the like; ``gpu-gpc-0`` on an AGX Thor."""
@@ -19,7 +19,7 @@ GPU = re.compile(r"\.(gpu|ga10b|gp10b|gv11b)$|^gpu-gpc-\d+$")
 class DevfreqReader(FileReader):
     """Load (share) and clock (MHz) of the GPU, as ``devfreq.gpu.load`` and ``devfreq.gpu.clock``.
 
-    A GPU that is powered off gives none.
+    A GPU that is powered off has none.
     """
 
     name = "devfreq"
@@ -27,9 +27,9 @@ class DevfreqReader(FileReader):
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> DevfreqReader | Absent:
         """Find the GPUs; absent where no device of that name can be read."""
-        places = [place for place in listed(root, "sys/class/devfreq", "*") if GPU.search(place.rpartition("/")[2])]
+        folders = [folder for folder in find(root, "sys/class/devfreq", "*") if GPU.search(folder.rpartition("/")[2])]
         files = []
-        for index, place in enumerate(places):
-            files.append(NumberFile(f"devfreq.gpu{index or ''}.load", f"{place}/device/load", 1e-3, SHARE))
-            files.append(NumberFile(f"devfreq.gpu{index or ''}.clock", f"{place}/cur_freq", 1e-6, MEGAHERTZ))
-        return cls(root, files).or_absent("no GPU has a frequency policy in /sys/class/devfreq: this is no Jetson")
+        for index, folder in enumerate(folders):
+            files.append(NumberFile(f"devfreq.gpu{index or ''}.load", f"{folder}/device/load", 1e-3, SHARE))
+            files.append(NumberFile(f"devfreq.gpu{index or ''}.clock", f"{folder}/cur_freq", 1e-6, MEGAHERTZ))
+        return cls(root, files).or_absent("no GPU has a frequency policy in /sys/class/devfreq: this is not a Jetson")

@@ -13,28 +13,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vlatool.machine.host import ROOT, read_text
-from vlatool.telemetry._reading import WATT, Absent, Reader, Reading, Run, gauge, listed, scaled
+from vlatool.telemetry._reading import WATT, Absent, Reader, Reading, Run, find, gauge, number
 
 HWMON = (
     ("sys/class/hwmon", "hwmon*"),
     ("sys/bus/i2c/drivers", "ina3221*/*/hwmon/hwmon*"),
     ("sys/bus/i2c/drivers", "ina238*/*/hwmon/hwmon*"),
 )
-"""The first place that has monitors is read: the others show the same chips again."""
+"""Folders of monitors; the first one with monitors is read, since the others show the same chips again."""
 IIO = ("sys/bus/i2c/drivers", "ina3221*/*/iio:device*")
 """JetPack 4: ``rail_name_N`` and ``in_powerN_input`` in mW."""
 CHANNELS = (1, 2, 3)
 NO_RAIL = "NC"
 """The label of a channel that is not connected."""
 REASON = (
-    "no INA3221 or INA238 power monitor is visible: this is no Jetson, or a container hides it "
+    "no INA3221 or INA238 power monitor is visible: this is not a Jetson, or a container hides it "
     "(mount /sys read-only); otherwise measure at the supply"
 )
 
 
 @dataclass(frozen=True)
 class _Rail:
-    """The files of one rail: volts and current (mV, mA), or power with its scale to watts."""
+    """Files of one rail: volts and current (mV, mA), or power with its scale to watts."""
 
     label: str
     power: str
@@ -42,10 +42,10 @@ class _Rail:
     current: str = ""
 
     def watts(self, root: Path) -> float | None:
-        power = scaled(root, self.power, self.scale)
+        power = number(root, self.power, self.scale)
         if not self.current or power is None:
             return power
-        amperes = scaled(root, self.current, 1e-3)
+        amperes = number(root, self.current, 1e-3)
         return None if amperes is None else power * amperes
 
 
@@ -65,60 +65,58 @@ class InaReader(Reader):
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> InaReader | Absent:
         """Find the rails; absent where there is no monitor or none of its rails can be read."""
-        rails = _numbered(_hwmon(root) or list(_iio(root)))
+        rails = _with_indexes(_hwmon(root) or list(_iio(root)))
         if not rails:
             return Absent(cls.name, REASON)
-        return cls(root, rails).or_absent(
-            "there are power monitors, but none of their rails can be read; look at dmesg"
-        )
+        return cls(root, rails).or_absent("there are power monitors, but none of their rails can be read; check dmesg")
 
     def read(self) -> list[Reading]:
         """Return the power of the rails in watts."""
         return [reading for rail in self._rails for reading in gauge(f"ina.{rail.label}", rail.watts(self._root), WATT)]
 
 
-def _numbered(rails: list[_Rail]) -> list[_Rail]:
+def _with_indexes(rails: list[_Rail]) -> list[_Rail]:
     """Give the second rail of the same label the index 1, and so on."""
-    seen: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     numbered = []
     for rail in rails:
-        index = seen[rail.label]
-        seen[rail.label] += 1
+        index = counts[rail.label]
+        counts[rail.label] += 1
         numbered.append(replace(rail, label=f"{rail.label}-{index}") if index else rail)
     return numbered
 
 
 def _hwmon(root: Path) -> list[_Rail]:
     for folder, pattern in HWMON:
-        rails = [rail for place in listed(root, folder, pattern) for rail in _chip(root, place)]
+        rails = [rail for folder in find(root, folder, pattern) for rail in _chip(root, folder)]
         if rails:
             return rails
     return []
 
 
-def _chip(root: Path, place: str) -> Iterator[_Rail]:
-    chip = read_text(root, f"{place}/name")
+def _chip(root: Path, folder: str) -> Iterator[_Rail]:
+    chip = read_text(root, f"{folder}/name")
     if chip == "ina3221":
         for channel in CHANNELS:
-            label = read_text(root, f"{place}/in{channel}_label")
+            label = read_text(root, f"{folder}/in{channel}_label")
             if label and label != NO_RAIL:
-                yield _Rail(label, f"{place}/in{channel}_input", 1e-3, f"{place}/curr{channel}_input")
-    elif chip == "ina238" and (root / place / "power1_input").exists():
-        yield _Rail(_label_of_ina238(root, place), f"{place}/power1_input", 1e-6)
+                yield _Rail(label, f"{folder}/in{channel}_input", 1e-3, f"{folder}/curr{channel}_input")
+    elif chip == "ina238" and (root / folder / "power1_input").exists():
+        yield _Rail(_label_of_ina238(root, folder), f"{folder}/power1_input", 1e-6)
 
 
-def _label_of_ina238(root: Path, place: str) -> str:
-    """Take the label of the chip; the one of an AGX Thor without a label is the input rail (jetson_stats #900)."""
+def _label_of_ina238(root: Path, folder: str) -> str:
+    """Return the label of the chip; one without a label on an AGX Thor is the input rail (jetson_stats #900)."""
     for name in ("in1_label", "power1_label", "label"):
-        if label := read_text(root, f"{place}/{name}"):
+        if label := read_text(root, f"{folder}/{name}"):
             return label
     return "VIN" if "thor" in (read_text(root, "proc/device-tree/model") or "").lower() else "INA238"
 
 
 def _iio(root: Path) -> Iterator[_Rail]:
-    for place in listed(root, *IIO):
-        for path in listed(root, place, "rail_name_*"):
+    for folder in find(root, *IIO):
+        for path in find(root, folder, "rail_name_*"):
             label = read_text(root, path)
             channel = re.search(r"rail_name_(\d+)$", path)
             if channel and label and label != NO_RAIL:
-                yield _Rail(label, f"{place}/in_power{channel[1]}_input", 1e-3)
+                yield _Rail(label, f"{folder}/in_power{channel[1]}_input", 1e-3)

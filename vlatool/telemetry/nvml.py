@@ -41,7 +41,7 @@ class NvmlReader(Reader):
 
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> NvmlReader | Absent:
-        """Open the library; absent without it, without a card, or where the cards tell nothing."""
+        """Open the library; absent without it, without a card, or where the cards support nothing."""
         if root != ROOT:
             return Absent(cls.name, "NVML reads this machine, not a copied tree")
         try:
@@ -54,11 +54,11 @@ class NvmlReader(Reader):
         except library.NVMLError as error:
             return Absent(cls.name, f"NVML cannot be opened ({error}): there is no NVIDIA card or driver")
         return cls(library, cards).or_absent(
-            "NVML tells nothing here, as on most Jetsons; their INA monitors are read instead"
+            "NVML supports nothing here, as on most Jetsons; their INA monitors are read instead"
         )
 
     def read(self) -> list[Reading]:
-        """Return what the cards tell; what one does not support is left out."""
+        """Return the readings of the cards, without unsupported ones."""
         return [reading for index, card in enumerate(self._cards) for reading in self._card(f"nvml.gpu{index}", card)]
 
     def _card(self, name: str, card: Any) -> list[Reading]:

@@ -1,4 +1,4 @@
-"""Power mode of a Jetson, as ``nvpmodel -q`` says it: a line with the name, then a line with the number.
+"""Power mode of a Jetson from ``nvpmodel -q``: a line with the name, then a line with the number.
 
 Source: the power pages of the Jetson Linux developer guide, and recorded output of JetPack 5 and 6.
 """
@@ -24,9 +24,9 @@ class NvpmodelReader(CommandReader):
 
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> NvpmodelReader | Absent:
-        """Ask for the mode; absent where there is no answer."""
+        """Ask for the mode; absent without an answer."""
         return cls(runner(root, run)).or_absent(
-            "nvpmodel -q gives no mode: this is no Jetson, or the command needs sudo here"
+            "nvpmodel -q prints no mode: this is not a Jetson, or the command needs sudo here"
         )
 
     def read(self) -> list[Reading]:

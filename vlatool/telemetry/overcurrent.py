@@ -1,4 +1,4 @@
-"""How often a Jetson throttled because a rail took too much current or the supply sagged.
+"""Throttle events of a Jetson because a rail drew too much current or the supply sagged.
 
 Source: the electrical management page of the Jetson Linux developer guide (``oc1_event_cnt`` to ``oc3_event_cnt`` of
 a hardware monitor; which limit each one guards differs by module).
@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT
-from vlatool.telemetry._reading import THROTTLE, Absent, FileReader, NumberFile, Run, listed
+from vlatool.telemetry._reading import THROTTLE, Absent, FileReader, NumberFile, Run, find
 
 COUNT = re.compile(r"/(oc\d+)_event_cnt$")
 
@@ -25,7 +25,7 @@ class OvercurrentReader(FileReader):
         """Find the counters; absent where there are none, which is everywhere but on a Jetson."""
         paths = {
             match[1]: path
-            for path in listed(root, "sys/class/hwmon", "hwmon*/oc*_event_cnt")
+            for path in find(root, "sys/class/hwmon", "hwmon*/oc*_event_cnt")
             if (match := COUNT.search(path))
         }
         files = [
@@ -34,4 +34,4 @@ class OvercurrentReader(FileReader):
             )
             for alarm, path in paths.items()
         ]
-        return cls(root, files).or_absent("no over-current counters: this is no Jetson with JetPack 5 or later")
+        return cls(root, files).or_absent("no over-current counters: this is not a Jetson with JetPack 5 or later")

@@ -1,4 +1,4 @@
-"""What this process takes, and what the host of a virtual machine takes away.
+"""Resources of this process, and CPU time stolen by the host of a virtual machine.
 
 Source: ``Documentation/filesystems/proc.rst`` of Linux. Where there is no ``/proc``, psutil is asked if installed.
 """
@@ -13,7 +13,7 @@ from typing import Any
 
 from vlatool.machine.host import ROOT, read_text
 from vlatool.telemetry import _reading
-from vlatool.telemetry._reading import Absent, Reader, Reading, Run, counter, gauge, listed
+from vlatool.telemetry._reading import Absent, Reader, Reading, Run, counter, find, gauge
 
 TICKS = 100.0
 """Clock ticks in a second: USER_HZ is 100 on x86 and ARM (``include/asm-generic/param.h`` of Linux)."""
@@ -32,15 +32,15 @@ class ProcessReader(Reader):
 
     Args:
         root: The root of the file system.
-        process: An object of psutil in the place of ``/proc``.
-        number: Another process that is read in the place of this one; 0 for this one.
+        process: An object of psutil instead of ``/proc``.
+        number: ID of another process to read; 0 for this one.
     """
 
     name = "process"
 
     def __init__(self, root: Path, process: Any = None, number: int = 0) -> None:
         self._root = root
-        self._place = f"proc/{number or 'self'}"
+        self._folder = f"proc/{number or 'self'}"
         self._process = process
         self._switches: dict[str, int] = {}
 
@@ -51,18 +51,18 @@ class ProcessReader(Reader):
         if not reader.read() and root == ROOT:
             with contextlib.suppress(ImportError):
                 reader = cls(root, importlib.import_module("psutil").Process(number or None))
-        return reader.or_absent("there is no /proc; elsewhere than on Linux: pip install psutil")
+        return reader.or_absent("/proc is missing; on systems other than Linux: pip install psutil")
 
     def read(self) -> list[Reading]:
         """Return the counters of this process and the machine's steal time."""
         return self._psutil() if self._process is not None else [*self._proc(), *self._steal()]
 
     def _proc(self) -> list[Reading]:
-        times = STAT.search(read_text(self._root, f"{self._place}/stat") or "")
+        times = STAT.search(read_text(self._root, f"{self._folder}/stat") or "")
         readings = _times((int(times[1]) + int(times[2])) / TICKS if times else None)
-        resident = RESIDENT.search(read_text(self._root, f"{self._place}/status") or "")
+        resident = RESIDENT.search(read_text(self._root, f"{self._folder}/status") or "")
         readings += gauge("process.memory", int(resident[1]) * 1024 / 1e6 if resident else None, _reading.MEGABYTE)
-        for path in listed(self._root, f"{self._place}/task", "*/status"):
+        for path in find(self._root, f"{self._folder}/task", "*/status"):
             if switches := SWITCHES.search(read_text(self._root, path) or ""):
                 self._switches[path] = int(switches[1])
         return readings + _switches(sum(self._switches.values()) if self._switches else None)

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT, read_text
-from vlatool.telemetry._reading import JOULE, Absent, FileReader, NumberFile, Run, listed, scaled
+from vlatool.telemetry._reading import JOULE, Absent, FileReader, NumberFile, Run, find, number
 
 ZONE = re.compile(r"intel-rapl:\d+$")
 """A zone at the top. Its children (core, uncore, dram) are inside of it and never added."""
@@ -19,13 +19,13 @@ UDEV_RULE = (
     'SUBSYSTEM=="powercap", KERNEL=="intel-rapl*", RUN+="/usr/bin/chgrp GROUP /sys/%p/energy_uj", '
     'RUN+="/usr/bin/chmod g+r /sys/%p/energy_uj"'
 )
-"""Lets a group read the counters; without the second part the group may not, because the mode is 0400."""
+"""Rule that lets a group read the counters; the second part is needed because the mode is 0400."""
 
 
 class RaplReader(FileReader):
     """Energy of every processor package in joules, as ``rapl.package-0``.
 
-    The zone ``psys`` is left out: it holds the package again, and how much of the board it covers differs by vendor.
+    The zone ``psys`` is excluded: it includes the package, and how much of the board it covers differs by vendor.
     """
 
     name = "rapl"
@@ -34,11 +34,11 @@ class RaplReader(FileReader):
     def open(cls, root: Path = ROOT, run: Run | None = None) -> RaplReader | Absent:
         """Find the packages; absent where there is none, or where the counter of one cannot be read."""
         files: dict[str, NumberFile] = {}
-        for place in listed(root, "sys/class/powercap", "intel-rapl:*"):
-            label = read_text(root, f"{place}/name") or ""
-            if ZONE.search(place) and label.startswith("package"):
-                wraps = scaled(root, f"{place}/max_energy_range_uj", 1e-6)
-                files[label] = NumberFile(f"rapl.{label}", f"{place}/energy_uj", 1e-6, JOULE, "counter", wraps, LABEL)
+        for folder in find(root, "sys/class/powercap", "intel-rapl:*"):
+            label = read_text(root, f"{folder}/name") or ""
+            if ZONE.search(folder) and label.startswith("package"):
+                wraps = number(root, f"{folder}/max_energy_range_uj", 1e-6)
+                files[label] = NumberFile(f"rapl.{label}", f"{folder}/energy_uj", 1e-6, JOULE, "counter", wraps, LABEL)
         if not files:
             return Absent(cls.name, "no RAPL package is visible (virtual machine or ARM); measure at the wall")
         reader = cls(root, files.values())

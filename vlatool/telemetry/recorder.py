@@ -1,4 +1,4 @@
-"""Sample all readers beside a run, in a thread of its own."""
+"""Sample all readers during a run, in a separate thread."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from collections.abc import Callable, Iterable
 from types import TracebackType
 
 from vlatool.telemetry._reading import Absent, Reader
-from vlatool.telemetry._summary import Recorded, Series, summarise
+from vlatool.telemetry._summary import Series, Summary, summarise
 
 STOP_TIMEOUT_S = 10.0
-"""A read takes at most a few commands of two seconds each; after this the thread is left alone."""
+"""A read takes at most a few commands of two seconds each; after this time the thread is abandoned."""
 
 
 class Recorder:
     """Samples readers at the start, every ``period_s`` seconds, and at the end.
 
-    The thread is a daemon and takes a share of one core: about what it takes to read the files. A reader that starts a
-    process is asked at most once in its own ``period_s``. A reader that fails is dropped and named among the absent.
+    The thread is a daemon and takes about as much of one core as reading the files. A reader that starts a process is
+    read at most once in its own ``period_s``. A reader that fails is dropped and listed among the absent.
 
     Args:
-        readers: Readers, and the absent ones, as ``open_all`` returns them.
+        readers: Readers, and absent ones, from ``open_all``.
         period_s: Seconds between two samples.
-        clock: Monotonic seconds.
+        clock: Clock of monotonic seconds.
 
     Raises:
         ValueError: when ``period_s`` is not above zero.
@@ -75,7 +75,7 @@ class Recorder:
             self._thread = None
 
     def sample(self, every: bool = False) -> None:
-        """Read once all readers that are due; with ``every`` all."""
+        """Read all readers that are due; with ``every`` all of them."""
         for reader in [*self._readers]:
             now = self._clock()
             if every or now - self._last.get(reader.name, -math.inf) >= reader.period_s:
@@ -83,8 +83,8 @@ class Recorder:
                 self._read(reader, now)
 
     @property
-    def recorded(self) -> Recorded:
-        """The summary of what has been sampled so far."""
+    def recorded(self) -> Summary:
+        """Summary of the samples so far."""
         with self._lock:
             partly = [part for reader in self._readers for part in reader.absent()]
             return summarise(self._samples, [*self._absent, *partly])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vlatool.machine.host import ROOT
 from vlatool.telemetry import _reading
-from vlatool.telemetry._reading import COLDEST, Absent, CommandReader, Reading, Run, gauge, runner
+from vlatool.telemetry._reading import MIN_TEMPERATURE, Absent, CommandReader, Reading, Run, gauge, runner
 
 COMMAND = ("sh", "-c", "timeout 1 tegrastats --interval 100 | head -n 1")
 """One line: tegrastats runs until it is stopped."""
@@ -35,13 +35,13 @@ class TegrastatsReader(CommandReader):
 
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> TegrastatsReader | Absent:
-        """Ask for one line; absent where there is no tegrastats or it says nothing that is known."""
+        """Ask for one line; absent without tegrastats, or when the line has no known value."""
         return cls(runner(root, run)).or_absent(
-            "tegrastats gives no line: this is no Jetson, or it needs the L4T tools installed"
+            "tegrastats prints nothing: this is not a Jetson, or the L4T tools are not installed"
         )
 
     def read(self) -> list[Reading]:
-        """Return what one line says."""
+        """Return the readings of one line."""
         return parse(self._run(COMMAND) or "")
 
 
@@ -61,7 +61,7 @@ def _memory(line: str) -> list[Reading]:
 
 
 def _cores(line: str) -> list[Reading]:
-    """Load and clock of each core that is on; before JetPack 3 one clock stands behind the list."""
+    """Return load and clock of each core that is on; before JetPack 3 one clock follows the list."""
     cores = CPU.search(line)
     readings: list[Reading] = []
     for index, text in enumerate(cores[1].split(",") if cores else []):
@@ -74,7 +74,7 @@ def _cores(line: str) -> list[Reading]:
 
 
 def _engines(line: str) -> list[Reading]:
-    """Load and clocks of the GPU (GR3D), the memory controller (EMC) and the engines; what is off is left out."""
+    """Return load and clocks of the GPU (GR3D), the memory controller (EMC) and the engines that are on."""
     readings: list[Reading] = []
     for name, limit, load, clocks in ENGINE.findall(line):
         readings += gauge(f"tegrastats.{name}.load", float(load) / 100, _reading.SHARE)
@@ -94,7 +94,7 @@ def _clock(limit: str) -> str:
 def _temperatures(line: str) -> list[Reading]:
     readings: list[Reading] = []
     for name, text in TEMPERATURE.findall(line):
-        if float(text) > COLDEST and "PMIC" not in name.upper():
+        if float(text) > MIN_TEMPERATURE and "PMIC" not in name.upper():
             readings += gauge(f"tegrastats.{name}.temperature", float(text), _reading.DEGREE)
     return readings
 

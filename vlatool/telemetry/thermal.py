@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 from vlatool.machine.host import ROOT, read_text
-from vlatool.telemetry._reading import COLDEST, DEGREE, Absent, FileReader, NumberFile, Run, listed
+from vlatool.telemetry._reading import DEGREE, MIN_TEMPERATURE, Absent, FileReader, NumberFile, Run, find
 
 NO_SENSORS = ("PMIC", "INT3400")
 """Zones without a sensor: the PMIC of a Jetson shows 50 or 100 degC always, ``INT3400 Thermal`` of Intel 20 degC."""
@@ -24,12 +24,12 @@ class ThermalReader(FileReader):
     def open(cls, root: Path = ROOT, run: Run | None = None) -> ThermalReader | Absent:
         """Find the zones; absent where none shows a temperature."""
         files = []
-        seen: Counter[str] = Counter()
-        for place in listed(root, "sys/class/thermal", "thermal_zone*"):
-            kind = read_text(root, f"{place}/type")
+        counts: Counter[str] = Counter()
+        for folder in find(root, "sys/class/thermal", "thermal_zone*"):
+            kind = read_text(root, f"{folder}/type")
             if kind is None or any(word in kind.upper() for word in NO_SENSORS):
                 continue
-            name = f"thermal.{kind}-{seen[kind]}" if seen[kind] else f"thermal.{kind}"
-            files.append(NumberFile(name, f"{place}/temp", 1e-3, DEGREE, least=COLDEST))
-            seen[kind] += 1
+            name = f"thermal.{kind}-{counts[kind]}" if counts[kind] else f"thermal.{kind}"
+            files.append(NumberFile(name, f"{folder}/temp", 1e-3, DEGREE, minimum=MIN_TEMPERATURE))
+            counts[kind] += 1
         return cls(root, files).or_absent("no thermal zone shows a temperature (virtual machine or container)")

@@ -14,20 +14,20 @@ from vlatool.machine.host import ROOT
 from vlatool.telemetry._reading import DEGREE, THROTTLE, WATT, Absent, Reader, Reading, Run, counter, gauge, runner
 
 BITS = {0: "under-voltage", 1: "arm frequency capped", 2: "throttled", 3: "soft temperature limit"}
-"""What is so now; the same bits from 16 on say that it has been so since the machine started."""
+"""Current state; the same bits from 16 on tell whether it occurred since the machine started."""
 SINCE_START = 16
 TEMPERATURE = re.compile(r"temp=(-?\d+(?:\.\d+)?)'C")
 THROTTLED = re.compile(r"throttled=0x([0-9a-fA-F]{1,8})\b")
 CURRENT = re.compile(r"^\s*(\w+)_A current\(\d+\)=(\d+(?:\.\d+)?)A\s*$", re.MULTILINE)
 VOLTAGE = re.compile(r"^\s*(\w+)_V volt\(\d+\)=(\d+(?:\.\d+)?)V\s*$", re.MULTILINE)
-REASON = "vcgencmd does not answer: this is no Raspberry Pi, or 'sudo usermod -aG video $USER' and a new login are due"
-NO_CURRENT = "this board senses no current (a Raspberry Pi 4 does not): measure its power at the supply"
+REASON = "vcgencmd fails: this is not a Raspberry Pi, or it needs 'sudo usermod -aG video $USER' and a new login"
+NO_CURRENT = "this board does not measure current (e.g. a Raspberry Pi 4): measure its power at the supply"
 
 
 class VcgencmdReader(Reader):
     """Temperature (degC), throttling now and since the start of the machine, and watts per rail; once a second.
 
-    The rails leave out what the USB ports and the 5 V pins take, and what the converters lose.
+    The rails do not include the power of USB ports and 5 V pins, nor the losses of the converters.
     """
 
     name = "vcgencmd"
@@ -40,19 +40,19 @@ class VcgencmdReader(Reader):
 
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> VcgencmdReader | Absent:
-        """Ask for every value once; absent where neither temperature nor throttling is told."""
+        """Ask for every value once; absent without temperature and throttling."""
         ask = runner(root, run)
-        bits = throttled(ask(("vcgencmd", "get_throttled")) or "")
-        degrees = temperature(ask(("vcgencmd", "measure_temp")) or "")
+        bits = parse_throttling(ask(("vcgencmd", "get_throttled")) or "")
+        degrees = parse_temperature(ask(("vcgencmd", "measure_temp")) or "")
         if bits is None and degrees is None:
             return Absent(cls.name, REASON)
-        rails = pmic_watts(ask(("vcgencmd", "pmic_read_adc")) or "")
+        rails = parse_pmic_watts(ask(("vcgencmd", "pmic_read_adc")) or "")
         return cls(ask, bool(rails), (bits or 0) >> SINCE_START)
 
     def read(self) -> list[Reading]:
-        """Return what vcgencmd says now."""
-        readings = gauge("vcgencmd.temperature", temperature(self._ask("measure_temp")), DEGREE)
-        bits = throttled(self._ask("get_throttled"))
+        """Return the current values."""
+        readings = gauge("vcgencmd.temperature", parse_temperature(self._ask("measure_temp")), DEGREE)
+        bits = parse_throttling(self._ask("get_throttled"))
         for bit, words in BITS.items() if bits is not None else ():
             name = words.replace(" ", "_")
             readings += gauge(f"vcgencmd.{name}", _bit(bits, bit), THROTTLE, words)
@@ -60,12 +60,12 @@ class VcgencmdReader(Reader):
                 sticky = _bit(bits, bit + SINCE_START)
                 readings += counter(f"vcgencmd.{name}_since_start", sticky, THROTTLE, note=words)
         if self._has_rails:
-            for rail, watts in pmic_watts(self._ask("pmic_read_adc")).items():
+            for rail, watts in parse_pmic_watts(self._ask("pmic_read_adc")).items():
                 readings += gauge(f"vcgencmd.{rail}", watts, WATT)
         return readings
 
     def absent(self) -> list[Absent]:
-        """Return the board's missing current sensing, and the reasons that no longer tell anything new."""
+        """Return missing current measurement, and throttle bits that were set before the recording."""
         missing = [] if self._has_rails else [Absent("vcgencmd power", NO_CURRENT)]
         before = [words for bit, words in BITS.items() if _bit(self._was_throttled, bit)]
         if before:
@@ -84,19 +84,19 @@ def _bit(bits: int | None, bit: int) -> int:
     return (bits or 0) >> bit & 1
 
 
-def temperature(text: str) -> float | None:
+def parse_temperature(text: str) -> float | None:
     """Return the degC of ``temp=48.0'C``; None when there is none."""
     degrees = TEMPERATURE.search(text)
     return float(degrees[1]) if degrees else None
 
 
-def throttled(text: str) -> int | None:
+def parse_throttling(text: str) -> int | None:
     """Return the bits of ``throttled=0x50000``; None when there are none."""
     bits = THROTTLED.search(text)
     return int(bits[1], 16) if bits else None
 
 
-def pmic_watts(text: str) -> dict[str, float]:
+def parse_pmic_watts(text: str) -> dict[str, float]:
     r"""Return the watts of every rail that has both a current and a voltage, paired by name.
 
     The numbers in brackets are channels of the converter and differ between the two. ``EXT5V`` and ``BATT`` have no

@@ -1,1 +1,1 @@
-"""Weights on the disk."""
+"""Stored weights: safetensors shards, and pairs of int8 weights."""

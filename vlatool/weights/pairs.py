@@ -2,12 +2,12 @@
 
 Such a processor multiplies unsigned activations with signed weights in pairs and adds both products in 16 bits, with
 saturation (``vpmaddubsw``). Both activations may be 255, so a pair is exact for all activations when the sum of its two
-weights fits into int8: 255 x 128 = 32,640 is the most that 16 bits hold. Weights of 7 bits keep to that, each alone.
-Held against the sum of the pair instead, weights may use all 8 bits, since two large neighbours of one sign are rare:
-of 768 normally distributed weights the steps are 1.35 times as large as those of 8 bits, where 7 bits double them.
+weights fits into int8: 255 x 128 = 32,640 still fits into 16 bits. Weights of 7 bits meet that bound individually. When
+the sum of the pair is bounded instead, weights may use all 8 bits, since two large neighbours of one sign are rare: for
+768 normally distributed weights the steps are 1.35 times as large as those of 8 bits, where 7 bits double them.
 
-Which weights are neighbours is a matter of the kernel. Products add up along the inner axis; convolutions of both
-engines add up all channels of a kernel position, then those of the next one.
+Which weights are neighbours depends on the kernel. Products accumulate along the inner axis; convolutions of both
+engines accumulate all channels of a kernel position, then those of the next one.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 LARGEST_SUM = 126
-"""Largest magnitude of a sum of two weights before they are rounded, which may add 1."""
+"""Largest magnitude of a sum of two weights before rounding, which may add 1."""
 
 
 def neighbours(weight: Array, kind: str, axis: int) -> Iterator[tuple[Array, Array]]:
-    """Yield the first and the second of all pairs of a weight, once for each order in which an engine adds up.
+    """Yield the first and the second weights of all pairs, once for each accumulation order of an engine.
 
     Args:
-        weight: Of any dtype; at least two axes.
+        weight: Weight of any dtype, with at least two axes.
         kind: Operator: ``Conv``, ``Gemm`` or ``MatMul``.
         axis: Axis of the outputs.
 
     Yields:
-        Two arrays of one shape, whose axis of outputs is where it is in the weight.
+        Two arrays of one shape, with the axis of outputs as in the weight.
     """
     if kind != "Conv":
         inner = -2 if axis == weight.ndim - 1 else -1
@@ -52,17 +52,17 @@ def neighbours(weight: Array, kind: str, axis: int) -> Iterator[tuple[Array, Arr
 
 def largest_sums(weight: Array, kind: str, axis: int) -> Array:
     """Return the largest magnitude of a sum of two neighbours for each output, float32."""
-    found: Array = np.zeros(weight.shape[axis], np.float32)
+    largest: Array = np.zeros(weight.shape[axis], np.float32)
     for first, second in neighbours(weight.astype(np.float32, copy=False), kind, axis):
         others = tuple(index for index in range(first.ndim) if index != (0 if kind == "Conv" else axis))
-        found = np.maximum(found, np.abs(first + second).max(axis=others, initial=0.0))
-    return found
+        largest = np.maximum(largest, np.abs(first + second).max(axis=others, initial=0.0))
+    return largest
 
 
-def fit(codes: Array, kind: str, axis: int) -> bool:
+def pairs_fit(codes: Array, kind: str, axis: int) -> bool:
     """Return whether the sum of any two int8 neighbours fits into int8.
 
-    Two numbers of one sign overflow when their sum, cut to 8 bits, has the other sign.
+    Two numbers of one sign overflow when their sum in 8 bits has the other sign.
     """
     for first, second in neighbours(codes, kind, axis):
         cut = first + second

@@ -1,4 +1,4 @@
-"""Weights in safetensors shards, read a part at a time: nothing is mapped, and the page cache is left alone."""
+"""Weights in safetensors shards, read in parts, without memory maps and around the page cache."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import math
 import mmap
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import SourceError
 
-READABLE = "see that this user may read it, and that its disk is well"
+READ_FIX = "check its permissions and its disk"
 
 Array = NDArray[Any]
 ITEM_BYTES = {
@@ -34,23 +34,23 @@ NUMPY_NAMES = {"bool": "BOOL", "float32": "F32", "float16": "F16", "bfloat16": "
 }
 INDEX = ".safetensors.index.json"
 PAGE = 4096
-LARGEST_HEADER = 100_000_000
-DIRECT_FROM = 1 << 20
-"""Bytes from which a read goes past the page cache."""
-AGAIN = "download or copy the weights again"
+MAX_HEADER_BYTES = 100_000_000
+MIN_DIRECT_BYTES = 1 << 20
+"""Smallest read that bypasses the page cache."""
+DOWNLOAD_FIX = "download or copy the weights again"
 
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """Where the bytes of one tensor are.
+    """Location of one tensor.
 
     Args:
         name: Name in the shard, or of the initializer.
-        file: File that holds it; for messages alone when ``array`` is given.
+        file: File that holds it; only for messages when ``array`` is given.
         offset: First byte in the file.
-        dtype: As safetensors calls it: ``BF16``, ``F32`` ...
+        dtype: Safetensors dtype: ``BF16``, ``F32`` ...
         shape: Sizes of the axes.
-        array: The bytes themselves, (bytes,) uint8, for a tensor that is in memory anyway.
+        array: Bytes of a tensor in memory, (bytes,) uint8.
     """
 
     name: str
@@ -77,7 +77,7 @@ class StoredTensor:
 
 
 def stored_array(name: str, array: Array, file: Path) -> StoredTensor:
-    """Return a tensor that is in memory already."""
+    """Return a stored tensor for an array in memory."""
     raw = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
     return StoredTensor(name, file, 0, NUMPY_NAMES[str(array.dtype)], array.shape, raw)
 
@@ -90,15 +90,15 @@ def shard_files(folder: Path, pattern: str) -> list[Path]:
     """
     files = sorted(path for path in folder.glob(pattern) if path.is_file())
     if not files:
-        raise SourceError(f"No file in {folder} matches 'weights: {pattern}'.", AGAIN)
+        raise SourceError(f"No file in {folder} matches 'weights: {pattern}'.", DOWNLOAD_FIX)
     return files
 
 
 def read_shards(folder: Path, pattern: str) -> dict[str, StoredTensor]:
-    """Read the headers of all shards: name -> where the tensor is, in the order of files and offsets.
+    """Read the headers of all shards: name -> location of the tensor, in the order of files and offsets.
 
     Raises:
-        SourceError: when a shard is missing, cut off or not a safetensors file, or a tensor is there twice.
+        SourceError: when a shard is missing, truncated or not a safetensors file, or a tensor occurs twice.
     """
     files = shard_files(folder, pattern)
     _check_indexes(files)
@@ -115,52 +115,52 @@ def read_shards(folder: Path, pattern: str) -> dict[str, StoredTensor]:
 
 
 def _check_indexes(files: list[Path]) -> None:
-    """Every shard that an index beside the shards names must be there and hold what the index says."""
+    """Check that every shard in an index next to the shards exists and holds the tensors of the index."""
     for index in sorted({path for file in files for path in file.parent.glob(f"*{INDEX}")}):
         try:
-            named = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
-            files_of = {str(tensor): str(file) for tensor, file in named.items()}
+            weight_map = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
+            files_of = {str(tensor): str(file) for tensor, file in weight_map.items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise SourceError(f"{index} is not an index of safetensors shards: {error!r}.", AGAIN) from error
+            raise SourceError(f"{index} is not an index of safetensors shards: {error!r}.", DOWNLOAD_FIX) from error
         for name in sorted(set(files_of.values())):
             if not (index.parent / name).is_file():
-                raise SourceError(f"{index} names the shard {name}, which is missing.", AGAIN)
+                raise SourceError(f"{index} names the shard {name}, which is missing.", DOWNLOAD_FIX)
         held = {name: {tensor.name for tensor in read_header(index.parent / name)} for name in set(files_of.values())}
         for tensor, name in files_of.items():
             if tensor not in held[name]:
-                raise SourceError(f"{index} says that '{tensor}' is in {name}, which does not hold it.", AGAIN)
+                raise SourceError(f"{index} says that '{tensor}' is in {name}, which does not hold it.", DOWNLOAD_FIX)
 
 
 def read_header(file: Path) -> list[StoredTensor]:
-    """Return what a safetensors file holds, reading its header alone.
+    """Return the tensors of a safetensors file from its header.
 
     Raises:
-        SourceError: naming what is wrong with the file.
+        SourceError: with the fault of the file.
     """
     header, start, size = _header_bytes(file)
     try:
         entries = json.loads(header)
     except ValueError as error:
-        raise SourceError(f"{file} has a damaged safetensors header: {error}.", AGAIN) from error
+        raise SourceError(f"{file} has a damaged safetensors header: {error}.", DOWNLOAD_FIX) from error
     if not isinstance(entries, Mapping):
-        raise SourceError(f"{file} has a damaged safetensors header: it is not a mapping.", AGAIN)
+        raise SourceError(f"{file} has a damaged safetensors header: it is not a mapping.", DOWNLOAD_FIX)
     return [_entry(file, str(name), entry, start, size) for name, entry in entries.items() if name != "__metadata__"]
 
 
 def _header_bytes(file: Path) -> tuple[bytes, int, int]:
-    """Return the header, where the data starts, and the size of the file."""
+    """Return the header, the offset of the data, and the size of the file."""
     try:
         with file.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             length = struct.unpack("<Q", stream.read(8))[0] if size >= 8 else 0
-            if not 2 <= length <= min(size - 8, LARGEST_HEADER):
+            if not 2 <= length <= min(size - 8, MAX_HEADER_BYTES):
                 raise SourceError(
                     f"{file} is not a safetensors file, or is cut off: {size} bytes cannot hold a header of {length}.",
-                    AGAIN,
+                    DOWNLOAD_FIX,
                 )
             return stream.read(length), 8 + length, size
     except OSError as error:
-        raise SourceError(f"{file} cannot be read: {error.strerror}.", READABLE) from error
+        raise SourceError(f"{file} cannot be read: {error.strerror}.", READ_FIX) from error
 
 
 def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTensor:
@@ -168,7 +168,7 @@ def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTe
         dtype, shape = str(entry["dtype"]), tuple(int(axis) for axis in entry["shape"])
         begin, end = (int(offset) for offset in entry["data_offsets"])
     except (KeyError, TypeError, ValueError) as error:
-        raise SourceError(f"{file} has a damaged safetensors header at '{name}': {error!r}.", AGAIN) from error
+        raise SourceError(f"{file} has a damaged safetensors header at '{name}': {error!r}.", DOWNLOAD_FIX) from error
     if dtype not in ITEM_BYTES:
         raise SourceError(
             f"{file} holds '{name}' as {dtype}; known dtypes: {', '.join(ITEM_BYTES)}.", "store it in one of these"
@@ -177,15 +177,15 @@ def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTe
     if min((0, *shape)) < 0 or begin < 0 or end - begin != tensor.nbytes:
         raise SourceError(
             f"{file} has a damaged safetensors header: '{name}' {list(shape)} {dtype} cannot take {end - begin} bytes.",
-            AGAIN,
+            DOWNLOAD_FIX,
         )
     if start + end > size:
-        raise SourceError(f"{file} is cut off: it has {size} bytes, '{name}' ends at {start + end}.", AGAIN)
+        raise SourceError(f"{file} is cut off: it has {size} bytes, '{name}' ends at {start + end}.", DOWNLOAD_FIX)
     return tensor
 
 
 def fingerprint(files: list[Path]) -> str:
-    """Return a SHA-256 over name, size, time of change and header of files: it changes when the weights do."""
+    """Return a SHA-256 over name, size, modification time and header of files: it changes with the weights."""
     digest = hashlib.sha256()
     for file in files:
         state = file.stat()
@@ -197,8 +197,8 @@ def fingerprint(files: list[Path]) -> str:
 def sampled_hash(files: list[Path]) -> str:
     """Return a SHA-256 over name, size, header and the first 4 KiB of every tensor of shards.
 
-    It is the same for a copy elsewhere, and other for retrained weights; a change of single numbers deep inside a
-    tensor can escape it, which hashing all of 13 GB would not, for ten times the time.
+    It is the same for a copy, and different for retrained weights; it can miss a change of single elements deep inside
+    a tensor, which hashing all of 13 GB would not, in ten times the time.
     """
     digest = hashlib.sha256()
     for file in files:
@@ -212,11 +212,17 @@ def sampled_hash(files: list[Path]) -> str:
 
 
 class Reader:
-    """Reads parts of tensors into one buffer; for one thread. Large reads go past the page cache where that works."""
+    """Reads parts of tensors into one buffer; for one thread. Large reads bypass the page cache where possible."""
 
     def __init__(self) -> None:
         self._files: dict[tuple[Path, bool], int] = {}
         self._buffer: mmap.mmap | None = None
+
+    def __enter__(self) -> Reader:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
 
     def read(self, tensor: StoredTensor, begin: int, size: int) -> Array:
         """Return bytes ``begin`` to ``begin + size`` of a tensor as (size,) uint8, valid until the next call.
@@ -229,22 +235,22 @@ class Reader:
         start = tensor.offset + begin
         aligned = start - start % PAGE
         length = -(-(start + size - aligned) // PAGE) * PAGE
-        buffer = self._room(length)
+        buffer = self._sized_buffer(length)
         try:
             got = self._fill(tensor.file, memoryview(buffer)[:length], aligned, start + size - aligned)
         except OSError as error:
-            raise SourceError(f"{tensor.file} cannot be read: {error.strerror}.", READABLE) from error
+            raise SourceError(f"{tensor.file} cannot be read: {error.strerror}.", READ_FIX) from error
         if got < start + size - aligned:
-            raise SourceError(f"{tensor.file} is cut off: it ends within '{tensor.name}'.", AGAIN)
+            raise SourceError(f"{tensor.file} is cut off: it ends within '{tensor.name}'.", DOWNLOAD_FIX)
         return np.frombuffer(buffer, np.uint8, size, start - aligned)
 
-    def _room(self, size: int) -> mmap.mmap:
+    def _sized_buffer(self, size: int) -> mmap.mmap:
         if self._buffer is None or len(self._buffer) < size:
             self._buffer = mmap.mmap(-1, size)
         return self._buffer
 
     def _fill(self, file: Path, view: memoryview, offset: int, needed: int) -> int:
-        direct = len(view) >= DIRECT_FROM
+        direct = len(view) >= MIN_DIRECT_BYTES
         got = 0
         while got < needed:
             try:
@@ -275,20 +281,10 @@ class Reader:
 
 
 def open_direct(file: Path, flags: int) -> int:
-    """Open a file past the page cache, or, where the file system cannot, through it."""
+    """Open a file for direct I/O where the file system supports it."""
     try:
         return os.open(file, flags | getattr(os, "O_DIRECT", 0), 0o666)
     except OSError as error:
         if error.errno != errno.EINVAL:
             raise
         return os.open(file, flags, 0o666)
-
-
-@contextlib.contextmanager
-def reading() -> Iterator[Reader]:
-    """Yield a reader that is closed at the end."""
-    reader = Reader()
-    try:
-        yield reader
-    finally:
-        reader.close()

@@ -28,7 +28,7 @@ class Rounded(Quantization):
         for graph in self.chosen_graphs(bundle):
             model = load(bundle.file(bundle.manifest.graphs[graph].file))
             layers[graph] = find_layers(model, ("MatMul", "Gemm", "Conv"))
-        selected = self.selected([layer.name for found in layers.values() for layer in found], bundle)
+        selected = self.select_nodes([layer.name for found in layers.values() for layer in found], bundle)
 
         def quantize(graph: str, original: Path, target: Path) -> None:
             model = load(original)

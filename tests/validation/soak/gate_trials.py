@@ -37,7 +37,7 @@ from vlatool.gate.run import run_gate
 from vlatool.gate.verdict import Outcome, worst
 from vlatool.measurement.pairs import PairJob, measure_pairs
 from vlatool.stage.base import Context
-from vlatool.stats.sequential import jointly
+from vlatool.stats.sequential import judge_jointly
 
 NEIGHBOUR = """
 import random, time
@@ -107,7 +107,7 @@ def resampled(output: Path, gates: int, margin: float) -> None:
     lines = [json.loads(line) for line in output.read_text().splitlines()]
     pool = [both for line in lines for both in zip(line["log_ratios"], line["log_mean_ratios"], strict=True)]
     draw = random.Random(0)
-    gate = (jointly(lambda _: draw.choice(pool), 2, margin)[0] for _ in range(gates))
+    gate = (judge_jointly(lambda _: draw.choice(pool), 2, margin)[0] for _ in range(gates))
     found = Counter(worst(Outcome(decision.verdict) for decision in decisions).value for decisions in gate)
     print(f"{gates} gates drawn from {len(pool)} processes (median and mean): {dict(found)}")
     slow = sum("found an observation that is slower" in line["said"] for line in lines)

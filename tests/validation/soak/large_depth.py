@@ -30,9 +30,9 @@ def make_llama(folder: Path) -> None:
     sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
     from _llama import write_llama
 
-    from vlatool.prune.depth import spread
+    from vlatool.prune.depth import evenly_spaced
 
-    count = write_llama(folder, holes=tuple(sorted(set(range(32)) - set(spread(32, 16)))))
+    count = write_llama(folder, holes=tuple(sorted(set(range(32)) - set(evenly_spaced(32, 16)))))
     print(f"{count / 1e9:.3f} G parameters")
 
 

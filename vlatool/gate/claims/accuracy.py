@@ -25,7 +25,7 @@ from vlatool.measures import Quantity, series
 from vlatool.measures.actions import RECORDED_DROP
 from vlatool.measures.success import SUCCESS, SUCCESS_DROP
 from vlatool.report import Measurement, Row
-from vlatool.stats.starts import distinct, independent
+from vlatool.stats.starts import distinct_starts, independent_starts
 from vlatool.stats.success_sequential import exact_drop
 
 MAX_SAMPLES = 100_000
@@ -90,8 +90,8 @@ class Accuracy(Claim):
         lost = sum(one > two for one, two in zip(before, after, strict=True))
         won = sum(one < two for one, two in zip(before, after, strict=True))
         starts = baseline.raw[series.START]
-        interval = exact_drop(lost, won, len(before), CONFIDENCE, independent(starts))
-        judged = self._held(SUCCESS_DROP, "more failed episodes:", interval, len(before), distinct(starts))
+        interval = exact_drop(lost, won, len(before), CONFIDENCE, independent_starts(starts))
+        judged = self._held(SUCCESS_DROP, "more failed episodes:", interval, len(before), distinct_starts(starts))
         if few := few_starts(baseline):
             judged = replace(judged, outcome=Outcome.INCONCLUSIVE, reason=Reason.FEW_STARTS,
                              facts={**judged.facts, "few": few})  # fmt: skip

@@ -16,8 +16,8 @@ from vlatool.gate.verdict import CONFIDENCE, Judgement, Outcome, Verdict
 from vlatool.measurement.turns import CONFIRM
 from vlatool.measures import Quantity
 from vlatool.measures.latency import LATENCY_MEAN_RATIO, LATENCY_RATIO, ratio_at_threads
-from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES, Decision, jointly
-from vlatool.stats.signed_rank import fewest
+from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES, Decision, judge_jointly
+from vlatool.stats.signed_rank import min_differences
 
 MEASURED = ((LATENCY_RATIO, "medians"), (LATENCY_MEAN_RATIO, "means of ratios"))
 """Statistics of the calls, and of the observations, each the median of its calls: the median and the mean."""
@@ -68,7 +68,7 @@ class Latency(Claim):
     @model_validator(mode="after")
     def _an_analysis_can_decide(self) -> Latency:
         after = self.interim_analyses
-        least = fewest(ALPHA / 2 / len(after)) if after else 1  # the median and the mean share it
+        least = min_differences(ALPHA / 2 / len(after)) if after else 1  # the median and the mean share it
         if not after or list(after) != sorted(set(after)) or after[0] < least:
             raise ValueError(f"interim_analyses must ascend and begin at {least} or later, or none of them can decide")
         return self
@@ -98,7 +98,7 @@ class Latency(Claim):
             pairs = timed.process(number)
             return pairs.log_ratio, pairs.mean_log_ratio
 
-        decisions, _ = jointly(ratios, len(MEASURED), self.margin, self.interim_analyses)
+        decisions, _ = judge_jointly(ratios, len(MEASURED), self.margin, self.interim_analyses)
         judged = [self._judged(*named, decision) for named, decision in zip(MEASURED, decisions, strict=True)]
         found = Verdict.of(judged, slow=slow_observations(timed, self.worst))
         return replace(found, outcome=Outcome.FAIL) if found.facts["slow"] else found

@@ -10,7 +10,7 @@ from vlatool.accuracy.moved import doubts, known_of, pairs_above_none, ratios
 from vlatool.gate.claims._ratio import Ratios, confidence_of
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.verdict import Judgement, Outcome, Reason, Verdict, worst
-from vlatool.motion.measure import FEWEST, metrics
+from vlatool.motion.measure import MIN_PAIRS, metrics
 from vlatool.report import Row
 
 OF_BODY = ("path_length", "joint_path", "jerk", "joint_jerk")
@@ -87,7 +87,7 @@ def _metrics_of(baseline: Row) -> tuple[str, ...]:
 def _from_none(title: str, some: int, count: int, confidence: float, doubt: Doubt | None) -> Judgement:
     """Judge a metric that the baseline has nothing of; the test is the exact sign test of pairs, one-sided."""
     unlikely = some and 0.5**some <= (1 - confidence) / 2
-    enough = not some and count >= FEWEST and not doubt
+    enough = not some and count >= MIN_PAIRS and not doubt
     outcome = Outcome.FAIL if unlikely else Outcome.PASS if enough else Outcome.INCONCLUSIVE
     return Judgement(outcome, title, facts={"some": some, "count": count, "doubt": doubt})
 

@@ -9,7 +9,7 @@ from vlatool.motion.track import Array, Track
 from vlatool.report import COUNT
 
 BAND = 0.1
-"""An opening within so much of the middle is neither open nor closed, so that noise there is no flip."""
+"""Distance from the middle within which a gripper is neither open nor closed, so that noise does not count."""
 
 
 class GripperFlips(Metric):

@@ -7,7 +7,7 @@ import numpy as np
 from vlatool.motion.metric import Metric
 from vlatool.motion.track import Array, Track, lengths
 
-HIGHEST_HZ, LEAST, PADDING = 10.0, 0.05, 4
+MAX_HZ, MIN_AMPLITUDE, PADDING = 10.0, 0.05, 4
 
 
 class SpectralArcLength(Metric):
@@ -35,9 +35,9 @@ def arc_length(speed: Array, hz: float) -> float:
     count = 2 ** (int(np.ceil(np.log2(len(speed)))) + PADDING)
     size = np.abs(np.fft.rfft(speed, count))
     frequency = np.fft.rfftfreq(count, 1 / hz)
-    kept = frequency <= HIGHEST_HZ
+    kept = frequency <= MAX_HZ
     size, frequency = size[kept] / size.max(), frequency[kept]
-    last = int(np.flatnonzero(size >= LEAST)[-1]) + 1
+    last = int(np.flatnonzero(size >= MIN_AMPLITUDE)[-1]) + 1
     size, frequency = size[:last], frequency[:last]
     if last < 2:
         return 0.0

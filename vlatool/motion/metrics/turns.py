@@ -8,7 +8,7 @@ from vlatool.motion.metric import Metric
 from vlatool.motion.track import Track, lengths
 from vlatool.report import COUNT
 
-TURNED = 1e-6
+MIN_TURN = 1e-6
 """Radians from which on a base has turned."""
 
 
@@ -22,5 +22,5 @@ class Turns(Metric):
         """Return how many; None without positions and headings."""
         if track.position is None or track.heading is None or len(track.position) < 2:
             return None
-        turned = np.abs(np.angle(np.exp(1j * np.diff(track.heading)))) > TURNED
+        turned = np.abs(np.angle(np.exp(1j * np.diff(track.heading)))) > MIN_TURN
         return float((turned & (lengths(track.position) == 0)).sum())

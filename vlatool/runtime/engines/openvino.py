@@ -219,8 +219,8 @@ class OpenvinoSession(Engine):
     def variants(cls, target: Target, calibrated: bool) -> dict[str, Stages]:
         """Return bfloat16 where the processor has it, and int8 with what is not quantized in that.
 
-        With matrix units (AMX) products are written as convolutions, too, as ``quantize._conv1x1`` says; where int8
-        products saturate, weights are such that none does.
+        With matrix units (AMX) products are written as convolutions, too, as ``quantize.int8.convolutions`` says; where
+        int8 products saturate, weights are such that none does.
         """
         plans: dict[str, Stages] = {}
         forms: dict[str, dict[str, Any]] = (

@@ -1,0 +1,109 @@
+"""Base of the methods that take ranges of activations from recorded observations."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import (
+    PLAYED,
+    Moment,
+    Recording,
+    calibration_checks,
+    calibration_recording,
+    observations_for,
+    takes_not_finite,
+)
+from vlatool.errors import DataError
+from vlatool.quantize._base import Quantization
+from vlatool.quantize.calibration.activation_statistics import ValueNames, calibrate
+from vlatool.quantize.calibration.ranges import Statistics
+from vlatool.quantize.calibration.samples import played_moments, recorded_moments
+from vlatool.stage.base import Context, SampleSet
+
+if TYPE_CHECKING:
+    from vlatool.hardware.profile import Profile
+
+NON_FINITE_SAMPLES = 16
+"""Calibration observations with NaN and infinity, where an input takes them."""
+
+
+class CalibratedQuantization(Quantization):
+    """A method that needs calibration data."""
+
+    alternative: ClassVar[str] = ""
+    """What a user without calibration data can do instead."""
+
+    calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
+    samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The calibration file."""
+        return (self.calibration,) if self.calibration else ()
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """There is calibration data."""
+        super().check(source, profile)
+        if source is None or (PLAYED in source.manifest.files and not self.calibration):
+            return
+        if calibration_recording(source, self.calibration) is None:
+            raise self._no_calibration_data(source)
+
+    def calibration_samples(self, bundle: Bundle) -> tuple[Recording, list[int]]:
+        """Return the recording and the indices of the calibration samples; warn of what makes them unreliable.
+
+        Args:
+            bundle: Bundle whose own recording is used when no other is given.
+
+        Raises:
+            DataError: when there is none.
+        """
+        recording = calibration_recording(bundle, self.calibration)
+        if recording is None:
+            raise self._no_calibration_data(bundle)
+        numbers = recording.spread(self.samples)
+        requested = self.samples if self.samples != type(self).model_fields["samples"].default else 0
+        for warning in calibration_checks(recording, numbers, bundle.manifest.spec, bundle.path / "assets", requested):
+            warnings.warn(warning, stacklevel=3)
+        return recording, numbers
+
+    def statistics(
+        self, bundle: Bundle, values: ValueNames, samples: SampleSet, context: Context,
+        exempt: Mapping[str, Collection[str]] | None = None
+    ) -> dict[str, dict[str, Statistics]]:  # fmt: skip
+        """Run the calibration samples, and observations saved by a training; return graph -> value -> statistics.
+
+        Args:
+            bundle, values, context, exempt: As for ``calibrate``.
+            samples: Collector of the hash of each sample.
+
+        Raises:
+            DataError, GraphError: see ``calibrate``.
+        """
+        uses_played = not self.calibration and PLAYED in bundle.manifest.files
+        if uses_played and calibration_recording(bundle) is None:
+            return calibrate(bundle, values, played_moments(bundle, samples), context, exempt=exempt)
+        recording, numbers = self.calibration_samples(bundle)
+        recorded = recorded_moments(bundle, recording, numbers, samples)
+        played = (moment for _ in range(uses_played) for moment in played_moments(bundle, samples))  # after the others
+        non_finite = (Moment(each, 0, begins=True) for each in self._non_finite_observations(bundle))
+        moments = itertools.chain(recorded, played, non_finite)
+        return calibrate(bundle, values, moments, context, numbers=numbers, exempt=exempt)
+
+    def _non_finite_observations(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return observations with NaN and infinity where an input takes them, so that ranges cover their results."""
+        if not takes_not_finite(bundle.manifest.spec):
+            return []
+        return observations_for(bundle, NON_FINITE_SAMPLES, self.calibration)
+
+    def _no_calibration_data(self, bundle: Bundle) -> DataError:
+        trainable = self.alternative and bundle.manifest.environment
+        training = ", or quantize.qat, which plays episodes" if trainable else ""
+        fix = f"pass --calibration FILE.npz{self.alternative}{training}"
+        return DataError(f"{bundle.manifest.name} carries no calibration data, which {self.name()} needs.", fix)

@@ -1,0 +1,1 @@
+"""Activations of a policy on recorded samples: statistics and the ranges that follow from them."""

@@ -1,0 +1,1 @@
+"""Rewrites of ONNX graphs for int8: fewer and cheaper operators around the quantized products."""
