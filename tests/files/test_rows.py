@@ -174,8 +174,8 @@ def test_streams_do_not_share_a_position(tmp_path: Path):
 def test_chosen_rows_stay_on_the_disk(tmp_path: Path, save: Callable[..., None]):
     save(tmp_path / "a.npz", image=frames())
     chosen = np.arange(COUNT) % 3 == 1
-    found = rows(tmp_path / "a.npz").only(chosen)
+    found = rows(tmp_path / "a.npz").select(chosen)
     assert isinstance(found, Rows)
     np.testing.assert_array_equal(found.read(0, len(found)), frames()[chosen])
     np.testing.assert_array_equal(found[[15, 2]], frames()[chosen][[15, 2]])
-    np.testing.assert_array_equal(found.only(np.arange(len(found)) > 3)[0], frames()[chosen][4])
+    np.testing.assert_array_equal(found.select(np.arange(len(found)) > 3)[0], frames()[chosen][4])

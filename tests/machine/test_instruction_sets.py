@@ -73,7 +73,7 @@ def test_a_host_is_confined_where_it_has_the_set_of_the_board(board, host, to_se
 )  # fmt: skip
 def test_a_process_is_confined_when_the_variable_says_so_and_the_processor_can(board, host, told: str, confined: bool):
     found = compare_sets("board", board, host, told)
-    assert found.confined is confined
+    assert found.is_confined is confined
     assert not found.to_set or not told, "what a person set is not set again"
 
 
@@ -117,7 +117,7 @@ def test_a_host_without_the_set_says_so_and_what_its_figures_are_worth(board, ho
     assert "speed-ups are not those of the board" in warning
     assert f"Measure on nuc, or on a processor with {found.lacks}." in warning
     assert not found.sentences()
-    assert not found.confined
+    assert not found.is_confined
 
 
 def test_a_set_that_a_person_chose_is_kept_and_told():
@@ -133,7 +133,7 @@ def test_a_host_of_the_same_set_needs_nothing_and_says_that_the_core_is_another(
 
 def test_nothing_is_said_where_there_is_nothing_to_compare():
     assert (BoardSet().to_set, BoardSet().plan(), BoardSet().sentences(), BoardSet().warnings()) == ("", "", (), ())
-    assert not BoardSet().confined
+    assert not BoardSet().is_confined
 
 
 def test_a_profile_says_its_set_where_it_runs_openvino(monkeypatch: pytest.MonkeyPatch):

@@ -15,7 +15,7 @@ from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
 from vlatool.prune._selection import Selection, protected_parts
-from vlatool.prune.depth import PROTECTED, Depth, evenly_spaced
+from vlatool.prune.depth import PROTECTED_WORDS, Depth, evenly_spaced
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
@@ -87,13 +87,13 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
     chosen = Depth(samples=2, include=("action_expert",)).change(modules, source_bundle, Context()).edits
     assert len(chosen[0].keep) == 2
     parts = {"action_head": ["trunk2", "trunk2.*"], "fusion": ["trunk3"]}
-    of_parts = Selection((), (), PROTECTED, protected_parts(parts, PROTECTED))
+    of_parts = Selection((), (), PROTECTED_WORDS, protected_parts(parts, PROTECTED_WORDS))
     assert of_parts.protects("trunk2")
     assert of_parts.protects("trunk2.blocks")
     assert not of_parts.protects("trunk3")
     assert not of_parts.selects(("trunk2.blocks",))
-    assert Selection(("trunk2.blocks",), (), PROTECTED, of_parts.parts).selects(("trunk2.blocks",))
-    protects = Selection((), (), PROTECTED).protects
+    assert Selection(("trunk2.blocks",), (), PROTECTED_WORDS, of_parts.parts).selects(("trunk2.blocks",))
+    protects = Selection((), (), PROTECTED_WORDS).protects
     assert protects("model.lm_expert.layers")
     assert protects("model.vision_tower.layers")
     assert protects("ActionHead.blocks")
@@ -224,7 +224,7 @@ def test_how_many_blocks_stay_is_said(source_bundle: Bundle):
 
 def test_the_guide_names_all_that_is_protected():
     guide = (Path(__file__).parents[2] / "docs/guides/prune-and-fine-tune.md").read_text()
-    assert f"({', '.join(PROTECTED)})" in " ".join(guide.split())
+    assert f"({', '.join(PROTECTED_WORDS)})" in " ".join(guide.split())
 
 
 def test_weights_that_are_not_finite_are_blamed_and_not_the_observation(policy_dir: Path, tmp_path: Path):

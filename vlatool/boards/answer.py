@@ -78,7 +78,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     bundle = opened(source, context)
     load = counted(bundle, context)
     spec = bundle.manifest.spec
-    asked = replace(asked, execute=spec.executed)
+    asked = replace(asked, execute=spec.executed_actions)
     if asked.hz is None and asked.latency_ms is None:
         asked = replace(asked, hz=spec.control_hz)
     model = load_model().condition(measured_questions(calibration))
@@ -220,7 +220,7 @@ def simulated(
         "precision": precision or stored_quantization(load) or "float32", "origin": "predicted",
         "latency_ms": [outcome.latency.ms, outcome.latency.low, outcome.latency.high],
         "regime": outcome.latency.regime, "memory_mb": outcome.memory_mb, "watts": outcome.watts,
-        "joules": outcome.joules, "execute": spec.executed, "control_hz": spec.control_hz,
+        "joules": outcome.joules, "execute": spec.executed_actions, "control_hz": spec.control_hz,
         "phases": [
             {"name": bound.phase.name, "runs": bound.phase.runs, "ms": bound.phase.ms, "shares": dict(bound.shares),
              "parts": parts_of(bound.phase, load.graphs[bound.phase.name], model.shares)}

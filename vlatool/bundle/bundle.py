@@ -48,7 +48,6 @@ class Bundle:
         """Read the manifest, check it against its digest, and check every file before anything else is parsed.
 
         Args:
-            path: the directory.
             verify: whether to check that the files are exactly those of the manifest, by size and SHA-256.
 
         Raises:

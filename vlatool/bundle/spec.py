@@ -241,10 +241,10 @@ class PolicySpec:
     @property
     def inference_hz(self) -> float:
         """Inferences per second that the control rate and the executed part of the chunk ask for."""
-        return self.control_hz / self.executed
+        return self.control_hz / self.executed_actions
 
     @property
-    def executed(self) -> int:
+    def executed_actions(self) -> int:
         """Actions of an inference that are executed."""
         return self.execute or self.chunk
 

@@ -90,7 +90,7 @@ class Recording:
             chosen: (N,) whether each observation is one of them.
         """
         inputs = {
-            name: values.only(chosen) if isinstance(values, Rows) else values[chosen]
+            name: values.select(chosen) if isinstance(values, Rows) else values[chosen]
             for name, values in self.inputs.items()
         }
         actions = None if self.actions is None else self.actions[chosen]

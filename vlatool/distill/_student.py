@@ -22,9 +22,6 @@ def student_steps(text: str) -> tuple[tuple[str, dict[str, Any]], ...]:
         text: ``depth=0.5,width=0.75``, or one of them: the share of the blocks of each stack, and the share of the
             multiply-accumulates, that stay. None are made of an empty one.
 
-    Raises:
-        RecipeError: when it says something else, or takes nothing away.
-
     Example:
         >>> student_steps("width=0.75, depth=0.5")
         (('prune.depth', {'ratio': 0.5}), ('prune.structured', {'ratio': 0.25}))

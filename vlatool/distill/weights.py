@@ -58,7 +58,6 @@ def check_tensors(modules: Mapping[str, nn.Module], stored: Mapping[str, Any], w
     """See that a file holds the weights of modules and nothing else.
 
     Args:
-        modules: graph name -> module.
         stored: name -> tensor; a name may have that of the graph before it.
         where: the file, for messages.
 

@@ -114,7 +114,6 @@ def write_directory(final: Path, *, force: bool = False, damaged: bool = False) 
     anything exactly one succeeds.
 
     Args:
-        final: path of the directory.
         force: whether to replace an unchanged directory that vlatool wrote.
         damaged: whether to replace any directory, moving aside what vlatool did not write (for the cache).
 

@@ -86,7 +86,6 @@ def check_limit(name: str, got: int, where: str, error: type[VlatoolError]) -> N
     """Refuse a value above a limit.
 
     Args:
-        name: name of the limit.
         got: value, in the unit of the limit.
         where: what has that value, as the start of a sentence.
         error: class of the error that is raised.

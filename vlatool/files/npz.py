@@ -85,7 +85,6 @@ def open_rows(
     The whole file is read once, in blocks: a damaged one is refused here and not later.
 
     Args:
-        path: path of the file.
         allowed: name of the limit on the total size of all arrays.
         in_memory: size of the largest array of numbers that is held in memory. Text, and arrays in Fortran's order, in
             which a row is scattered, are held in memory whatever their size.

@@ -101,7 +101,6 @@ def refuse_inputs(final: Path, inputs: Iterable[str | os.PathLike[str] | None]) 
     and is written again.
 
     Args:
-        final: path of the output.
         inputs: what the command reads, as the user wrote it: files, directories, ``path.py:make``; None and names that
             are not files are ignored.
 
@@ -126,7 +125,6 @@ def output_errors(final: Path, *, cache: bool = False) -> Iterator[None]:
     """Turn the operating system's errors of writing into an error of one sentence that names the output.
 
     Args:
-        final: path of the output.
         cache: whether it lies in vlatool's cache, so that another output would not help.
 
     Raises:

@@ -242,7 +242,7 @@ class Rows:
             raise DataError(f"{self.where} was changed while it was read.", "run it again once nothing writes there")
         return array.astype(self.dtype, copy=False)
 
-    def only(self, chosen: NDArray[np.bool_]) -> Rows:
+    def select(self, chosen: NDArray[np.bool_]) -> Rows:
         """Return the rows of a mask, which stay on the disk, too.
 
         Args:

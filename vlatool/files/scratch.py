@@ -24,7 +24,6 @@ def rename_in_errors(path: Path, name: str, itself: str = "") -> Iterator[None]:
     """Replace a path in the errors that leave this block, of this process, of a child or of a library.
 
     Args:
-        path: directory.
         name: what replaces its path: another path, or empty to name its files relative to it.
         itself: what replaces the directory itself; ``name`` when empty.
     """

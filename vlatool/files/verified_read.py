@@ -142,7 +142,6 @@ def find_unlisted(root: Path, listed: set[str], free: tuple[str, ...], folder: s
     """Return the path of anything below ``root`` that is not listed, or nothing.
 
     Args:
-        root: directory.
         listed: relative paths that are expected.
         free: names of further regular files that may be at the top.
         folder: directory at the top that may contain regular files and directories of any name.
@@ -175,7 +174,6 @@ def verified_directory(root: Path, folder: str, files: dict[str, tuple[str, int]
     names, with the same time stamps.
 
     Args:
-        root: directory of the bundle.
         folder: folder in which the engine opens files.
         files: relative path below ``root`` -> SHA-256 and size.
 

@@ -30,7 +30,6 @@ def read_yaml(path: Path, what: str, raised: type[InputError]) -> Any:
     """Return the value in a YAML file.
 
     Args:
-        path: path of the file.
         what: name of the file, as the subject of a sentence: ``The recipe out/recipe.yaml``.
         raised: class of the errors.
 

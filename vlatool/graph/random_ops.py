@@ -59,7 +59,6 @@ def refuse_random_file(model: Any, path: Path) -> None:
 
     Args:
         model: An ``onnx.ModelProto``.
-        path: Path of the file.
 
     Raises:
         GraphError: with the operators, and how to declare the noise instead.

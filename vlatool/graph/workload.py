@@ -129,7 +129,6 @@ def graph_workload(
     """Count the work of one run of an ONNX file; a free first axis counts as 1.
 
     Args:
-        path: The file.
         parts: Part of the policy -> globs of module names, to count each by itself.
         count_as: Function that returns the category of a layer's multiply-accumulates.
 

@@ -35,7 +35,6 @@ def read_workload(file: Path, of: str = "") -> Workload | None:
     """Return the workload of a file; None when the file is missing, damaged or of another source.
 
     Args:
-        file: Path of the file.
         of: Expected ``digest``.
     """
     data = _content(file)

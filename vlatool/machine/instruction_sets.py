@@ -58,7 +58,7 @@ class BoardSet:
         return self.wanted if needed else ""
 
     @property
-    def confined(self) -> bool:
+    def is_confined(self) -> bool:
         """Whether OpenVINO computes in the board's set in this process, and ONNX Runtime in the host's own."""
         return bool(self.wanted) and not self.lacks and self.isa_limit == self.wanted != self.host
 
@@ -86,7 +86,7 @@ class BoardSet:
         """Say before the run what OpenVINO will compute in; empty where there is nothing to say."""
         if not self.wanted:
             return ""
-        if self.to_set or self.confined:
+        if self.to_set or self.is_confined:
             return f"OpenVINO confined to {self.wanted}, in a process of its own; ONNX Runtime as this host is"
         if self.same_set:
             return f"OpenVINO in {self.wanted}, as this host is"
@@ -97,7 +97,7 @@ class BoardSet:
         if self.same_set:
             return (f"This host has the instruction set of {self.board} ({self.wanted}) on another core: errors and "
                     "ratios are of that set, milliseconds are this host's.",)  # fmt: skip
-        if not self.confined:
+        if not self.is_confined:
             return ()
         return (
             f"OpenVINO was confined to {self.wanted}, the instruction set of {self.board}: its errors are of that set, "
@@ -109,14 +109,14 @@ class BoardSet:
 
     def about_errors(self) -> tuple[str, ...]:
         """Say what errors alone are those of, where OpenVINO is or can be confined to the board's set."""
-        if self.confined or self.to_set:
+        if self.is_confined or self.to_set:
             sentence = f"OpenVINO was confined to {self.wanted}, the instruction set of {self.board}"
             return (f"{sentence}: its answers are of that set.",)
         return (f"This host has the instruction set of {self.board} ({self.wanted}).",) if self.same_set else ()
 
     def warnings(self) -> tuple[str, ...]:
         """Say where this host's figures are not those of the board's set, what that means, and what to do."""
-        if not self.wanted or self.confined or self.same_set:
+        if not self.wanted or self.is_confined or self.same_set:
             return ()
         if self.isa_limit:
             return (f"ONEDNN_MAX_CPU_ISA={self.isa_limit} is set, so that OpenVINO computes neither as {self.board} "
@@ -185,7 +185,6 @@ def compare_sets(board: str, features: Collection[str], host: Collection[str], i
     """Return a board's set beside this host's.
 
     Args:
-        board: name of the profile.
         features: features of the board's processor.
         host: features of this host's processor.
         isa_limit: what ``ONEDNN_MAX_CPU_ISA`` says.

@@ -30,7 +30,6 @@ def python_command(module: str, arguments: Sequence[str] = (), path: Sequence[st
     Neither the current directory nor variables of Python choose what it imports, but ``import_path()`` alone.
 
     Args:
-        module: its full name.
         arguments: ``sys.argv[1:]`` of the module.
         path: where modules are imported from; ``import_path()`` when None.
     """

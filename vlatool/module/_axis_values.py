@@ -41,11 +41,7 @@ class Values:
         return found if isinstance(found, list) and (not found or isinstance(found[0], tuple)) else None
 
     def shape_of(self, node: Any) -> Shape:
-        """Return the axes of an argument.
-
-        Raises:
-            TypeError: when it is not a tensor.
-        """
+        """Return the axes of an argument."""
         shape = self.shape(node) if hasattr(node, "op") else None
         if shape is None:
             raise TypeError("no tensor")

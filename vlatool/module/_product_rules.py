@@ -163,11 +163,7 @@ def _gates(walk: Values, node: Any, read: Axis, weights: Sequence[Any], lead: Sh
     """Unite the axes of a recurrent layer's weights; return that of its hidden units.
 
     Args:
-        walk: walk of the graph.
-        node: what it reads.
-        read: axis of that.
         weights: of the input (gates x hidden, read), of the state (gates x hidden, hidden), biases (gates x hidden).
-        lead: axes over which the layer runs.
     """
     first, second = walk.shape_of(weights[0]), walk.shape_of(weights[1])
     walk.contract(node, read, weights[0], first[1])

@@ -23,7 +23,6 @@ class Resizer:
     """Writes the new sizes into operators that state some.
 
     Args:
-        walk: walk of the graph.
         keep: factor -> its elements that stay.
     """
 
@@ -31,11 +30,7 @@ class Resizer:
         self._walk, self._keep = walk, keep
 
     def resize(self, node: Any) -> None:
-        """Change one operator.
-
-        Raises:
-            RuntimeError: naming operator and layer, for a form of the operator that is not known here.
-        """
+        """Change one operator."""
         if node.op != "call_function":
             return
         name = getattr(node.target, "_opname", "")

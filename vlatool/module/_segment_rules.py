@@ -16,11 +16,7 @@ SPLITS = ("chunk", "split", "split_with_sizes", "tensor_split", "unsafe_chunk", 
 
 
 def along_of(node: Any, rank: int) -> int:
-    """Return the axis that an operator joins or splits.
-
-    Raises:
-        ValueError: for a vector, or a value that the operator makes a matrix of first.
-    """
+    """Return the axis that an operator joins or splits."""
     fixed = FIXED_AXES.get(node.target._opname)
     if fixed is None:
         return int(argument(node, "dim", 0)) % rank
@@ -80,13 +76,7 @@ def _put_slice(walk: Values, node: Any) -> Shape:
 
 
 def _piece(walk: Values, node: Any, like: Any) -> tuple[Shape, int]:
-    """Return the axes of a slice, and the axis that it is one of.
-
-    Args:
-        walk: walk of the graph.
-        node: node with the arguments of a slice.
-        like: node whose value has its sizes.
-    """
+    """Return the axes of a slice, and the axis that it is one of."""
     given = walk.shape_of(node.args[0])
     along = argument(node, "dim", 0) % len(given)
     whole, count = walk.factors.size(given[along]), sizes_of(like.meta["val"])[along]

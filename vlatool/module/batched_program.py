@@ -195,11 +195,7 @@ class BatchedProgram:
         return fed
 
     def _kept_output(self, name: str, value: Tensor, size: int) -> Tensor:
-        """Return what a module gave for a kept value, with the batch before its shape.
-
-        Raises:
-            SourceError: when it has another shape than the program declares.
-        """
+        """Return what a module gave for a kept value, with the batch before its shape."""
         shape, axis = list(self.kept[name]["shape"]), self._batch_axis(name) if size > 1 else 0
         wanted = [*shape[:axis], size, *shape[axis + 1 :]] if size > 1 else shape
         if list(value.shape) != wanted:
@@ -212,11 +208,7 @@ class BatchedProgram:
         return value.movedim(axis, 0).unsqueeze(axis + 1) if size > 1 else value[None]
 
     def _batch_axis(self, name: str) -> int:
-        """Return the axis of a kept value in which a batch is: the one that modules take, or the next of size 1.
-
-        Raises:
-            SourceError: when no axis has the size 1.
-        """
+        """Return the axis of a kept value in which a batch is: the one that modules take, or the next of size 1."""
         shape = self.kept[name]["shape"]
         ones = [axis for axis, size in enumerate(shape) if size == 1]
         if not ones:
@@ -313,8 +305,6 @@ def draw_noise(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.ran
 
     Args:
         noise: value name -> shape and distribution, as the program has them.
-        size: size of the batch.
-        random: generator of random numbers.
     """
     torch = require("torch", "build")
     batches = {name: {**wanted, "shape": (size, *wanted["shape"][1:])} for name, wanted in noise.items()}

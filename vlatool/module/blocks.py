@@ -15,7 +15,6 @@ def stacks(module: nn.Module, *, mixed: bool = False) -> Iterator[tuple[str, Any
     """Yield (name, stack) of every list or sequence of at least two modules of one class with equal weights' shapes.
 
     Args:
-        module: module that is searched.
         mixed: whether to yield also lists of modules of several kinds, such as layers that alternate.
     """
     nn = require("torch", "build").nn

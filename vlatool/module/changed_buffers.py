@@ -24,7 +24,6 @@ def refuse_changed_buffers(exported: Any, graph: str) -> None:
 
     Args:
         exported: A ``torch.export.ExportedProgram``.
-        graph: name of the graph.
 
     Raises:
         SourceError: naming the first one.

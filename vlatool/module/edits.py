@@ -186,8 +186,6 @@ def refuse_traced(bundle: Bundle, what: str, command: str) -> None:
     """Refuse a policy that lost units: its parts are those of a trace, and not of the classes that it was made of.
 
     Args:
-        bundle: the policy.
-        what: parts that would be looked for by their class.
         command: command that looks for them.
 
     Raises:
@@ -290,7 +288,6 @@ def save_tensors(path: Path, tensors: Mapping[str, Any], about: Mapping[str, str
     """Write a safetensors file.
 
     Args:
-        path: path of the new file.
         tensors: name -> tensor.
         about: texts that go with them.
 
@@ -313,9 +310,7 @@ def stream_tensors(
     """Write a safetensors file of tensors that come one after the other, so that one is in memory at a time.
 
     Args:
-        path: path of the new file.
         forms: name -> dtype and shape, in the order in which they come.
-        tensors: the tensors.
         about: texts that go with them.
 
     Raises:

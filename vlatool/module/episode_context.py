@@ -51,7 +51,6 @@ def passages(bundle: Bundle, program: BatchedProgram, noise: Values, count: int,
     begins is exact.
 
     Args:
-        bundle: bundle of the policy.
         program: the policy as it is.
         noise: what it draws, each time.
         count: count of observations at most.

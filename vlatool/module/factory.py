@@ -187,11 +187,7 @@ def _check_package(factory: str) -> None:
 
 
 def _check_own(make: Any, factory: str) -> None:
-    """Refuse a function that the named package only imports from elsewhere.
-
-    Raises:
-        SourceError: naming the module that defines it.
-    """
+    """Refuse a function that the named package only imports from elsewhere; name the module that defines it."""
     package = split_factory(factory)[0].partition(".")[0]
     module = str(getattr(make, "__module__", None) or type(make).__module__)
     if module.partition(".")[0] != package:

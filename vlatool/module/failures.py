@@ -137,7 +137,6 @@ def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
 
     Args:
         error: what ``torch.onnx.export`` raised.
-        graph: name of the graph.
         module: the torch module that was exported.
     """
     chain = list(_chain(error))

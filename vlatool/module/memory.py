@@ -42,10 +42,6 @@ def refuse_hidden_state(bundle: Bundle, modules: Mapping[str, nn.Module]) -> Non
     What changes modules looks before it begins: a trace holds for ever what an attribute was, and a training of single
     observations learns nothing of it.
 
-    Args:
-        bundle: bundle of the policy.
-        modules: graph name -> module.
-
     Raises:
         SourceError: naming the attribute.
     """

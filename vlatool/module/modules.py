@@ -14,7 +14,6 @@ def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
 
     Args:
         product: a module, a program of ``torch.export``, or a mapping of graph names to them.
-        graphs: names of the program's graphs.
 
     Raises:
         SourceError: when one is missing or is something else.

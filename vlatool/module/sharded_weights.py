@@ -78,11 +78,7 @@ def stored_modules(bundle: Bundle) -> StoredModules:
 
 
 def _locate(graph: str, made: MetaModules, shards: Mapping[str, StoredTensor], file: Path) -> dict[str, StoredTensor]:
-    """Return where the bytes of every parameter and saved buffer are: name -> tensor.
-
-    Raises:
-        SourceError: naming the first tensor that is missing or has another shape.
-    """
+    """Return where the bytes of every parameter and saved buffer are: name -> tensor."""
     names: dict[int, list[str]] = {}
     for name, value in made.made[graph]:
         names.setdefault(id(value), []).append(name)

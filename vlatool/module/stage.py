@@ -88,9 +88,7 @@ class ModuleStage(Transform):
         """Change weights in place, and return what else is to be changed.
 
         Args:
-            modules: graph name -> module, as the source has it.
             source: bundle with the recordings.
-            context: context of the run, for progress.
         """
         raise NotImplementedError(self.name())
 
@@ -153,11 +151,7 @@ class ModuleStage(Transform):
 
 @contextlib.contextmanager
 def _name_bad_weights(modules: Callable[[], Mapping[str, nn.Module]]) -> Iterator[None]:
-    """Say of an answer that is not finite which weight makes it so, where one does.
-
-    Raises:
-        SourceError: naming the first weight that is not finite.
-    """
+    """Say of an answer that is not finite which weight makes it so, where one does."""
     try:
         yield
     except GraphError as error:
@@ -182,11 +176,7 @@ def _structure(bundle: Bundle) -> str:
 
 
 def _run_once(bundle: Bundle) -> None:
-    """Run a policy whose weights are in shards: with their values where that is quick, with shapes alone else.
-
-    Raises:
-        SourceError: when it fails.
-    """
+    """Run a policy whose weights are in shards: with their values where that is quick, with shapes alone else."""
     stored = stored_modules(bundle)
     if stored.nbytes < MAX_RUN_BYTES:
         answered = off_the_robot("the first observation", OF_THE_POLICY)

@@ -41,7 +41,6 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
 
     Args:
         arguments: one tensor for each feed of the step, real or fake.
-        options: options of ``torch.onnx.export``.
 
     Raises:
         GraphError: when torch cannot, or the graph would draw random numbers.

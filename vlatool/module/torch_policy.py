@@ -57,11 +57,7 @@ def unedited_modules(source: Bundle) -> dict[str, nn.Module]:
 
 
 def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> None:
-    """Fill a module from shards whose tensors are named as in ``state_dict()``, or ``GRAPH.`` before that.
-
-    Raises:
-        SourceError: when a tensor is missing or has another shape.
-    """
+    """Fill a module from shards whose tensors are named as in ``state_dict()``, or ``GRAPH.`` before that."""
     stored: dict[str, Any] = {}
     for file in shard_files(folder, pattern):
         read_header(file)
@@ -73,7 +69,6 @@ def torch_policy(source: Bundle, seed: int | None = None) -> Policy:
     """Open a source bundle in eager torch behind the interface of the runtime's policy.
 
     Args:
-        source: source of a torch policy.
         seed: seed of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
     """
     return policy_of(source, load_modules(source), seed)

@@ -104,11 +104,7 @@ def _for_any_batch(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[E
 
 
 def _run(module: nn.Module, feeds: Sequence[Tensor]) -> None:
-    """Run what is left of a module.
-
-    Raises:
-        RuntimeError: when it fails, which is a fault of the cut and not of the policy.
-    """
+    """Run what is left of a module; where that fails, it is a fault of the cut and not of the policy."""
     torch = require("torch", "build")
     try:
         with torch.no_grad():
@@ -147,11 +143,7 @@ def _remove_units(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Ed
 
 
 def _leaf(walk: Walk, edit: Edit) -> int:
-    """Return the factor that an edit names.
-
-    Raises:
-        SourceError: when there is none, or it is smaller.
-    """
+    """Return the factor that an edit names."""
     axis, *path = edit.path
     shape = walk.weights.get(edit.module, [])
     atoms = {atom.path: atom.leaf for atom in walk.factors.atoms(shape[axis])} if axis < len(shape) else {}

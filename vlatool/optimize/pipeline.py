@@ -234,7 +234,7 @@ def _measured(
 def _enough(plan: Plan) -> Enough | None:
     """Return what ends the episodes: a candidate that keeps to the limits, where measured latencies decide."""
     board = plan.profile.engine if plan.profile else DEFAULT_ENGINE
-    if plan.recipe.effort.every_candidate or plan.board_set.confined or board not in engine_names():
+    if plan.recipe.effort.every_candidate or plan.board_set.is_confined or board not in engine_names():
         return None
 
     def enough(row: Row, baseline: Row) -> bool:
@@ -257,7 +257,7 @@ def judged_rows(
     on_board = plan.on_board
     judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
     small = plan.recipe.limits.max_memory_mb is not None
-    if plan.profile and plan.board_set.confined:
+    if plan.profile and plan.board_set.is_confined:
         judged = choose_apart(judged, engines or {}, tuple(plan.profile.engines), plan.board_set, small)
     else:
         elsewhere = "" if on_board else plan.board

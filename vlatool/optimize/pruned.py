@@ -129,7 +129,7 @@ class PrunedSearch:
         return candidate(transforms(stages), self.source, self.baseline, self.plan, self.context)
 
     def _speedup(self, bundle: Bundle) -> float:
-        engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self.plan.board_set.confined else ""
+        engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self.plan.board_set.is_confined else ""
         threads = self.plan.recipe.effort.threads
         timing = Latency(against=(bundle.path,), iterations=TIMED, threads=threads, engine=engine, **QUICK)
         return cached_measure(timing, self.baseline, self.plan.cache, self.context).rows[-1].value(SPEEDUP)

@@ -117,7 +117,7 @@ class Search:
         self.trials: list[Trial] = []
         self._seen: dict[str, str] = {}
         self._begun = time.monotonic()
-        self._apart = board_set(self.profile).confined
+        self._apart = board_set(self.profile).is_confined
         self._planned = 1
         self._layers: list[LayerError] | None = None
         self._observations = recorded_observations(self.baseline, RECORDED)

@@ -101,7 +101,7 @@ def about_int8(rows: Mapping[str, Row], engines: Mapping[str, str], where: Board
         f"{where.board} has no VNNI: int8 products are added in pairs of 16 bits there, which can saturate, and int8 "
         "may be slower than float32. "
     )
-    if not (where.confined or where.same_set):
+    if not (where.is_confined or where.same_set):
         return (f"{words}Whether it is was not measured: OpenVINO does not compute in that set here.",)
     words += "It was tried all the same: "
     tried = {name: speedup for name, row in rows.items()
@@ -111,7 +111,7 @@ def about_int8(rows: Mapping[str, Row], engines: Mapping[str, str], where: Board
     name, fastest = max(tried.items(), key=lambda pair: pair[1].value)
     low, high = fastest.low or fastest.value, fastest.high or fastest.value
     verdict = "it loses there" if high < 1 else "it wins there" if low > 1 else "it is not shown to win there"
-    of = f"{IN_OPENVINO}, of {where.ratio}" if where.confined else "float32"
+    of = f"{IN_OPENVINO}, of {where.ratio}" if where.is_confined else "float32"
     return (f"{words}{name} is {fastest.value:.2f}x ({low:.2f} to {high:.2f}) as fast as {of}; {verdict}.",)
 
 

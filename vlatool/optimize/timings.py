@@ -51,7 +51,7 @@ class Timing:
             bundles: Name -> bundle, float32 first.
         """
         (base, baseline), *_ = bundles.items()
-        if not self.where.confined:
+        if not self.where.is_confined:
             torch = [source] if source.manifest.source and source.path != baseline.path else []
             return self._timed(bundles, torch)
         own = {name: bundle for name, bundle in bundles.items() if name != base and engine_of(bundle) == ENGINE}
@@ -112,7 +112,7 @@ def _noted(row: Row, what: str) -> tuple[Measurement, ...]:
 
 def placed(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> dict[str, Row]:
     """Return the rows with OpenVINO's measurements placed where they were taken, if that is a host that is confined."""
-    if not where.confined:
+    if not where.is_confined:
         return dict(rows)
 
     def moved(number: Measurement) -> Measurement:
@@ -136,7 +136,7 @@ def foretold_by_engine(
     """
     predicted = {name: predictions(profile, bundle) for name, bundle in bundles.items()}
     (base, baseline), *_ = bundles.items()
-    own = predictions(profile, baseline, ENGINE) if where.confined else []
+    own = predictions(profile, baseline, ENGINE) if where.is_confined else []
     predicted[base] += [OPENVINO_FLOAT32_P50.relabel(number) for number in own if number.name == LATENCY_P50.name]
     return predicted
 

@@ -23,9 +23,6 @@ def action_gradients(actions: Iterable[Any], values: Mapping[Key, Any]) -> Itera
     Args:
         actions: Raw actions, computed one by one from the values.
         values: Tensors that require gradients.
-
-    Raises:
-        SourceError: when the policy gives actions without gradients.
     """
     torch = require("torch", "build")
     random = torch.Generator().manual_seed(SEED)

@@ -30,9 +30,7 @@ class BlockRanking:
     """Effect of blocks on the action, on recorded observations.
 
     Args:
-        modules: Graph name -> module.
         source: Bundle with the program and the encoding of observations.
-        samples: Largest number of observations.
     """
 
     def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> None:

@@ -36,7 +36,6 @@ class LatencyMeter:
         engine: Engine of the runtime; the default one when empty.
         threads: Number of intra-op threads.
         made_by: Entry for the manifests of the exports.
-        context: Receiver of progress.
     """
 
     def __init__(
@@ -93,11 +92,7 @@ class LatencyPredictor(LatencyMeter):
         super().__init__(*others)
 
     def times(self, edit_lists: Sequence[Sequence[Edit]]) -> tuple[float, list[float]]:
-        """Return the milliseconds of the unpruned policy, and of each list of edits.
-
-        Raises:
-            RecipeError: when the latency model has no data for this board and engine.
-        """
+        """Return the milliseconds of the unpruned policy, and of each list of edits."""
         whole, *others = (self._ms(path) for path in [self._unpruned, *self._export_each(edit_lists)])
         return whole, others
 

@@ -54,11 +54,7 @@ def describe_reduction(record: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def refuse_shortfall(bundle: Bundle) -> None:
-    """Refuse a bundle whose pruning missed the requested reduction by more than a tenth.
-
-    Raises:
-        FallsShort: with the operators that keep the rest, and their shares of the remaining work.
-    """
+    """Refuse a bundle whose pruning missed the requested reduction by more than a tenth."""
     record = bundle.manifest.made_by[PRUNED_KEY]
     if record["reached"] >= MIN_REACHED * record["asked"]:
         return

@@ -25,11 +25,7 @@ class Selection:
     parts: tuple[str, ...] = ()
 
     def check(self, names: Sequence[str], what: str) -> None:
-        """Refuse a pattern that matches nothing.
-
-        Raises:
-            RecipeError: naming the pattern and the nearest name.
-        """
+        """Refuse a pattern that matches nothing."""
         for pattern in (*self.include, *self.exclude):
             if not any(matches(name, (pattern,)) for name in names):
                 raise RecipeError(
@@ -52,7 +48,6 @@ def protected_parts(parts: Mapping[str, Sequence[str]], words: Sequence[str]) ->
 
     Args:
         parts: Name of a part, such as ``action_head`` -> globs of modules.
-        words: Protected words.
     """
     return tuple(pattern for name, globs in parts.items() if _has_word(name, words) for pattern in globs)
 

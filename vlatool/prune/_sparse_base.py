@@ -30,7 +30,7 @@ PATTERNS = {"2:4": (2, 4), "4:8": (4, 8)}
 Pattern = Literal["unstructured", "2:4", "4:8"]
 MAX_NAMED = 8
 """Largest number of layers in a message; the others are counted."""
-PROTECTED = ("embed", "norm", "head", "action")
+PROTECTED_WORDS = ("embed", "norm", "head", "action")
 """Words in the names of layers that stay dense unless --include names them."""
 
 
@@ -51,11 +51,7 @@ class SparsePruning(ModuleStage):
     exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
-        """Set weights to zero.
-
-        Raises:
-            RecipeError: when no layer is chosen, or the ratio is not that of the pattern.
-        """
+        """Set weights to zero."""
         check_pattern(self.pattern, self.ratio)
         selection = select_layers(modules, source, self.include, self.exclude)
         context.messages.extend(selection.describe())
@@ -115,11 +111,7 @@ class SparsePruning(ModuleStage):
 
 
 def check_pattern(pattern: Pattern, ratio: float) -> None:
-    """Refuse a ratio that is not that of the pattern.
-
-    Raises:
-        RecipeError: saying so.
-    """
+    """Refuse a ratio that is not that of the pattern."""
     if pattern != "unstructured" and ratio != 0.5:
         raise RecipeError(f"The pattern {pattern} keeps half of the weights.", "leave --ratio out")
 
@@ -186,9 +178,6 @@ def select_layers(
     """Select the layers to prune; embeddings, norms, heads and output layers stay, unless included.
 
     A layer that several graphs share belongs to the first one; likewise a weight that several layers share.
-
-    Raises:
-        RecipeError: when a pattern matches none, or there is none.
     """
     found: dict[int, tuple[tuple[str, str], Any]] = {}
     for graph, module in modules.items():
@@ -197,7 +186,7 @@ def select_layers(
                 found.setdefault(id(part.weight), ((graph, name), part))
     named = dict(found.values())
     full = {(graph, name): f"{graph}.{name}" if len(modules) > 1 else name for graph, name in named}
-    selection = Selection(include, exclude, PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
+    selection = Selection(include, exclude, PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS))
     selection.check([*full.values(), *(name for _, name in named)], "layer")
     outputs = output_layers(modules, source, named.values()) if not include else set()
     prunable = {

@@ -34,7 +34,6 @@ class UnitGroup:
     """Units that are removed together with all their weights: heads of an attention, neurons of an MLP, channels.
 
     Args:
-        graph: Name of the graph.
         leaf: Factor of ``vlatool.module.axes``.
         size: Number of units.
         members: Axes of weights that contain the units.
@@ -89,11 +88,7 @@ class UnitGroup:
 
 
 def trace_walks(modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Walk]:
-    """Trace the modules of a policy; return graph name -> its axes.
-
-    Raises:
-        SourceError: when torch.export cannot trace a module.
-    """
+    """Trace the modules of a policy; return graph name -> its axes."""
     return {graph: Walk(trace_module(modules[graph], feeds)) for graph, feeds in first_feeds(modules, source).items()}
 
 
@@ -101,13 +96,8 @@ def find_groups(walks: Mapping[str, Walk], selection: Selection, multiple: int, 
     """Return all groups of removable units; none where operators keep all of them.
 
     Args:
-        walks: Graph name -> axes.
         selection: Selection of weights.
         multiple: Number of neurons or channels to remove at a time; heads go one by one.
-        name: Name of the policy.
-
-    Raises:
-        RecipeError: when a pattern matches no weight, or everything removable is excluded.
     """
     groups = []
     names: list[str] = []
@@ -141,15 +131,9 @@ def rank_units(
     """Set the importance of all units.
 
     Args:
-        groups: Groups of the modules.
         rank: ``gate``: the expected squared change of the action when a unit is scaled; ``magnitude``: the norms of
             the weights that write and that read it; ``random``.
-        modules: Graph name -> module.
         source: Bundle with recorded observations.
-        samples: Number of observations.
-
-    Raises:
-        SourceError: when the policy gives actions without gradients.
     """
     if rank == "random":
         random = np.random.default_rng(SEED)
@@ -180,7 +164,6 @@ class Macs:
     """Counter of the multiply-accumulates of one inference.
 
     Args:
-        walks: Graph name -> walk.
         runs: Graph name -> number of runs.
         groups: Groups of removable units.
     """

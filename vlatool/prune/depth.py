@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from vlatool.hardware.profile import Profile
 
-PROTECTED = (
+PROTECTED_WORDS = (
     "vision", "visual", "image", "vit", "encoder", "projector", "connector", "head", "decoder", "action", "expert"
 )  # fmt: skip
 """Words in the names of modules whose blocks stay unless --include names them. Perception and action are less redundant
@@ -144,7 +144,7 @@ class Depth(ModuleStage):
                 "class, each with an output like its input.",
                 "prune widths instead: vlatool prune neurons",
             )
-        selection = Selection(self.include, self.exclude, PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
+        selection = Selection(self.include, self.exclude, PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS))
         selection.check(names, "stack of blocks")
         selected = {(graph, name): size for (graph, name), size in sizes.items() if selection.selects((name,))}
         if not selected:
@@ -161,11 +161,7 @@ def _list_stacks(sizes: Mapping[StackId, int]) -> str:
 
 
 def _explicit_blocks(sizes: Mapping[StackId, int], keep: Sequence[int]) -> dict[StackId, list[int]]:
-    """Return the same blocks for each stack.
-
-    Raises:
-        RecipeError: when the stacks differ in length, a block does not exist, or all stay.
-    """
+    """Return the same blocks for each stack."""
     if len(set(sizes.values())) > 1:
         raise RecipeError(
             f"--keep numbers the blocks of stacks of one length; these differ: {_list_stacks(sizes)}.",

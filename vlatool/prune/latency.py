@@ -37,7 +37,7 @@ from vlatool.prune._latency_meter import LatencyMeter, LatencyPredictor
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune._trials import Trials
 from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, no_units, rank_units, trace_walks
-from vlatool.prune.depth import PROTECTED
+from vlatool.prune.depth import PROTECTED_WORDS
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -100,12 +100,7 @@ class LatencyPruning(ModuleStage):
 
     @model_validator(mode="after")
     def _check_board(self) -> Self:
-        """Refuse an unknown board, an engine that it lacks, or ``threads``: predictions are for whole boards.
-
-        Raises:
-            ProfileError: with the known boards or engines.
-            RecipeError: for ``threads``.
-        """
+        """Refuse an unknown board, an engine that it lacks, or ``threads``: predictions are for whole boards."""
         if self.board and not self.chosen:
             board = load_profile(self.board)
             _ = Candidate(board, board.default_mode, self.engine or board.engine).figures
@@ -180,7 +175,7 @@ class LatencyPruning(ModuleStage):
         """Return the stacks that may lose blocks, with the importance of each block; none for a policy without any."""
         if not self.blocks or self.rank != "gate":
             return []
-        protected = Selection((), (), PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
+        protected = Selection((), (), PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS))
         found = [
             Stack(lists, tuple(name for name, _ in blocks.named_children()))
             for lists, blocks in stacks_of(modules)
@@ -230,12 +225,7 @@ class LatencyPruning(ModuleStage):
 
 
 def _parse_edits(text: str) -> tuple[Edit, ...]:
-    """Return the edits that an earlier run chose.
-
-    Raises:
-        SourceError: when the text is not a list of edits.
-        RecipeError: when it is an empty list.
-    """
+    """Return the edits that an earlier run chose."""
     edits = edits_from(text, "--chosen")
     if not edits:
         raise RecipeError("--chosen is an empty list: nothing would be pruned.", "omit it for a new selection")

@@ -61,10 +61,8 @@ class Structured(ModuleStage):
         """Remove units from ranked groups.
 
         Args:
-            walks: Graph name -> its axes.
             groups: Groups of units, ranked.
             runs: Graph name -> number of runs in an inference.
-            context: Receiver of progress.
         """
         work = Macs(walks, runs, groups)
         self._remove(groups, work, context)

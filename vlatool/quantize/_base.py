@@ -231,7 +231,6 @@ def describe_float_layers(name: str, model: Any) -> list[str]:
     """Describe the recurrent layers of a graph, whose products stay in float32; an empty list without such layers.
 
     Args:
-        name: Name of the graph.
         model: An ``onnx.ModelProto``.
     """
     layers = [node.name for node in model.graph.node if node.op_type in RECURRENT]

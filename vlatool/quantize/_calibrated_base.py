@@ -60,9 +60,6 @@ class CalibratedQuantization(Quantization):
 
         Args:
             bundle: Bundle whose own recording is used when no other is given.
-
-        Raises:
-            DataError: when there is none.
         """
         recording = calibration_recording(bundle, self.calibration)
         if recording is None:
@@ -82,9 +79,6 @@ class CalibratedQuantization(Quantization):
         Args:
             bundle, values, context, exempt: As for ``calibrate``.
             samples: Collector of the hash of each sample.
-
-        Raises:
-            DataError, GraphError: see ``calibrate``.
         """
         uses_played = not self.calibration and PLAYED in bundle.manifest.files
         if uses_played and calibration_recording(bundle) is None:

@@ -18,16 +18,11 @@ engine_class(sys.argv[1])(Path(sys.argv[2]), 1)
 
 
 def open_in_child(path: Path, engine: str, precision: str, remedy: str) -> None:
-    """Open a graph in a child process.
+    """Open a graph in a child process; refuse it when that crashes, and leave other refusals to the engine itself.
 
     Args:
-        path: The graph.
-        engine: Engine that will run it; the default one when empty.
         precision: Precision of its quantized layers.
         remedy: Fix for the case that the engine crashes.
-
-    Raises:
-        GraphError: when the child was killed by a signal; a refusal is left to the engine's own message.
     """
     done = subprocess.run(python_code(CHILD_CODE, [engine, str(path)]), capture_output=True, check=False)
     if done.returncode < 0:

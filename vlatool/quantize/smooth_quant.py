@@ -118,14 +118,7 @@ class SmoothQuant(CalibratedQuantization):
         return [numbers[::2], numbers[1::2]]
 
     def _smooth(self, model: Any, group: SmoothingGroup, halves: list[Array], samples: int) -> dict[str, Any]:
-        """Smooth one activation in place and return a record of it.
-
-        Args:
-            model: An ``onnx.ModelProto``.
-            group: Activation and layers to smooth.
-            halves: Largest magnitude of each channel, for each part of the calibration.
-            samples: Number of calibration samples.
-        """
+        """Smooth one activation in place and return a record of it."""
         peaks = np.maximum.reduce(halves)
         excess = PeakExcess.between(halves[0], halves[-1], samples)
         median = float(np.median(peaks))
@@ -213,11 +206,7 @@ def _group_peaks(peaks: list[dict[str, dict[str, Array]]], graph: str, group: Sm
 
 
 def _check_same(source: Bundle, smoothed: Bundle) -> None:
-    """Refuse a bundle whose golden action is not the source's.
-
-    Raises:
-        GraphError: when it differs by more than float32 rounding explains.
-    """
+    """Refuse a bundle whose golden action is not the source's."""
     before, after = load_golden(source), load_golden(smoothed)
     if before is None or after is None or not _equal(before[:2], after[:2]):
         return

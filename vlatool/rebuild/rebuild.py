@@ -181,7 +181,6 @@ def rebuild(
 
     Args:
         bundle: the bundle to make again; verified.
-        context: context of the run, for progress.
         source: policy directory, ``path.py:make``, ONNX file, or a bundle that is the input of a recorded stage; where
             the policy was when the bundle was made, if not given.
         files: files that options name and that are not beside the source.
@@ -291,11 +290,7 @@ def _recorded_source(
 
 
 def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
-    """Return the stage of a source whose files have the recorded hashes.
-
-    Raises:
-        SourceError: naming each file that differs, what was got and what is recorded.
-    """
+    """Return the stage of a source whose files have the recorded hashes."""
     stage = source_stage(source)
     if stage.name() != entry["stage"]:
         raise SourceError(
@@ -324,11 +319,7 @@ def _short_hash(digest: str | None) -> str:
 
 
 def _noted_folders(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> Iterator[str]:
-    """Yield where the source may be: as the bundle or the cached source bundle notes.
-
-    Raises:
-        SourceError: when the user has neither named nor trusted that folder.
-    """
+    """Yield where the source may be: as the bundle or the cached source bundle notes."""
     description = next(iter(entries[0].get("files", {})), "policy.yaml")
     source_hash = entries[1].get("input") if len(entries) > 1 else bundle.hash
     cached = [path.parent for path in sorted((cache / "stages").glob(f"{entries[0]['stage']}-*/{MANIFEST}"))]

@@ -74,10 +74,6 @@ class Connection:
     Args:
         target: target, as ``ssh`` takes it.
         options: options of ssh, before vlatool's own.
-        connect_timeout_s: seconds for ssh to connect.
-
-    Raises:
-        MissingExtra: when there is no ssh.
     """
 
     def __init__(self, target: str, options: Sequence[str], connect_timeout_s: float) -> None:
@@ -122,11 +118,7 @@ class Connection:
         self._until += seconds
 
     def send(self, data: bytes) -> bool:
-        """Write bytes; False when the target had something to say before they were through.
-
-        Raises:
-            TargetError: when the connection ends or nothing moves.
-        """
+        """Write bytes; False when the target had something to say before they were through."""
         rest, moved = memoryview(data), time.monotonic()
         while rest:
             ready = self._ready(STALLED_S * 1000, self._in)
@@ -151,11 +143,7 @@ class Connection:
         return self.send(json.dumps(message).encode() + b"\n")
 
     def receive(self, timeout_s: float | None = None, *, alive: bool = False) -> dict[str, Any]:
-        """Return the next message, and send signs of life meanwhile when ``alive``.
-
-        Raises:
-            TargetError: when the connection ends, or nothing comes in time.
-        """
+        """Return the next message, and send signs of life meanwhile when ``alive``."""
         start = time.monotonic()
         while True:
             if alive and time.monotonic() >= self._due:
@@ -208,11 +196,7 @@ class Connection:
             self._err.close()
 
     def _ready(self, milliseconds: float, *more: IO[bytes]) -> list[IO[bytes]]:
-        """Wait until something can be read, or written to one of ``more``; what ssh says is taken in at once.
-
-        Raises:
-            TargetError: when the run takes longer than the limit.
-        """
+        """Wait until something can be read, or written to one of ``more``; what ssh says is taken in at once."""
         poll = select.poll()
         for stream in (self._out, *(() if self._err.closed else (self._err,))):
             poll.register(stream, select.POLLIN)

@@ -67,11 +67,7 @@ sys.exit(0 if good else 9)
 
 
 def packages_of(engines: Iterable[str]) -> tuple[str, ...]:
-    """Return numpy and the packages of the engines.
-
-    Raises:
-        UsageError: for an engine that is not known.
-    """
+    """Return numpy and the packages of the engines."""
     return ("numpy", *sorted({engine_class(name).package for name in engines}))
 
 

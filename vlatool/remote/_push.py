@@ -37,11 +37,7 @@ class Item:
     sha256: str = ""
 
     def pieces(self) -> Iterator[bytes]:
-        """Yield the content in pieces.
-
-        Raises:
-            BundleError: when the file is not what the manifest says.
-        """
+        """Yield the content in pieces."""
         if self.path is None:
             yield self.content
             return

@@ -36,21 +36,13 @@ class RunDirectory:
 
     @property
     def path(self) -> Path:
-        """Where it is.
-
-        Raises:
-            Refused: before it is made, and once it is removed.
-        """
+        """Path of the directory, while it exists."""
         if self._path is None:
             raise Refused("no place", "the directory of the run is gone")
         return self._path
 
     def make(self) -> None:
-        """Make it in the user's cache directory, or where temporary files go.
-
-        Raises:
-            Refused: when neither can be written to.
-        """
+        """Make it in the user's cache directory, or where temporary files go."""
         refusals = []
         for attempt in (self._cache, self._cache, self._cache, self._temporary):
             try:

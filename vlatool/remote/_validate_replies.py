@@ -61,11 +61,7 @@ class DiskFull:
 
 
 def parse(text: bytes | str, target: str) -> dict[str, Any]:
-    """Return a message of the target.
-
-    Raises:
-        TargetError: when it is not a mapping of plain values with finite numbers.
-    """
+    """Return a message of the target."""
     try:
         message = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
@@ -77,11 +73,7 @@ def parse(text: bytes | str, target: str) -> dict[str, Any]:
 
 
 def sane(value: Any, target: str, depth: int = 0) -> Any:
-    """Return a value with printable texts.
-
-    Raises:
-        TargetError: when it is nested too deep, or holds a number that is not finite or too large.
-    """
+    """Return a value with printable texts."""
     if depth > MAX_DEPTH:
         raise invalid_reply(target, f"a message has more than {MAX_DEPTH} levels")
     if isinstance(value, str):
@@ -96,11 +88,7 @@ def sane(value: Any, target: str, depth: int = 0) -> Any:
 
 
 def read(kind: type[T], value: Any, target: str, where: str) -> T:
-    """Return a reply of the target as an object of a type.
-
-    Raises:
-        TargetError: when it is not of that type.
-    """
+    """Return a reply of the target as an object of a type."""
     try:
         return from_json(kind, value, where)
     except ValueError as error:
@@ -108,11 +96,7 @@ def read(kind: type[T], value: Any, target: str, where: str) -> T:
 
 
 def python_of(facts: Any, target: str) -> Python:
-    """Return what the target says of a Python, each text on a line of its own.
-
-    Raises:
-        TargetError: when something of it is missing or of another type.
-    """
+    """Return what the target says of a Python, each text on a line of its own."""
     python = read(Python, facts, target, "python")
     return replace(
         python,

@@ -56,7 +56,6 @@ def measure_on(
         python: Python to use on the target; ``~/`` is the home directory there. When empty, the first of python3 and
             python3.13 to python3.10 that is new enough and imports numpy and the engine.
         ssh_options: options of ssh, before vlatool's own.
-        connect_timeout_s: seconds for ssh to connect.
 
     Returns:
         The agent's result, ``target``: python, architecture, kernel and packages there; no host, user or address; and
@@ -173,13 +172,7 @@ def _target_error(target: str, answer: Mapping[str, Any]) -> VlatoolError:
 
 
 def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell: OnProgress) -> dict[str, Any]:
-    """Pass on what the agent tells until it has ended, and return its result.
-
-    Args:
-        connection, target: connection, and name of the target.
-        paths: directory there -> the bundle's directory here, which messages name in its place.
-        tell: callback for progress.
-    """
+    """Pass on what the agent tells until it has ended, and return its result."""
     answer: Result | Raised | None = None
     while True:
         heard = connection.receive(alive=True)

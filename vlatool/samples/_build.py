@@ -33,7 +33,6 @@ def build(
 
     Args:
         architecture: Builds the module on torch's current device.
-        seed: Seed of the weights.
         dtype: Name of a floating torch dtype; weights are drawn in float32 and rounded to it.
         device: Where the module lives, the CPU when None. ``"meta"`` costs no memory and leaves the weights undefined.
         prefix: Full name of the module inside the policy, when it is a part: ``"language.layers.7"``.
@@ -68,8 +67,6 @@ def fill(module: nn.Module, seed: int, prefix: str = "") -> None:
 
     Args:
         module: Any module; parameters on the meta device stay as they are.
-        seed: Seed of the weights.
-        prefix: As for ``build``.
     """
     with torch.no_grad():
         for path, part in module.named_modules(prefix=prefix):

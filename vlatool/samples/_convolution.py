@@ -35,7 +35,6 @@ class ResNetFeatures(nn.Module):
 
     Args:
         widths: Channels of each stage; (64, 128, 256, 512) is ResNet-18.
-        features: Width of the output.
     """
 
     def __init__(self, widths: tuple[int, ...] = (64, 128, 256, 512), features: int = 1000) -> None:

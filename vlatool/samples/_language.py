@@ -123,7 +123,7 @@ class Past:
         """The cache of one layer."""
         return Past(self.keys[:, index], self.values[:, index], self.here)
 
-    def extended(self, key: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    def insert(self, key: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
         """Put one layer's new key and value, (B, shared_heads, 1, D) each, into their place."""
         return torch.where(self.here, key, self.keys), torch.where(self.here, value, self.values)
 
@@ -165,7 +165,7 @@ class DecoderLayer(nn.Module):
         """(B, T, width) -> tokens (B, T, width), key and value (B, shared_heads, T, D), or S for T with a past."""
         query, key, value = self.project(tokens, angles)
         if past is not None:
-            key, value = past.extended(key, value)
+            key, value = past.insert(key, value)
         return self.finish(tokens, query, key, value, mask), key, value
 
 
@@ -173,7 +173,6 @@ class Decoder(nn.Module):
     """A stack of layers with one position table.
 
     Args:
-        shape: Sizes.
         length: Largest number of positions.
     """
 
@@ -204,7 +203,6 @@ class Prefill(nn.Module):
     """A decoder over given embeddings, causal.
 
     Args:
-        shape: Sizes.
         length: Number of tokens.
     """
 

@@ -124,7 +124,6 @@ class OpenDecode(nn.Module):
     """One more action token.
 
     Args:
-        shape: Sizes.
         language: Shared with the prefill.
     """
 

@@ -84,7 +84,6 @@ class VisionEncoder(nn.Module):
     """Patches, learned positions and blocks.
 
     Args:
-        shape: Sizes.
         final_norm: Whether the tokens are normalised at the end.
     """
 
@@ -117,7 +116,6 @@ class VisionFeatures(nn.Module):
 
     Args:
         shape: Sizes; at least one register.
-        features: Width of the output.
     """
 
     def __init__(self, shape: VisionShape, features: int = 1000) -> None:

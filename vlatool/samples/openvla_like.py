@@ -46,7 +46,6 @@ def make(seed: int = 0, dtype: str = "float32", device: str | None = None) -> di
     """Return the policy in eval mode.
 
     Args:
-        seed: Seed of the weights.
         dtype: Name of a floating torch dtype.
         device: Where it lives, the CPU when None; ``"meta"`` costs no memory.
 

@@ -33,9 +33,6 @@ def add_switches(
         ranges: Value name -> (low, high), for every value of ``calibrated_values``; when None, ranges are computed at
             run time (uint8, DynamicQuantizeLinear).
         style: Quantization style of the layers.
-
-    Raises:
-        GraphError: when a range is missing, or a weight holds NaN or infinity.
     """
     selected = list(layers)
     quantized = load(path)
@@ -66,7 +63,6 @@ class _Pairs(OnnxGraph):
         """Return the nodes before an input of a layer, and the name of their output; none for an unquantized input.
 
         Args:
-            layer: Name of the node.
             index: Index of the input.
             source: Input of the copied QuantizeLinear.
             suffix: Suffix that makes the names of the copies unique.

@@ -78,12 +78,10 @@ def sensitivities(
     observations in float32; zero where the observations are not from a recording.
 
     Args:
-        bundle: A float32 bundle.
         stage: Stage that selects the layers and their style.
         ranges: Graph -> value -> (low, high), from ``ranges_of``; calibrated as the stage does when None. A missing
             graph gets its ranges at run time, as in dynamic int8.
         observations: Raw observations, at least one.
-        context: Receiver of progress.
         seconds: Time limit; no further observation is started that would exceed it, except the first one.
 
     Raises:

@@ -69,11 +69,7 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
 
 
 def measure_in_child(environment: Mapping[str, str], stage: Measure, source: Bundle, context: Context) -> Report:
-    """Run a measuring stage in a child process that has further variables from its start.
-
-    Raises:
-        VlatoolError: what the stage raises.
-    """
+    """Run a measuring stage in a child process that has further variables from its start."""
     job, settings = _job(stage, source, context), " ".join(f"{name}={value}" for name, value in environment.items())
     about = f"{stage.name()} with {settings}" if settings else stage.name()
     job["keeps"] = context.unfinished is not None

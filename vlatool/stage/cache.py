@@ -164,7 +164,6 @@ def prune(
     """Remove entries, the least recently used first, and then the recordings that no entry holds any more.
 
     Args:
-        cache: the cache.
         older_than_s: age in seconds, since the last use, from which entries are removed; 0 for everything.
         most_bytes: size that the rest may have.
         dry_run: whether only to report what would be removed.

@@ -41,10 +41,7 @@ def run_transform(
     A stage that runs a user's code, or a graph that nobody has run yet, does so in a child process.
 
     Args:
-        stage: what runs.
         source: its input; None for a stage that starts a chain.
-        out: the new bundle.
-        context: context of the run, for progress.
         force: whether to replace a directory that vlatool wrote.
         damaged: see ``vlatool.files.directory_writer.write_directory``.
         reports: directory of reports of a stage before it, which come along where this one writes none.

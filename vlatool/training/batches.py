@@ -62,11 +62,7 @@ def mean_loss(frames: Frames, indices: NDArray[Any], loss: Loss, rows: int, devi
     """Return the mean loss of rows, without gradients.
 
     Args:
-        frames: where they are.
         indices: indices of them, as ``Frames.sample`` gives.
-        loss: loss of a batch.
-        rows: number of rows at a time.
-        device: device of the training.
     """
     total, count = 0.0, frames.row_count(indices)
     with require("torch", "build").no_grad(), device.computing(), device.casting():

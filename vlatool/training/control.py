@@ -21,7 +21,6 @@ def exchange_labels(frames: Path, labels: Sequence[str], seed: Sequence[int]) ->
     Args:
         frames: folder of the round, labelled.
         labels: names of what the teacher said.
-        seed: seed of the exchange.
 
     Raises:
         DataError: when there is no other row.

@@ -52,7 +52,6 @@ class Expert:
 
         Args:
             recording: recorded observations to choose from.
-            source: the student's bundle.
             share: share of them, at least one.
             seed: seed of the choice; a smaller share is a part of a larger one.
             encode: observation -> what the policy takes.
@@ -95,7 +94,6 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
     """Return so many recorded observations of a bundle, spread over its recording; None when it has none.
 
     Args:
-        source: the bundle.
         most: observations.
         whole: whether these are whole episodes.
 
@@ -142,8 +140,6 @@ def expert_loss(
     Continuous ones: ``distance``, over the leading steps that were recorded.
 
     Args:
-        modules: the student's.
-        source: its bundle.
         distance: student's and expert's actions, (B, T, A) each -> the mean over them.
     """
     action = source.manifest.spec.action

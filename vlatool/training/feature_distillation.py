@@ -84,9 +84,6 @@ def with_hints(
         base: its loss runs the student once on the rows that it is given.
         weights: name of a hint -> its weight in the loss.
         student: program that the objective runs.
-        source: the student's bundle.
-        teacher: the teacher.
-        seed: seed of the projections.
 
     Raises:
         RecipeError: when there is nothing to compare.
@@ -144,11 +141,7 @@ def _forms(ours: Taps, theirs: Taps, source: Bundle) -> tuple[Forms, Forms]:
 
 
 def _hint(name: str, weight: float, pairs: Sequence[Pair], forms: tuple[Forms, Forms], seed: int) -> Hint:
-    """Return a hint over all stacks that it can compare.
-
-    Raises:
-        RecipeError: when there is none.
-    """
+    """Return a hint over all stacks that it can compare."""
     kind = registry.load("hints", name)()
     left_out: dict[Stack, str] = {}
     for pair in pairs:

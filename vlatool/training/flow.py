@@ -58,9 +58,7 @@ def check_loops(student: BatchedProgram, teacher: BatchedProgram, action: str, n
     """Refuse programs whose turns cannot be compared.
 
     Args:
-        student, teacher: programs.
         action: name of the action.
-        name: name of the policy.
 
     Raises:
         RecipeError: when there is no loop, both have other ones, or something else gives the action.

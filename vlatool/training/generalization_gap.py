@@ -22,10 +22,6 @@ def last_round_losses(frames: Frames, number: int, loss: Loss, rows: int, device
 
     Args:
         frames: all rounds, the last one not trained on yet.
-        number: number of the last round.
-        loss: loss of a batch.
-        rows: number of rows at a time.
-        device: device of the training.
     """
     played = {NEW_ROUND: number} | ({PREVIOUS_ROUND: number - 1} if number > 1 else {})
     indices = {name: frames.sample((round_,), MAX_ROWS) for name, round_ in played.items()}

@@ -78,13 +78,7 @@ class HeldOut:
         self.expert.read()
 
     def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, device: Device) -> float:
-        """Return the mean loss of the held-out part.
-
-        Args:
-            loss: loss of a batch.
-            rows: number of rows at a time.
-            device: device of the training.
-        """
+        """Return the mean loss of the held-out part."""
         return mean_loss(self._frames, self._frames.sample((0,), len(self._frames)), loss, rows, device)
 
     def mixture_loss(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, device: Device) -> float:
@@ -94,7 +88,6 @@ class HeldOut:
             alpha: share of the teacher.
             loss: loss of a batch, against the teacher.
             expert: expert of a batch, against the expert's actions; None where no expert is asked.
-            rows, device: as in ``loss``.
         """
         total = alpha * self.loss(loss, rows, device) if alpha else 0.0
         if expert is None:

@@ -106,7 +106,6 @@ def launch_processes(
         size: how many processes there are with this one.
         folder: folder of the training.
         about: name of the code that they run.
-        device: device on which they train.
 
     Raises:
         RecipeError: when torchrun started another number of processes.

@@ -284,11 +284,7 @@ class Trainer:
             yield "best", name, held
 
     def _resume(self) -> None:
-        """Resume from the checkpoint, if there is one.
-
-        Raises:
-            DataError: when it is damaged.
-        """
+        """Resume from the checkpoint, if there is one."""
         if not self._file.is_file():
             return
         safetensors, torch = require("safetensors", "build"), require("torch", "build")

@@ -41,8 +41,6 @@ def pairs_of(modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher)
 
     Args:
         modules: the student's, graph name -> module.
-        source: the student's bundle.
-        teacher: the teacher.
     """
     edits, found = read_edits(source), list[Pair]()
     same_factory = teacher.bundle.manifest.source == source.manifest.source

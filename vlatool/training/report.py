@@ -27,7 +27,6 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
     Args:
         made: bundle with ``module/training.json``.
         seconds: what the training took, on the wall clock.
-        command: the command line.
 
     Raises:
         OSError: when it cannot be written.

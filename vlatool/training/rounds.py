@@ -80,12 +80,7 @@ def write_labels(frames: Path, names: Sequence[str], outputs: Sequence[str], tea
     A teacher that keeps values is run along the episodes.
 
     Args:
-        frames: folder of the round.
-        names: inputs of the policy.
-        outputs: outputs of the policy.
         teacher: its program.
-        seed: seed of the noise.
-        context: context of the run, for progress.
         turns: whether to write also one random turn of the teacher's loop for each row.
 
     Returns:
@@ -122,11 +117,8 @@ def _teacher_batches(
     """Yield batches of the teacher: seed, rows (B,), mask of the rows to write, its values, and the noise.
 
     Args:
-        teacher: its program.
         inputs: name -> (N, ...).
         begins: (N,) whether an episode begins with a row; None for a teacher that keeps nothing.
-        seed: seed of the noise.
-        turns: whether what a loop carries is among the values.
     """
     run = teacher.path if turns else teacher.run
     if begins is None:
@@ -176,8 +168,6 @@ def next_round(frames: Frames, number: int, fill: Any) -> None:
     """Use a round, writing it first unless an earlier run did.
 
     Args:
-        frames: all rounds.
-        number: number of the round.
         fill: function called with the folder to write into.
     """
     if not frames.has(number):

@@ -119,9 +119,7 @@ def outputs_and_labels(
     """Run a student; return an output for each row that counts, and what was said of it.
 
     Args:
-        program: the student.
         rows: rows of a batch, name -> (B, ...); or stretches of episodes, along which it keeps its values.
-        name: name of the output.
         label: prefix of who said so.
         computed: function that returns the context in which the student computes.
     """

@@ -83,7 +83,6 @@ class Teacher:
         """Open the teacher of a student.
 
         Args:
-            student: the student's bundle.
             path: the teacher's bundle, or its policy; what the student was before any edit when None.
             modules: the student's, which the teacher's must not share weights with.
 

@@ -235,7 +235,6 @@ def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
     """Serve the calls of the first process until its command has ended.
 
     Args:
-        launch: this process.
         about: name of the training, for messages.
         ready: called first: what the command line has to check or allow here.
 

@@ -39,7 +39,6 @@ def requested_rows(asked: int | None, source: Bundle, plays: bool) -> int:
 
     Args:
         asked: number that the user asked for; None when not given.
-        source: source of the policy.
         plays: whether the teacher plays episodes: then none are taken unless they are asked for.
 
     Raises:
@@ -61,11 +60,8 @@ def write_user_batches(
     """Write encoded observations that the policy's function yields, as a part of a round.
 
     Args:
-        source: source of the policy.
-        count: how many.
         seed: seed that the function is called with.
         target: folder for ``NAME.npy`` of each input, (count, ...).
-        context: context of the run, for progress.
         along: whether rows are episodes, which the batches number under ``episode``.
 
     Raises:

@@ -60,11 +60,7 @@ class ChildKilled(SourceError):
 
 
 def read(line: bytes, about: str) -> dict[str, Any]:
-    """Parse a message of a child.
-
-    Raises:
-        SourceError: when it is none of those that ``vlatool.user_code._child`` says.
-    """
+    """Parse a message of a child."""
     try:
         message = parse_json(line)
     except ValueError as error:

@@ -234,11 +234,7 @@ class Child:
         return []
 
     def _check_call(self, tell: OnProgress) -> None:
-        """Say what the child waits for, and end it where a call takes longer than it may.
-
-        Raises:
-            SourceError: naming the call, its limit and how to raise it.
-        """
+        """Say what the child waits for, and end it where a call takes longer than it may."""
         call = self._page.read()
         waited = 0.0 if call is None else time.monotonic() - call.begun
         if call is not None and waited > call.limit_s:

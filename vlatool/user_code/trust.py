@@ -181,11 +181,7 @@ def _files(folder: Path) -> Iterator[tuple[str, Path | str]]:
 
 
 def _read() -> dict[str, str]:
-    """Return folder -> content hash of what is trusted.
-
-    Raises:
-        SourceError: when other users may write the file, or it is invalid.
-    """
+    """Return folder -> content hash of what is trusted."""
     file = trust_file()
     try:
         with file.open(encoding="utf-8") as stream:

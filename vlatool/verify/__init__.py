@@ -46,7 +46,6 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
     Args:
         bundle: a source bundle, whose torch modules run, or one with graphs.
         options: what is compared.
-        context: whom to tell.
 
     Raises:
         SourceError: when the original cannot be imported, fails, or gives something that is not an action.
@@ -81,11 +80,11 @@ def _report(bundle: Bundle, options: Options, comparison: Mapping[str, Any]) -> 
     """
     name, count, spec = bundle.manifest.name, int(comparison["samples"]), bundle.manifest.spec
     steps, worst = int(comparison["steps"]), float(comparison["error"])
-    verdict = "fail" if comparison["differing"] else "inconclusive" if steps < spec.executed else "pass"
+    verdict = "fail" if comparison["differing"] else "inconclusive" if steps < spec.executed_actions else "pass"
     observations = str(comparison["observations"]).removesuffix("s" if count == 1 else "")
     title = f"{name} against {options.against} on {count} {observations}"
-    sentences = _sentences(name, options, comparison, verdict, spec.executed)
-    compared = f"Compared: {steps} of the {spec.chunk} steps of a chunk, of which {spec.executed} are executed"
+    sentences = _sentences(name, options, comparison, verdict, spec.executed_actions)
+    compared = f"Compared: {steps} of the {spec.chunk} steps of a chunk, of which {spec.executed_actions} are executed"
     sentences += [f"{compared}, on {count} {observations}."] if spec.chunk > 1 else []
     note = f"action, in physical units, {steps} of {spec.chunk} steps"
     measurements = [RELATIVE_ERROR_MAX.measurement(worst, samples=count, note=note)]

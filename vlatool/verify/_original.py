@@ -26,9 +26,6 @@ class Original:
         factory: ``original.py:act`` or ``package.module:act``.
         folder: what a path counts from.
         spec: spec of the policy that is compared.
-
-    Raises:
-        SourceError, MissingExtra: when it cannot be imported.
     """
 
     def __init__(self, factory: str, folder: Path, spec: PolicySpec) -> None:

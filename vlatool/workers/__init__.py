@@ -74,7 +74,6 @@ class Workers:
 
         Args:
             work: what is to be done.
-            tell: callback for progress.
             done: function called with the number of a request and its answer as soon as there is one, from any thread.
             note: function called with what a reader of the results must know of the workers, a sentence.
 

@@ -71,11 +71,7 @@ class Parcel:
 
 
 def parcel_of(folder: Folder) -> Parcel:
-    """Return what of a folder is sent.
-
-    Raises:
-        SourceError: when it is too much, or a file cannot be read.
-    """
+    """List the files of a folder that are sent, within the limit on their number."""
     root = Path(folder.path)
     try:
         paths = [root / name for name in folder.names] or list(_has_few_files(root))
@@ -102,11 +98,7 @@ def _transfer_file(path: Path, name: str) -> TransferFile:
 
 
 def blocks(parcel: Parcel) -> Iterator[bytes]:
-    """Yield the contents of all files, one after the other, in blocks; at least one.
-
-    Raises:
-        SourceError: when a file is no longer what it was.
-    """
+    """Yield the contents of all files, one after the other, in blocks; at least one."""
     waiting = bytearray()
     for file in parcel.files:
         path, left = Path(parcel.folder, file.name), file.size
@@ -126,11 +118,7 @@ def blocks(parcel: Parcel) -> Iterator[bytes]:
 
 
 class IncomingParcel:
-    """A parcel that is being written into the cache of this machine.
-
-    Raises:
-        OutputError: when it cannot be written.
-    """
+    """A parcel that is being written into the cache of this machine."""
 
     def __init__(self, parcel: Parcel) -> None:
         self._parcel = parcel
@@ -159,11 +147,7 @@ class IncomingParcel:
             self._opened.__exit__(type(error), error, error.__traceback__)
 
     def end(self) -> None:
-        """Give the folder its name.
-
-        Raises:
-            OutputError: when what arrived is not what was sent.
-        """
+        """Give the folder its name, if what arrived is what was sent."""
         self._close()
         try:
             for file in self._parcel.files:

@@ -58,11 +58,7 @@ class Ray(Workers):
 
 
 def _connect() -> Any:
-    """Connect this process to the cluster, once; return the library.
-
-    Raises:
-        TargetError: when there is no cluster, or it does not take this process.
-    """
+    """Connect this process to the cluster, once; return the library."""
     ray = require("ray", "ray")
     if ray.is_initialized():
         return ray
@@ -79,12 +75,7 @@ def _connect() -> Any:
 
 
 def _refuse_unreachable(address: str, own: str) -> None:
-    """Say at once that nobody listens: Ray itself goes on trying for many minutes.
-
-    Args:
-        address: address, as Ray takes it; ``auto`` is what ``ray start`` noted on this machine.
-        own: this machine's address, which Ray takes for names of the loopback one.
-    """
+    """Say at once that nobody listens: Ray itself goes on trying for many minutes."""
     where = address
     if address == "auto":
         with contextlib.suppress(OSError):
@@ -163,11 +154,7 @@ class _RayWorkers:
         self._sent.clear()
 
     def _free_slots(self) -> int:
-        """Return how many workers the cluster has place for.
-
-        Raises:
-            TargetError: when it has none.
-        """
+        """Return how many workers the cluster has place for."""
         slots = int(self._ray.cluster_resources().get("CPU", 0))
         if slots < 1:
             raise TargetError("The Ray cluster has no processor for a worker.", "start a node: ray start --num-cpus=N")
@@ -223,11 +210,7 @@ class _RayWorkers:
         return seat.take.remote(number, last, True)
 
     def _compare(self, there: dict[str, str]) -> None:
-        """Say where a worker's machine would compute otherwise than this one.
-
-        Raises:
-            TargetError: when it has another vlatool.
-        """
+        """Say where a worker's machine would compute otherwise than this one."""
         here = this_machine()
         if there["vlatool"] != here["vlatool"]:
             raise TargetError(

@@ -73,10 +73,8 @@ def calibrate(
     """Collect statistics of activations.
 
     Args:
-        bundle: A float32 bundle.
         values: Values to observe.
         observations: Raw ones, or encoded for the graphs (``Encoded``), consumed one at a time; see ``run_with_taps``.
-        context: Receiver of progress.
         channels: Whether the largest magnitude of each entry of the last axis is collected, too.
         numbers: Indices of the observations in the recording, for messages; counted from 0 when empty.
         exempt: Graph name -> values that may be NaN or infinite, which their statistics then record.

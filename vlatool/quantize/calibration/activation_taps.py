@@ -66,11 +66,9 @@ def run_with_taps(
     """Run a policy with taps on its graphs.
 
     Args:
-        bundle: A float32 bundle.
         taps: Graph name -> session; graphs without one run unchanged.
         observations: Raw ones, or encoded for the graphs (``Encoded``), consumed one at a time. Moments that do not
             count are not observed, and the policy is reset where an episode begins.
-        context: Receiver of progress.
         activity: Description of the work in progress messages, before the words "sample 3".
         numbers: Indices of the observations in the recording, for messages; counted from 0 when empty.
 

@@ -47,12 +47,7 @@ class _NonFiniteTap(ActivationTap):
 
 
 def finite_layers(bundle: Bundle, layers: Mapping[str, list[Layer]]) -> dict[str, list[Layer]]:
-    """Return the layers whose inputs and outputs are always finite; all layers where no input takes other values.
-
-    Args:
-        bundle: A float32 bundle.
-        layers: Graph name -> layers.
-    """
+    """Return the layers whose inputs and outputs are always finite; all layers where no input takes other values."""
     if not takes_not_finite(bundle.manifest.spec):
         return dict(layers)
     values = {name: _quantized_values(bundle, name, selected) for name, selected in layers.items()}

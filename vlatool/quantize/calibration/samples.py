@@ -19,9 +19,7 @@ def recorded_moments(
     """Yield recorded samples; for a policy that keeps values, each after the earlier ones of its episode.
 
     Args:
-        bundle: Bundle of the policy.
         recording: Recording of observations.
-        numbers: Indices of the samples, ascending.
         samples: Collector of the hash of each sample.
     """
     keeps = keeps_values(bundle.manifest.program)

@@ -17,7 +17,7 @@ from vlatool.quantize.calibration.activation_taps import ActivationTap, run_with
 from vlatool.stage.base import Context
 
 PEAKS = "vlatool.peaks"
-ZERO, ONE = "vlatool.zero", "vlatool.one"
+ZERO_NAME, ONE_NAME = "vlatool.zero", "vlatool.one"
 
 
 @dataclass
@@ -51,16 +51,16 @@ class _PeakTap(ActivationTap):
                 [
                     graph.node("Abs", [name], [f"{peak}.abs"]),
                     graph.node("IsInf", [name], [f"{peak}.inf"]),
-                    graph.node("Where", [f"{peak}.inf", ZERO, f"{peak}.abs"], [f"{peak}.finite"]),
+                    graph.node("Where", [f"{peak}.inf", ZERO_NAME, f"{peak}.abs"], [f"{peak}.finite"]),
                     graph.node("ReduceMax", [f"{peak}.finite"], [f"{peak}.peak"], keepdims=0),
-                    graph.node("Reshape", [f"{peak}.peak", ONE], [peak]),
+                    graph.node("Reshape", [f"{peak}.peak", ONE_NAME], [peak]),
                 ]
             )
         if not peaks:
             return
         graph.graph.node.append(graph.node("Concat", peaks, [PEAKS], axis=0))
-        graph.add(ZERO, 0, np.float32)
-        graph.add(ONE, [1], np.int64)
+        graph.add(ZERO_NAME, 0, np.float32)
+        graph.add(ONE_NAME, [1], np.int64)
         graph.graph.output.append(graph.onnx.ValueInfoProto(name=PEAKS))
 
     def observe(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
@@ -81,11 +81,8 @@ def find_overflows(
     """Return graph -> value -> where it exceeds ``limit``; infinity does not count, since every float type has it.
 
     Args:
-        bundle: A float32 bundle.
-        graphs: Names of the observed graphs.
         observations: Raw observations, consumed one at a time; see ``run_with_taps``.
         limit: Largest finite magnitude that is allowed.
-        context: Receiver of progress.
 
     Raises:
         DataError: when an observation does not fit the spec; names the sample.

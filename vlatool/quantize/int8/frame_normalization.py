@@ -153,10 +153,7 @@ class _NormalizationFolder(OnnxGraph):
         """Add a border of pixels to a frame, instead of the padding of the convolution.
 
         Args:
-            chain: Nodes from the Cast to the convolution.
-            pads: Rows and columns before, rows and columns after.
             border: A pixel, (C,).
-            convolution: Node that loses its padding.
         """
         axes = np.arange(4)  # axis of the frame for each axis of the convolution's input
         for node in (node for node in chain if node.op_type == "Transpose"):

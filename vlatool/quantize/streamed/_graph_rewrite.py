@@ -262,7 +262,6 @@ class GraphRewriter:
             product: Product to replace; the bias of a Gemm becomes an Add.
             task: Task of its weight; where that was scaled by a vector, the activations are divided by it first.
             values: Initializers from ``add_initializers``.
-            form: Format of the weight.
             accuracy: ``accuracy_level`` of ``MatMulNBits``.
         """
         make, name, activation, nodes = self._ir.node, product.node.name, product.node.inputs[0], []

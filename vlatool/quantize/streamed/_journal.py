@@ -95,11 +95,7 @@ def _is_whole(reader: Reader, file: Path, offset: int, size: int, digest: Any, s
 
 
 def hash_part(reader: Reader, file: Path, offset: int, size: int, digest: Any) -> None:
-    """Update a hash with part of a file, read from the disk.
-
-    Raises:
-        SourceError: when the file is shorter.
-    """
+    """Update a hash with part of a file, read from the disk."""
     part = StoredTensor(file.name, file, offset, "U8", (size,))
     for begin in range(0, size, READ_BYTES):
         digest.update(reader.read(part, begin, min(READ_BYTES, size - begin)).data)

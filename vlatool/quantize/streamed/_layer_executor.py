@@ -39,11 +39,7 @@ class LayerExecutor:
         self._sessions: dict[Any, Any] = {}
 
     def run(self, samples: list[Values], tools: Tools) -> Iterator[None]:
-        """Run all nodes, yielding before each; ``samples`` hold the inputs and receive the outputs, by name.
-
-        Raises:
-            GraphError: when ONNX Runtime cannot run a node alone.
-        """
+        """Run all nodes, yielding before each; ``samples`` hold the inputs and receive the outputs, by name."""
         graph = self._template.model.graph
         outputs = {value.name for value in graph.outputs}
         pending_reads = Counter(value.name for node in graph for value in _read_values(node))

@@ -25,7 +25,6 @@ class Prefetcher:
     Args:
         records: All records of the file.
         start: Index of the first record to compute.
-        file: The file.
         processes: Number of worker processes; with 0 each record is computed here on demand.
     """
 
