@@ -6,6 +6,7 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GateFailed, GraphError, MissingExtra, TargetError, UsageError
+from vlatool.machine.processes import signal_name
 from vlatool.measurement import child
 from vlatool.measurement.child import (
     Progress,
@@ -17,7 +18,6 @@ from vlatool.measurement.child import (
     error_of,
     read_line,
     result_of,
-    signal_name,
 )
 from vlatool.measurement.cold_start import ColdStart
 from vlatool.measurement.jobs import ColdStartJob, Limits

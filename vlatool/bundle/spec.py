@@ -225,7 +225,8 @@ class PolicySpec:
                 )
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
-        if isinstance(self.control_hz, bool) or not _is_between(self.control_hz, 0, MAX_HZ):
+        hz = self.control_hz
+        if isinstance(hz, bool) or not (isinstance(hz, int | float) and 0 < hz < MAX_HZ):
             allowed = f"a rate in Hz above 0 and below {MAX_HZ:,}"
             raise SpecError(f"control_hz is {short_repr(self.control_hz)}; allowed: {allowed}.")
         integer(self.chunk, "chunk", SpecError, 1)
@@ -271,10 +272,6 @@ class PolicySpec:
         plain["inputs"] = [tensor.to_dict() for tensor in self.inputs]
         plain["outputs"] = [tensor.to_dict() for tensor in self.outputs]
         return plain
-
-
-def _is_between(value: Any, low: float, high: float) -> bool:
-    return isinstance(value, int | float) and low < value < high
 
 
 def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:

@@ -65,7 +65,7 @@ def write_ledger(directory: Path) -> None:
     Raises:
         OSError: when a file cannot be read, or the ledger cannot be written.
     """
-    known = _manifest_records(directory)
+    known = _records(_read_json(directory / MANIFEST)[0])
     files, folders = {}, []
     for path in sorted(directory.rglob("*")):
         name, status = path.relative_to(directory).as_posix(), path.lstat()
@@ -226,11 +226,6 @@ def _bundle_listing(directory: Path) -> Listing | None:
                 if Path(entry.path).read_bytes().split()[:1] == [digest.encode()]:
                     listed[entry.name] = cached_hash(Path(entry.path))
     return Listing.of(listed)
-
-
-def _manifest_records(directory: Path) -> dict[str, tuple[str, int]]:
-    """Return name -> (SHA-256, bytes) of the files that a manifest in the directory records."""
-    return _records(_read_json(directory / MANIFEST)[0])
 
 
 def _records(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:

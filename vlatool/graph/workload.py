@@ -6,10 +6,9 @@ counted, as in the published tables that the predictions are based on.
 
 from __future__ import annotations
 
-import fnmatch
 import math
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, require
 from vlatool.graph.macs import COMPUTE, CONVOLUTIONS, INTEGER_OPS, WEIGHT_AT, node_macs, precision_of
+from vlatool.graph.nodes import matches
 from vlatool.graph.shapes import Tensors, open_graph
 
 MAX_DEPTHWISE_PRODUCTS = 121
@@ -150,12 +150,7 @@ def graph_workload(
 
 def part_of(name: str, parts: Mapping[str, Sequence[str]]) -> str:
     """Return the first part that a module, or a node named after one (``head/MatMul``), belongs to; empty for none."""
-    names = (name, name.rpartition("/")[0] or name)
-    return next((part for part, globs in parts.items() if _matches(names, globs)), "")
-
-
-def _matches(names: Iterable[str], globs: Iterable[str]) -> bool:
-    return any(fnmatch.fnmatchcase(name, glob) for name in names for glob in globs)
+    return next((part for part, globs in parts.items() if matches(name, tuple(globs))), "")
 
 
 def _count(

@@ -24,6 +24,14 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 """What an isolated process does first: ``-P`` would say it shorter, from Python 3.11 on."""
 
 
+def signal_name(code: int) -> str:
+    """Return the name of the signal that ended a process, from its negative exit code."""
+    try:
+        return signal.Signals(-code).name
+    except ValueError:  # a real-time signal has no name
+        return f"signal {-code}"
+
+
 def python_command(module: str, arguments: Sequence[str] = (), path: Sequence[str] | None = None) -> list[str]:
     """Return the command that runs a module as ``__main__`` in an isolated Python (``-I``).
 

@@ -17,7 +17,7 @@ from typing import IO, Any, TypeVar
 from vlatool import errors
 from vlatool.errors import GateFailed, GraphError, VlatoolError
 from vlatool.files.messages import from_json, to_json
-from vlatool.machine.processes import die_with_parent
+from vlatool.machine.processes import die_with_parent, signal_name
 from vlatool.measurement.jobs import Limits
 from vlatool.measurement.process_limits import command, ran_out
 
@@ -185,14 +185,6 @@ def end_error(about: str, code: int, log: str, limits: Limits, when: str = "in a
         )
     last = (log.strip() or f"exit code {code}").splitlines()[-1]
     return GraphError(f"{about} cannot be run in a fresh process: {last}", REINSTALL)
-
-
-def signal_name(code: int) -> str:
-    """Return the name of the signal that ended a process, from its negative exit code."""
-    try:
-        return signal.Signals(-code).name
-    except ValueError:  # a real-time signal has no name
-        return f"signal {-code}"
 
 
 def too_large(limits: Limits, seen: str = "") -> GateFailed:

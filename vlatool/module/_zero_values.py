@@ -54,7 +54,8 @@ class ZeroValues:
             return len(inputs) > 1 and all(inputs[1:])
         if name in MOVES or name == "getitem":
             return all(inputs)
-        return self._gives_zero(node) if _is_elementwise(node.target) else False
+        elementwise = any(tag.name == "pointwise" for tag in getattr(node.target, "tags", ()))
+        return elementwise and self._gives_zero(node)
 
     def _gives_zero(self, node: Any) -> bool:
         """Compute an elementwise operator of zeros, and of any numbers where values are not."""
@@ -78,7 +79,3 @@ def _holds_tensors(node: Any) -> bool:
     """Tell a tensor, or several, from a size."""
     value = node.meta.get("val")
     return hasattr(value, "dtype") or isinstance(value, list | tuple)
-
-
-def _is_elementwise(target: Any) -> bool:
-    return any(tag.name == "pointwise" for tag in getattr(target, "tags", ()))

@@ -36,7 +36,8 @@ def fold_weights(model: Any) -> int:
             model.graph.register_initializer(new)
             ir.convenience.replace_all_uses_with(value, new)
         model.graph.remove(node, safe=True)
-        _remove_weight(model.graph, weight)
+        if not list(weight.uses()) and not weight.is_graph_output():
+            del model.graph.initializers[weight.name]
         folded += 1
     return folded
 
@@ -65,9 +66,3 @@ def _free(graph: Any, name: str) -> str:
     while name in graph.initializers:
         name += "_"
     return name
-
-
-def _remove_weight(graph: Any, weight: Any) -> None:
-    """Drop a weight that nothing reads any more."""
-    if not list(weight.uses()) and not weight.is_graph_output():
-        del graph.initializers[weight.name]

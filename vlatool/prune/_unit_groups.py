@@ -151,7 +151,7 @@ def rank_units(
         for slopes in action_gradients(_actions(modules, source, samples), values):
             for group in groups:
                 sensitivity = np.zeros(group.size)
-                for member in _reading_members(group):
+                for member in [each for each in group.members if each.reads] or group.members:
                     if (key := (group.graph, member.weight)) in slopes:
                         sensitivity += _sum_by_unit(values[key].detach() * slopes[key], member)
                 group.importance = group.importance + sensitivity**2
@@ -238,11 +238,6 @@ def _magnitude(group: UnitGroup, weights: Mapping[str, Any]) -> NDArray[Any]:
         ]
         product = product * np.sqrt(np.sum(squares, axis=0)) if squares else product
     return product
-
-
-def _reading_members(group: UnitGroup) -> list[Member]:
-    """Return the members that read the units; those that write them where none reads them."""
-    return [member for member in group.members if member.reads] or group.members
 
 
 def _sum_by_unit(values: Tensor, member: Member) -> NDArray[Any]:

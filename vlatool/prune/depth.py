@@ -144,7 +144,9 @@ class Depth(ModuleStage):
                 "class, each with an output like its input.",
                 "prune widths instead: vlatool prune neurons",
             )
-        selection = Selection(self.include, self.exclude, PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS))
+        selection = Selection(
+            self.include, self.exclude, PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS)
+        )
         selection.check(names, "stack of blocks")
         selected = {(graph, name): size for (graph, name), size in sizes.items() if selection.selects((name,))}
         if not selected:

@@ -18,7 +18,6 @@ from vlatool.graph.nodes import reads
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._calibrated_base import CalibratedQuantization
 from vlatool.quantize.calibration.activation_statistics import calibrate
-from vlatool.quantize.calibration.ranges import Statistics
 from vlatool.quantize.calibration.samples import recorded_moments
 from vlatool.quantize.int8.smoothing_groups import ConstantEdit, SmoothingGroup, find_groups
 from vlatool.quantize.int8.smoothing_scales import PeakExcess, best_alpha, int8_loss, smooth_scales, weight_peaks
@@ -81,14 +80,16 @@ class SmoothQuant(CalibratedQuantization):
         peaks = []
         for numbers in halves:
             observations = recorded_moments(bundle, recording, numbers, samples)
-            peaks.append(_peaks(calibrate(bundle, values, observations, context, channels=True, numbers=numbers)))
+            statistics = calibrate(bundle, values, observations, context, channels=True, numbers=numbers)
+            peaks.append({graph: {name: np.asarray(seen.peaks) for name, seen in collected.items()}
+                          for graph, collected in statistics.items()})  # fmt: skip
         notes: list[dict[str, Any]] = []
 
         def smooth(name: str, original: Path, target: Path) -> None:
             model = load(original)
             for group in groups[name]:
-                note = self._smooth(model, group, _group_peaks(peaks, name, group), sum(map(len, halves)))
-                notes.append({"graph": name, **note})
+                largest = [np.maximum.reduce([half[name][value] for value in group.activations]) for half in peaks]
+                notes.append({"graph": name, **self._smooth(model, group, largest, sum(map(len, halves)))})
             save(model, target)
 
         smoothed = self.transform(bundle, out, context, smooth, made_by=self.made_by(calibration=samples))
@@ -191,18 +192,6 @@ class _Writer(OnnxGraph):
 
 def _reciprocals(scales: Array) -> Array:
     return (1 / scales.astype(np.float64)).astype(np.float32)
-
-
-def _peaks(statistics: dict[str, dict[str, Statistics]]) -> dict[str, dict[str, Array]]:
-    return {
-        graph: {name: np.asarray(seen.peaks) for name, seen in collected.items()}
-        for graph, collected in statistics.items()
-    }
-
-
-def _group_peaks(peaks: list[dict[str, dict[str, Array]]], graph: str, group: SmoothingGroup) -> list[Array]:
-    """Return the largest magnitudes over all inputs of the group, for each part of the calibration."""
-    return [np.maximum.reduce([half[graph][name] for name in group.activations]) for half in peaks]
 
 
 def _check_same(source: Bundle, smoothed: Bundle) -> None:

@@ -75,7 +75,7 @@ class RebuildResult:
     @property
     def machine_may_differ(self) -> bool:
         """Whether all that differs is of the machine that made the bundle: golden outputs, and the manifest."""
-        return all(file.identical or file.file == MANIFEST or _is_golden(file.file) for file in self.files)
+        return all(each.identical or each.file == MANIFEST or each.file.startswith("golden/") for each in self.files)
 
     @property
     def files_beside(self) -> tuple[str, ...]:
@@ -88,10 +88,6 @@ def _rank(name: str) -> int:
     """Return how late in the making of a bundle a file comes: what differs first may be why later ones do."""
     folder = name.partition("/")[0]
     return LAST_FILES.index(folder) + 1 if folder in LAST_FILES else 0
-
-
-def _is_golden(file: str) -> bool:
-    return file.startswith("golden/")
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ import vlatool
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import OutputError, TargetError, UsageError, VlatoolError
 from vlatool.files.printable import one_line
-from vlatool.measurement.child import CRASHES, Progress, Raised, Result, error_of, read_line, signal_name
+from vlatool.machine.processes import signal_name
+from vlatool.measurement.child import CRASHES, Progress, Raised, Result, error_of, read_line
 from vlatool.remote import _probe, _push
 from vlatool.remote._connection import RUN_AGAIN, Connection
 from vlatool.remote._validate_replies import AgentExit, DiskFull, Python, invalid_reply, parse, python_of, read, sane

@@ -70,17 +70,13 @@ def fill(module: nn.Module, seed: int, prefix: str = "") -> None:
     """
     with torch.no_grad():
         for path, part in module.named_modules(prefix=prefix):
-            _fill_buffers(part)
+            if isinstance(part, Constants):
+                part.reset_constants()
+            elif isinstance(part, nn.BatchNorm2d):
+                part.reset_running_stats()
             for name, parameter in part.named_parameters(prefix=path, recurse=False):
                 scales = name.endswith(".gain") or (isinstance(part, NORMS) and name.endswith("weight"))
                 _draw(parameter, seed, name, 1.0 if scales else 0.0)
-
-
-def _fill_buffers(part: nn.Module) -> None:
-    if isinstance(part, Constants):
-        part.reset_constants()
-    elif isinstance(part, nn.BatchNorm2d):
-        part.reset_running_stats()
 
 
 def _draw(parameter: Tensor, seed: int, name: str, centre: float) -> None:

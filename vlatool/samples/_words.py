@@ -37,7 +37,7 @@ PHRASES = (
 )  # fmt: skip
 JOINTS = ("and", "then", "and then", "before you", "after that")
 MANNERS = (*_words("slowly carefully gently quickly again twice"), "with your left arm", "with the gripper", "now")
-OTHER_WORDS = _words(
+PARTICLES = _words(
     "go forward backward up down stop wait stay walk drive enter leave follow pass cross corner hallway corridor "
     "room kitchen bathroom bedroom office entrance exit stairs elevator wall floor ceiling please robot arm both "
     "one two three four five half all every each it them from at of to with your you off out over around through "
@@ -52,7 +52,20 @@ def vocabulary() -> dict[str, object]:
         >>> vocabulary()["pad"]
         0
     """
-    listed = (ARTICLES, VERBS, OBJECTS, COLOURS, SIZES, MATERIALS, SIDES, RELATIONS, PHRASES, JOINTS, MANNERS, OTHER_WORDS)
+    listed = (
+        ARTICLES,
+        VERBS,
+        OBJECTS,
+        COLOURS,
+        SIZES,
+        MATERIALS,
+        SIDES,
+        RELATIONS,
+        PHRASES,
+        JOINTS,
+        MANNERS,
+        PARTICLES,
+    )
     words = dict.fromkeys(word for group in listed for entry in group for word in entry.split())
     return {"kind": "words", "pad": PAD, "unknown": UNKNOWN, "words": {word: 2 + i for i, word in enumerate(words)}}
 

@@ -264,15 +264,10 @@ def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
         for name in sorted(entry.files, key=lambda file: (file in (LEDGER, "manifest.json"), file == LEDGER)):
             with contextlib.suppress(FileNotFoundError):
                 (path / name if name else path).unlink()
-        _remove_folders(path)
+        for folder, _, _ in os.walk(path, topdown=False):
+            with contextlib.suppress(OSError):  # not empty
+                os.rmdir(folder)
     return "holds what vlatool did not write" if os.path.lexists(path) else ""
-
-
-def _remove_folders(path: Path) -> None:
-    """Remove the folders that are empty, from below."""
-    for folder, _, _ in os.walk(path, topdown=False):
-        with contextlib.suppress(OSError):
-            os.rmdir(folder)
 
 
 def _remove_unused(cache: Path, unused: Iterable[str]) -> dict[str, str]:

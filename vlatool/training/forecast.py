@@ -40,11 +40,8 @@ class Forecast:
             return ""
         taken = self._now() - self._start - sum(self._paused)
         seconds = taken / (step - self._first) * (self._steps - step)
-        return f"{duration(seconds + self._pauses_ahead(step))} left"
-
-    def _pauses_ahead(self, step: int) -> float:
-        """Return what further pauses will take, as many as there were for the steps so far."""
-        return sum(self._paused) / (step - self._first) * (self._steps - step)
+        pauses = sum(self._paused) / (step - self._first) * (self._steps - step)  # as many as for the steps so far
+        return f"{duration(seconds + pauses)} left"
 
 
 def duration(seconds: float) -> str:

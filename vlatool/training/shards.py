@@ -202,7 +202,7 @@ class Parts(Shards):
         try:
             yield
         except (RuntimeError, SourceError) as error:
-            if _is_communication_error(error):
+            if any(name in str(error) for name in COMMUNICATION_ERRORS):  # the modules of a user run in the midst of it
                 raise SourceError(LOST_PROCESS, RUN_AGAIN) from error
             raise
 
@@ -228,11 +228,6 @@ def _release_memory() -> None:
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
-
-
-def _is_communication_error(error: Exception) -> bool:
-    """Say whether an error is of what connects processes: the modules of a user run in the midst of it."""
-    return any(name in str(error) for name in COMMUNICATION_ERRORS)
 
 
 def shards_of(modules: Mapping[str, nn.Module], group: Group, *, cut: bool) -> Shards:

@@ -20,6 +20,7 @@ from vlatool.files.json import parse_json
 from vlatool.files.limits import LIMITS_VARIABLE, limit
 from vlatool.files.printable import MAX_CHARACTERS, truncate
 from vlatool.machine.engine_calls import EngineCall, engine_crash
+from vlatool.machine.processes import signal_name
 
 CONNECTION_ERRORS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
 """Errors of connections: none of a file, and to this program the sign that nobody reads it any more."""
@@ -165,7 +166,7 @@ def ending_error(status: bytes, about: str, last: ChildState) -> BaseException:
             f"{about} ended its process with exit code {code} before it was done (os._exit, or a library's exit).",
             "let it raise an exception that says what is wrong instead",
         )
-    name = _signal(code)
+    name = signal_name(code)
     if code == -signal.SIGKILL:
         return ChildKilled(
             f"{about}: the process that ran it was killed (SIGKILL) before it was done.",
@@ -184,12 +185,5 @@ def _engine_error(code: int, doing: EngineCall, said: str) -> GraphError:
         seconds = limit("engine_seconds")
         error = engine_crash(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)
         return GraphError(error.message, f"if it needs longer: {LIMITS_VARIABLE}=engine_seconds={10 * seconds}")
-    how = f"with {_signal(code)}" if code < 0 else f"with exit code {code}"
+    how = f"with {signal_name(code)}" if code < 0 else f"with exit code {code}"
     return engine_crash(doing, f"ended its process {how}", said)
-
-
-def _signal(code: int) -> str:
-    try:
-        return signal.Signals(-code).name
-    except ValueError:
-        return f"signal {-code}"

@@ -102,7 +102,8 @@ def _of_stages(
         yield from guessed
         if guessed or not before:
             return
-        those = "The inputs are" if not others else f"Of the inputs, {_quoted_names(compared)} {_are(compared)}"
+        are = "is" if len(compared) == 1 else "are"
+        those = "The inputs are" if not others else f"Of the inputs, {_quoted_names(compared)} {are}"
         words = f"{those} the same, the network's output is not, first on observation {network['first']}"
         if any(_of_quantization(policy)):
             yield f"{words}, as is to be expected."
@@ -113,10 +114,6 @@ def _of_stages(
 
 def _quoted_names(names: Sequence[str]) -> str:
     return " and ".join(", ".join(f"'{name}'" for name in part) for part in (names[:-1], names[-1:]) if part)
-
-
-def _are(names: Sequence[str]) -> str:
-    return "is" if len(names) == 1 else "are"
 
 
 def _by(samples: Sequence[Sample], stage: Mapping[str, Any]) -> str:

@@ -105,8 +105,9 @@ def parse_workers(text: str) -> tuple[str, int]:
     """
     name, _, count = text.partition(":") if not text.isdecimal() else (PROCESSES, "", text)
     if name not in registry.names(KIND):
+        others = [each for each in registry.names(KIND) if each != PROCESSES]
         raise UsageError(
-            f"--workers is '{text}'; it takes a number of processes, or {suggest(name, _other_launchers())}.",
+            f"--workers is '{text}'; it takes a number of processes, or {suggest(name, others)}.",
             "write --workers 4, or --workers ray:4",
         )
     if ":" in text or count:
@@ -115,7 +116,3 @@ def parse_workers(text: str) -> tuple[str, int]:
                              "--workers 4" if name == PROCESSES else f"--workers {name}:4")  # fmt: skip
         return name, int(count)
     return name, 0
-
-
-def _other_launchers() -> list[str]:
-    return [name for name in registry.names(KIND) if name != PROCESSES]

@@ -18,7 +18,7 @@ FLOAT16_MAX = 65504.0
 SMALLEST_NORMAL = 2.0**-14
 """Smallest normal float16; smaller values lose bits, and become zero on engines that flush subnormals."""
 FLOAT16 = 10  # onnx.TensorProto.FLOAT16
-UNDEFINED_TYPE = 0  # onnx.TensorProto.UNDEFINED
+NO_TYPE = 0  # onnx.TensorProto.UNDEFINED
 INTEGERS = (2, 3, 4, 5, 6, 7, 12, 13)  # onnx.TensorProto: (u)int8, (u)int16, (u)int32, (u)int64
 
 
@@ -49,7 +49,7 @@ def phase_nodes(model: Any) -> set[str]:
         node = pending.pop()
         if node.name not in names:
             names.add(node.name)
-            float_inputs = [name for name in node.input if graph.types.get(name, UNDEFINED_TYPE) in (FLOAT, UNDEFINED_TYPE)]
+            float_inputs = [name for name in node.input if graph.types.get(name, NO_TYPE) in (FLOAT, NO_TYPE)]
             producers = [graph.producers[name] for name in float_inputs if name in graph.producers]
             pending.extend(node for node in producers if node.op_type not in HEAVY)
     return names
@@ -155,7 +155,7 @@ def _is_cast_to_float16(node: Any) -> bool:
 
 def _cast_to(node: Any) -> int:
     """Return the target type of a Cast; 0 for any other node."""
-    return next((int(item.i) for item in node.attribute if item.name == "to" and node.op_type == "Cast"), UNDEFINED_TYPE)
+    return next((int(item.i) for item in node.attribute if item.name == "to" and node.op_type == "Cast"), NO_TYPE)
 
 
 def _drop_unread_casts(graph: OnnxGraph) -> None:

@@ -98,8 +98,9 @@ def find_products(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Prod
     for node in model.graph:
         if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
             continue
-        if not _is_activation_matrix(node.inputs[0]):
-            continue
+        factor = node.inputs[0]
+        if factor.is_initializer() or (factor.shape is not None and len(factor.shape) < 2):
+            continue  # products of two constants are computed once, those of a vector have no matrix of activations
         attributes = {name: attribute.value for name, attribute in node.attributes.items()}
         plain = attributes.get("alpha", 1.0) == attributes.get("beta", 1.0) == 1.0 and not attributes.get("transA")
         operand, transposed = node.inputs[1], bool(attributes.get("transB"))
@@ -111,11 +112,6 @@ def find_products(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Prod
         rows, columns = tensor.shape[::-1] if transposed else tensor.shape
         bias = node.inputs[2] if len(node.inputs) > 2 else None
         yield Product(node, operand.name, rows, columns, transposed, bias)
-
-
-def _is_activation_matrix(operand: Any) -> bool:
-    """Return whether an operand is an activation of two axes or more; products of two constants are computed once."""
-    return not operand.is_initializer() and (operand.shape is None or len(operand.shape) > 1)
 
 
 def transposes_constant(node: Any) -> bool:

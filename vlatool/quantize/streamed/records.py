@@ -98,15 +98,11 @@ def _write(handle: int, view: memoryview, offset: int) -> None:
         try:
             done += os.pwrite(handle, view[done:], offset + done)
         except OSError as error:
-            if error.errno != errno.EINVAL or not _is_direct(handle):
+            if error.errno != errno.EINVAL or not (O_DIRECT and fcntl.fcntl(handle, fcntl.F_GETFL) & O_DIRECT):
                 raise
             _disable_direct_io(handle)
         if done % PAGE:
             _disable_direct_io(handle)
-
-
-def _is_direct(handle: int) -> bool:
-    return bool(O_DIRECT and fcntl.fcntl(handle, fcntl.F_GETFL) & O_DIRECT)
 
 
 def _disable_direct_io(handle: int) -> None:
