@@ -83,7 +83,6 @@ class PlainSource:
     """An uncompressed array in a file.
 
     Args:
-        file: the file.
         start: offset of its first element.
     """
 

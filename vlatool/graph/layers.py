@@ -28,7 +28,6 @@ class Layer:
     """A node that can be computed in int8.
 
     Args:
-        name: Name of the node.
         kind: Operator type.
         activations: Values that must be quantized at run time.
         weight: Initializer that is quantized ahead of time; empty when both operands are activations.

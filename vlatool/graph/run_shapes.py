@@ -19,7 +19,6 @@ class RunShapes:
     """Shapes of a node in one run of its graph.
 
     Args:
-        times: Number of its runs.
         inputs: Shapes of its inputs in the last run, without omitted ones and weights that the engine packed.
         outputs: Shapes of its outputs.
     """

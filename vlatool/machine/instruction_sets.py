@@ -38,7 +38,6 @@ class BoardSet:
     """The set that OpenVINO computes in on a board, beside the one that it computes in here.
 
     Args:
-        board: name of the profile.
         wanted: the board's set; empty where there is nothing to compare (no profile, no x86, no OpenVINO on it).
         lacks: the feature that this host's processor would need for it; empty when it has it.
         host: the highest set of this host's processor; empty when it is not an x86.

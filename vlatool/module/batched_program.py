@@ -41,10 +41,6 @@ class BatchedProgram:
     get them with the batch instead of an axis of size 1, whichever they take. They begin at zero where none are given,
     as they do after ``reset``.
 
-    Args:
-        steps: steps of the program, as in the manifest.
-        modules: graph name -> module.
-
     Attributes:
         noise: what the program draws, value name -> shape and distribution.
         kept: what the program keeps from run to run, value name -> shape and dtype.

@@ -137,7 +137,6 @@ def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
 
     Args:
         error: what ``torch.onnx.export`` raised.
-        module: the torch module that was exported.
     """
     chain = list(_chain(error))
     cause = _cause(chain, module)

@@ -34,7 +34,6 @@ class MetaModules:
     """A policy's modules with every parameter on torch's meta device, changed by the edits of its bundle.
 
     Args:
-        modules: graph name -> module.
         made: graph name -> each parameter and buffer with the name that it had in what the factory made, one that is
             shared with each of its names; empty where a module must be traced.
     """

@@ -207,11 +207,9 @@ def write_modules(
     """Write a source bundle with other modules.
 
     Args:
-        source: what it is made from.
         out: an empty directory.
         edits: all edits since the factory.
         modules: graph name -> module after the edits; none where the weights are those of the policy's shards.
-        made_by: stage, options and versions.
         training: how they were trained, if they were.
         program: how they run; as in the source when None.
         played: observations that they were trained on, which the bundle keeps.

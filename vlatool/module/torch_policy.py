@@ -85,7 +85,6 @@ class TorchSession:
 
     Args:
         module: the module; takes the feeds positionally in the order of ``step.feeds``.
-        step: the program step that runs it.
     """
 
     def __init__(self, module: nn.Module, step: ProgramStep) -> None:

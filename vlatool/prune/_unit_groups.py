@@ -35,7 +35,6 @@ class UnitGroup:
 
     Args:
         leaf: Factor of ``vlatool.module.axes``.
-        size: Number of units.
         members: Axes of weights that contain the units.
         step: Number of units to remove at a time.
         importance: Importance of each unit, by index.
@@ -165,7 +164,6 @@ class Macs:
 
     Args:
         runs: Graph name -> number of runs.
-        groups: Groups of removable units.
     """
 
     def __init__(self, walks: Mapping[str, Walk], runs: Mapping[str, int], groups: Sequence[UnitGroup]) -> None:

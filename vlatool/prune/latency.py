@@ -246,7 +246,6 @@ class _Selector:
     """Selects units and blocks to remove by their measured costs.
 
     Args:
-        groups: Groups of removable units.
         stacks: Stacks of removable blocks.
         work: Counter of multiply-accumulates of the groups.
         prices: Role of a group -> milliseconds for a multiply-accumulate.

@@ -41,7 +41,6 @@ class RebuildResult:
     """What came of making a bundle again.
 
     Args:
-        bundle: the bundle that was checked.
         hash: ``sha256:...`` of the bundle that was made again.
         source: what it was made from.
         files: every hashed file and the manifest, compared byte by byte.

@@ -69,8 +69,6 @@ class Feedforward(nn.Module):
     """Linear, GELU, linear.
 
     Args:
-        width: Width of input and output.
-        hidden: Width of the hidden layer.
         approximate: ``"none"`` (exact) or ``"tanh"``.
     """
 
@@ -133,10 +131,6 @@ class EncoderBlock(nn.Module):
     """Pre-norm transformer block: self-attention and a GELU feed-forward, each with a residual.
 
     Args:
-        width: Width of the tokens.
-        heads: Number of attention heads.
-        hidden: Hidden width of the feed-forward.
-        approximate: Approximation of the GELU.
         gains: Whether each branch ends in a learned gain, as in DINOv2.
     """
 

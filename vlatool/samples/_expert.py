@@ -17,12 +17,6 @@ class ExpertShape:
 
     Args:
         width: Width of the action tokens.
-        depth: Number of blocks.
-        heads: Number of attention heads.
-        hidden: Of each feed-forward.
-        context: Width of the context tokens.
-        chunk: Actions in a chunk.
-        action: Elements of one action.
     """
 
     width: int = 768

@@ -17,12 +17,7 @@ class FusionShape:
 
     Args:
         vision: Encoder that all cameras share.
-        cameras: Number of cameras.
-        words: Number of instruction tokens.
         vocabulary: Number of token ids; id 0 is padding.
-        depth: Blocks of the fusion transformer.
-        chunk: Actions in one pass.
-        action: Elements of one action.
     """
 
     vision: VisionShape = VIT_S

@@ -16,18 +16,7 @@ Angles = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class DecoderShape:
-    """Shape of a decoder.
-
-    Args:
-        width: Width of the tokens.
-        layers: Number of layers.
-        heads: Query heads.
-        shared_heads: Key/value heads.
-        head_width: Width of each head.
-        hidden: Hidden width of each feed-forward.
-        base: Base of the rotary positions.
-        epsilon: Epsilon of the RMS norms.
-    """
+    """Shape of a decoder."""
 
     width: int
     layers: int
@@ -48,8 +37,6 @@ class Rotary(Constants):
     """Rotary position table (Su et al., arXiv 2104.09864), in the half-split layout of Llama.
 
     Args:
-        length: Number of positions.
-        width: Width of a head.
         base: Base of the geometric series of wave lengths.
     """
 
@@ -200,11 +187,7 @@ class Decoder(nn.Module):
 
 
 class Prefill(nn.Module):
-    """A decoder over given embeddings, causal.
-
-    Args:
-        length: Number of tokens.
-    """
+    """A decoder over given embeddings, causal."""
 
     def __init__(self, shape: DecoderShape, length: int) -> None:
         super().__init__()

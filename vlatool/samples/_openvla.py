@@ -30,7 +30,6 @@ class OpenShape:
         vocabulary: Number of token ids that mean something; id 0 is padding.
         rows: Rows of the embedding and the head (padded vocabulary).
         bins: Number of bins of an action element.
-        words: Number of instruction tokens.
         action: Elements of the action, each one token.
     """
 

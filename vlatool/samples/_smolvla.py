@@ -26,10 +26,6 @@ class SmolShape:
         expert_width: Width of the action tokens.
         expert_hidden: Hidden width of each feed-forward of the expert.
         vocabulary: Number of token ids; id 0 is padding.
-        words: Number of instruction tokens.
-        state: Elements of the robot's state.
-        chunk: Actions in a chunk.
-        action: Elements of one action.
         steps: Euler steps from noise to actions.
     """
 

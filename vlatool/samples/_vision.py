@@ -47,14 +47,7 @@ class VisionShape:
     """Shape of a vision transformer.
 
     Args:
-        pixels: Height and width of the image.
-        patch: Height and width of a patch.
-        width: Width of the tokens.
-        depth: Number of blocks.
-        heads: Number of attention heads.
-        hidden: Hidden width of each feed-forward.
         registers: Learned tokens in front of the patches (class token included).
-        approximate: Approximation of the GELU.
         gains: Whether blocks have learned gains (DINOv2).
         colours: Mean and deviation of the channels.
     """

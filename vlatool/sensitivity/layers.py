@@ -152,7 +152,6 @@ class Switchboard:
     """A float32 policy in which any combination of layers can be computed in int8; a context manager.
 
     Args:
-        bundle: A float32 bundle.
         stage: Stage that selects the layers and their style.
         ranges: Ranges from ``ranges_of``.
         threads: Number of intra-op threads; the cores that this process may use when None.

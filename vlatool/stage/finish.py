@@ -127,7 +127,6 @@ def finish(
 
     Args:
         source: what the bundle was made from.
-        made_by: stage, options and versions.
         graphs: graph name -> graph.
         observations: raw observations; the first two become golden. On ``MAX_COMPARED`` of them the bundle is compared
             with the source, where that has graphs.

@@ -29,7 +29,6 @@ class Batches:
 
     Args:
         loss: rows, name -> (B, ...) -> the mean of their losses.
-        frames: all rows.
         size: rows of a batch.
         accumulate: parts that a process computes one after the other.
         group: group of processes, and this one's rank.

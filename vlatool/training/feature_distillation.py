@@ -83,7 +83,6 @@ def with_hints(
     Args:
         base: its loss runs the student once on the rows that it is given.
         weights: name of a hint -> its weight in the loss.
-        student: program that the objective runs.
 
     Raises:
         RecipeError: when there is nothing to compare.

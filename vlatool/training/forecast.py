@@ -14,7 +14,6 @@ class Forecast:
     """Tells from the steps and pauses of this run when it will end.
 
     Args:
-        steps: number of steps in total.
         done: number of steps before this run.
         now: the clock, in seconds.
     """

@@ -21,11 +21,7 @@ BLOCK_ROWS = 256
 
 
 class Frames:
-    """Rounds of rows, each round a folder with ``NAME.npy`` of (N, ...) that stays on the disk.
-
-    Args:
-        folder: where the rounds are.
-    """
+    """Rounds of rows, each round a folder with ``NAME.npy`` of (N, ...) that stays on the disk."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -32,7 +32,6 @@ class HeldOut:
     """The recorded observations in two parts: one for training, one held out.
 
     Args:
-        folder: folder of the training.
         frames: folder -> the rounds in it, as the objective takes them.
     """
 

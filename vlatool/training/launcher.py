@@ -104,7 +104,6 @@ def launch_processes(
     Args:
         job: argument of ``rank_process.load``.
         size: how many processes there are with this one.
-        folder: folder of the training.
         about: name of the code that they run.
 
     Raises:

@@ -48,11 +48,8 @@ class Settings:
     """Settings of the training loop.
 
     Args:
-        steps: updates of the weights.
-        learning_rate: highest learning rate.
         weight_decay: weight decay of weights with two axes or more, decoupled (AdamW).
         average: decay of the exponential moving average of the weights, which is the result.
-        seed: seed of the batches.
         device: device and precision.
         checkpoint_s: seconds between checkpoints.
         shard: whether each process holds a part of the weights alone.
@@ -83,7 +80,6 @@ class Trainer:
     trained is what runs on the robot.
 
     Args:
-        modules: graph name -> module.
         settings: how long and how fast.
         folder: folder for checkpoints.
         group: the processes that train together; the first one writes checkpoints.

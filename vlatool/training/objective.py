@@ -22,7 +22,6 @@ class Objective:
     """The objective of a training.
 
     Args:
-        name: name of the loss.
         modules: the student's, which are trained in place.
         loss: rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
             computed in parts.
@@ -62,12 +61,7 @@ class Objective:
         return {**self.modules, **self.along}
 
     def look(self, frames: Frames, shown: Frames) -> None:
-        """Let the programs find out whether their modules take batches, with rows that all processes agree on.
-
-        Args:
-            frames: what the teacher labelled.
-            shown: what the expert did.
-        """
+        """Let the programs find out whether their modules take batches, with rows that all processes agree on."""
         for loss, rows in ((self.loss, frames), (self.expert, shown)):
             if loss is not None and len(rows):
                 loss(rows.batch(np.arange(2) % len(rows)))

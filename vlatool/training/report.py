@@ -26,7 +26,6 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
 
     Args:
         made: bundle with ``module/training.json``.
-        seconds: what the training took, on the wall clock.
 
     Raises:
         OSError: when it cannot be written.

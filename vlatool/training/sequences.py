@@ -44,7 +44,6 @@ class EpisodeWindows:
     """What a loss takes instead of rows: the rows, and the windows in them.
 
     Args:
-        frames: all rows.
         lanes: lanes that are run.
     """
 
@@ -56,10 +55,6 @@ class Sequences(Frames):
     """Rounds of rows that say where episodes begin; drawn, counted and judged as stretches of them.
 
     Places are (N, 3): first row, first one that counts, and the one after the last.
-
-    Args:
-        folder: where the rounds are.
-        unroll: length of what is drawn.
     """
 
     def __init__(self, folder: Path, unroll: Unroll) -> None:

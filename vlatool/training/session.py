@@ -62,7 +62,6 @@ class Plan:
         patience: pauses in a row without an improvement after which training ends; 0 for never.
         accumulate: parts of a batch, computed one after the other.
         user_rows: rows that are taken from the function of the policy's that yields batches.
-        supervision: who says what is right.
     """
 
     batch: int
@@ -91,11 +90,6 @@ class Session:
     Args:
         plan: what is played when.
         settings: how long and how fast is trained.
-        objective: what is trained.
-        source: the student's bundle.
-        teacher: who says what is right.
-        folder: the folder.
-        context: context of the run, for progress.
         processes: other processes that train, too.
     """
 

@@ -94,7 +94,6 @@ class Parts(Shards):
 
     Args:
         modules: graph name -> module, which is changed in place.
-        group: the processes.
 
     Raises:
         RecipeError: when no weight can be cut.

@@ -43,7 +43,6 @@ class Taps:
     """Records the outputs of blocks.
 
     Args:
-        program: the policy.
         blocks: blocks of it.
     """
 

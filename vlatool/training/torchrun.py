@@ -157,12 +157,7 @@ def open_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
 
 
 class Follower:
-    """A process that follows this one, as ``Child`` is one that it started: it calls functions of ``rank_process``.
-
-    Args:
-        launch: this process.
-        rank: the other one.
-    """
+    """A process that follows this one, as ``Child`` is one that it started: it calls functions of ``rank_process``."""
 
     def __init__(self, launch: Launch, rank: int) -> None:
         self._store, self._rank, self._lost = launch.store(), rank, threading.Event()

@@ -96,7 +96,6 @@ class _Rows:
         encode: the policy's own.
         count: rows in all.
         size: rows of a batch, at most.
-        tell: callback for progress.
         along: whether batches also hold the number of the episode of each row.
     """
 

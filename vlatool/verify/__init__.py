@@ -45,7 +45,6 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
 
     Args:
         bundle: a source bundle, whose torch modules run, or one with graphs.
-        options: what is compared.
 
     Raises:
         SourceError: when the original cannot be imported, fails, or gives something that is not an action.

@@ -45,11 +45,9 @@ class StoredTensor:
     """Location of one tensor.
 
     Args:
-        name: Name in the shard, or of the initializer.
         file: File that holds it; only for messages when ``array`` is given.
         offset: First byte in the file.
         dtype: Safetensors dtype: ``BF16``, ``F32`` ...
-        shape: Sizes of the axes.
         array: Bytes of a tensor in memory, (bytes,) uint8.
     """
 

@@ -73,7 +73,6 @@ class Workers:
         """Yield the answer to every request, in order; close the iterator to end the workers.
 
         Args:
-            work: what is to be done.
             done: function called with the number of a request and its answer as soon as there is one, from any thread.
             note: function called with what a reader of the results must know of the workers, a sentence.
 

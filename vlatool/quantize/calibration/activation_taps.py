@@ -29,7 +29,6 @@ class ActivationTap:
     Args:
         path: File of the graph; large weights stay in their files.
         copy: Path of the copy with additional outputs.
-        add_outputs: Function that adds the outputs.
     """
 
     def __init__(self, path: Path, copy: Path, add_outputs: Callable[[OnnxGraph], None]) -> None:

@@ -50,7 +50,6 @@ class Piece:
     Args:
         name: Name of the initializer.
         dtype: Name of an ``onnx_ir.DataType``.
-        shape: Sizes of the axes.
         offset: First byte within the record.
         size: Size in bytes.
     """
@@ -70,7 +69,6 @@ class Task:
         source: Location of its bytes.
         kind: ``blocks`` (MatMulNBits), ``qdq`` or ``copy``.
         pieces: Tensors of the result.
-        label: Name of the layer, for reports.
         rows, columns: Inputs (K) and outputs (N) of the layer, when it is quantized.
         output_first: Whether the weight is stored as (N, K).
         dtype: Type of the copy: ``F32``, ``F16`` or that of the source.

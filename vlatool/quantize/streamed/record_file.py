@@ -36,8 +36,6 @@ class RecordFile:
     """The finished file.
 
     Args:
-        path: Path in the work directory.
-        sha256: SHA-256 of the file, as hex.
         bytes: Size of the file.
         notes: Figures that each record's ``fill`` returned.
         resumed: Number of records that an earlier run had finished.

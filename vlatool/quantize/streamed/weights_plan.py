@@ -36,7 +36,6 @@ class GraphPlan:
     """One graph and the tasks of its constants.
 
     Args:
-        template: The original graph.
         products: Quantized products, each with the index of its task.
         kept: Copied initializer -> index of its task.
     """
