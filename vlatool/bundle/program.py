@@ -87,6 +87,7 @@ class ProgramStep:
     """One entry of a program: run a graph, once or several times.
 
     Args:
+        graph: name of the graph.
         feeds: graph input name -> value name.
         gives: graph output name -> value name.
         repeat: how often the graph runs.
