@@ -59,7 +59,6 @@ def check_tensors(modules: Mapping[str, nn.Module], stored: Mapping[str, Any], w
 
     Args:
         stored: name -> tensor; a name may have that of the graph before it.
-        where: the file, for messages.
 
     Raises:
         SourceError: when a tensor is unknown, there under both names, or of other numbers than the module's: codes of

@@ -88,7 +88,6 @@ def check_limit(name: str, got: int, where: str, error: type[VlatoolError]) -> N
     Args:
         got: value, in the unit of the limit.
         where: what has that value, as the start of a sentence.
-        error: class of the error that is raised.
     """
     allowed = limit(name)
     if got > allowed:

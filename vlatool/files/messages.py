@@ -32,7 +32,6 @@ def from_json(kind: type[T], value: Any, where: str = "message") -> T:
     ``Any``, which is not checked.
 
     Args:
-        value: JSON value.
         where: name of the value, for the reason.
 
     Raises:

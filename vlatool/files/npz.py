@@ -54,7 +54,6 @@ def open_npz(
         source: path, or content of the file.
         allowed: name of the limit (``vlatool.files.limits``) on the total size of all arrays.
         where: name of the file in messages; its path when empty.
-        error: class of the error that is raised.
         fix: remedy for a file that cannot be read.
 
     Raises:

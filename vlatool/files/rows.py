@@ -185,7 +185,6 @@ class Rows:
         source: source of its bytes, in C order.
         shape: shape, with the axis of samples first.
         dtype: dtype as stored; rows are returned in native byte order.
-        where: name of the array in messages.
 
     Example:
         >>> import tempfile

@@ -28,8 +28,6 @@ def read_verified(root: Path, name: str, sha256: str, size: int) -> bytes:
     Args:
         root: directory; the path to it may contain links, the path below it must not.
         name: relative path with ``/``.
-        sha256: recorded SHA-256 as hex.
-        size: recorded size in bytes.
 
     Raises:
         BundleError: when it is missing, a link, or has another size or content.

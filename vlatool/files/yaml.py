@@ -31,7 +31,6 @@ def read_yaml(path: Path, what: str, raised: type[InputError]) -> Any:
 
     Args:
         what: name of the file, as the subject of a sentence: ``The recipe out/recipe.yaml``.
-        raised: class of the errors.
 
     Raises:
         InputError: of the class ``raised``, when the file is missing, cannot be read, is not YAML, is larger than the

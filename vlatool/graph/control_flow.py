@@ -74,7 +74,6 @@ def flatten(graph: Any, opset: int, known: Mapping[str, Any]) -> list[Item]:
 
     Args:
         graph: Graph of a model from ``with_unique_names``.
-        opset: Opset of the model.
         known: Value -> ``ValueInfoProto`` from an earlier inference.
 
     Returns:

@@ -42,7 +42,6 @@ class QdqWriter(OnnxGraph):
 
     Args:
         model: An ``onnx.ModelProto``, changed in place.
-        layers, ranges, style: As for ``insert_qdq``.
     """
 
     codes: ClassVar[str] = "int8"
@@ -200,7 +199,6 @@ def quantize_weight(
     Args:
         values: float32, any shape.
         axis: Axis with one scale for each entry; one scale for all when None.
-        name: Name of the weight in messages.
         min_scales: Smallest allowed scales, one for each entry of the axis.
         sums: Largest magnitudes of a sum of two paired weights, one for each output, where such a sum must fit into
             int8, too (``weights.pairs``).

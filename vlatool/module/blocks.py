@@ -37,7 +37,6 @@ def block_names(module: nn.Module, stack: str) -> list[str]:
 
     Args:
         module: module as a factory makes it, or traced: then its stacks are no longer lists, but keep their names.
-        stack: name of the list or sequence.
     """
     part = dict(module.named_modules()).get(stack)
     names = [] if part is None else [name for name, _ in part.named_children() if "@" not in name]

@@ -21,7 +21,6 @@ class Atom:
     """One place in an axis that a factor has, which is neither divided nor a concatenation.
 
     Args:
-        leaf: the factor.
         path: number of the factor in the axis; where that one is a concatenation, number of the segment and of the
             factor in it, and so on.
         slower: factors that it lies within, as the elements of a head lie within the heads.

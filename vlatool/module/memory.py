@@ -60,7 +60,6 @@ def refuse_kept_values(module: nn.Module, step: ProgramStep, feeds: Sequence[Map
     """Run a module on different inputs and see whether it changes an attribute that its outputs depend on.
 
     Args:
-        module: a module of a policy.
         step: what it is fed and gives.
         feeds: two inputs or more, arrays by name; of one alone nothing is learnt.
 

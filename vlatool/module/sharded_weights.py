@@ -35,7 +35,6 @@ class StoredModules:
 
     Args:
         modules: graph name -> module, parameters on torch's meta device.
-        locations: where each parameter and saved buffer is.
     """
 
     modules: dict[str, nn.Module]

@@ -204,7 +204,6 @@ class StaticInt8(CalibratedQuantization):
         """Return value -> quantization range (low, high).
 
         Args:
-            statistics: Statistics of each value.
             unsigned: Values that are uint8 where others are symmetric.
         """
         kind = self.style.activations

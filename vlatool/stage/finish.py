@@ -91,7 +91,6 @@ class Difference:
 
     Args:
         mean, worst: mean and maximum of the relative L2 differences of an output; the share of others if discrete.
-        samples: observations.
         recorded: whether they were recorded.
     """
 
@@ -126,7 +125,6 @@ def finish(
     """Write golden file and manifest of a bundle whose graphs and carried folders are in ``out`` already.
 
     Args:
-        source: what the bundle was made from.
         graphs: graph name -> graph.
         observations: raw observations; the first two become golden. On ``MAX_COMPARED`` of them the bundle is compared
             with the source, where that has graphs.

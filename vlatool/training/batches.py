@@ -29,9 +29,7 @@ class Batches:
 
     Args:
         loss: rows, name -> (B, ...) -> the mean of their losses.
-        size: rows of a batch.
         accumulate: parts that a process computes one after the other.
-        group: group of processes, and this one's rank.
     """
 
     def __init__(

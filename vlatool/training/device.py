@@ -73,11 +73,7 @@ class Device:
         return context
 
     def choose(self, number: int) -> None:
-        """Let a GPU be the one that this process computes on, where it computes on one.
-
-        Args:
-            number: number of the process, of those on this machine.
-        """
+        """Let a GPU be the one that this process computes on, where it computes on one."""
         if self.name == "cuda":
             require("torch", "build").cuda.set_device(number)
 
@@ -102,7 +98,6 @@ def device_of(asked: DeviceChoice, precision: str, processes: int = 1, here: int
     Args:
         asked: ``auto``: a GPU where torch has one; several processes share the processors unless ``cuda`` is asked for.
         precision: ``auto``: bfloat16 where the device multiplies it natively.
-        processes: processes that train together.
         here: how many of them are on this machine, each with a GPU of its own; all when None.
 
     Raises:

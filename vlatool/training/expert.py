@@ -94,7 +94,6 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
     """Return so many recorded observations of a bundle, spread over its recording; None when it has none.
 
     Args:
-        most: observations.
         whole: whether these are whole episodes.
 
     Raises:

@@ -32,7 +32,6 @@ class Product:
 
     Args:
         first: place of the first one; the second one follows it.
-        names: names of both.
         outputs: axis of the weight that has an output in each entry; -1 for matrices, which may be no weights.
         blocks: whether int4 rounds the weight.
     """

@@ -35,9 +35,7 @@ class Hint:
 
     Args:
         name: name of the option that gives its weight.
-        weight: weight in the sum.
         distance: features of the student and of the teacher, (N, ..., D) -> their distance, a mean over rows.
-        pairs: blocks that are compared.
         left_out: stack -> why it is not compared.
         projections: number of a pair -> what brings the student's features to the teacher's width.
     """

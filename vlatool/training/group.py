@@ -33,7 +33,6 @@ class Group:
 
     Args:
         rank: its number; the first one, 0, plays, labels and writes.
-        size: how many there are.
     """
 
     rank: int = 0
@@ -99,7 +98,6 @@ def join_group(store: Callable[[], Any], group: Group, device: str = "cpu", *, h
 
     Args:
         store: opens a store of ``torch.distributed`` through which they find each other; a new one for each group.
-        group: group, and this process's rank.
         device: ``cpu`` or ``cuda``, of what is added up.
         here: whether all of them are on this machine, so that no other one needs to reach them.
 

@@ -37,8 +37,6 @@ class RankProcesses:
         """Let the others train while the block runs.
 
         Args:
-            rounds: how many rounds of rows there are.
-            rows: how many rows in all of them.
             until: number of steps after which to stop.
 
         Raises:

@@ -80,7 +80,6 @@ class Trainer:
     trained is what runs on the robot.
 
     Args:
-        settings: how long and how fast.
         folder: folder for checkpoints.
         group: the processes that train together; the first one writes checkpoints.
         constraint: what holds of the weights after each step.

@@ -27,7 +27,6 @@ class Pair:
     Args:
         stack: stack of both.
         numbers: numbers of the blocks in it, the student's and the teacher's.
-        ours, theirs: the blocks.
     """
 
     stack: Stack

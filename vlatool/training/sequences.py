@@ -41,11 +41,7 @@ class Unroll:
 
 @dataclass(frozen=True)
 class EpisodeWindows:
-    """What a loss takes instead of rows: the rows, and the windows in them.
-
-    Args:
-        lanes: lanes that are run.
-    """
+    """What a loss takes instead of rows: the rows, and the windows in them."""
 
     frames: Frames
     lanes: Lanes

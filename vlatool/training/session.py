@@ -89,7 +89,6 @@ class Session:
 
     Args:
         plan: what is played when.
-        settings: how long and how fast is trained.
         processes: other processes that train, too.
     """
 

@@ -71,7 +71,6 @@ class Teacher:
     Args:
         bundle: its source bundle.
         edits: what was done to its structure.
-        program: its modules, and how they run.
     """
 
     bundle: Bundle

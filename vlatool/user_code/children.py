@@ -176,8 +176,6 @@ class Child:
 
         Args:
             function: what is called, with ``job`` and ``tell``.
-            job: its argument.
-            tell: callback for the child's progress.
             own: whether it runs vlatool's code alone, and a policy's in its own children.
 
         Raises:

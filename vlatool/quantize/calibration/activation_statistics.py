@@ -73,7 +73,6 @@ def calibrate(
     """Collect statistics of activations.
 
     Args:
-        values: Values to observe.
         observations: Raw ones, or encoded for the graphs (``Encoded``), consumed one at a time; see ``run_with_taps``.
         channels: Whether the largest magnitude of each entry of the last axis is collected, too.
         numbers: Indices of the observations in the recording, for messages; counted from 0 when empty.

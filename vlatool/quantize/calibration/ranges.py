@@ -99,7 +99,6 @@ def choose_range(
     """Return (low, high) that an activation is quantized over.
 
     Args:
-        statistics: Statistics of the activation.
         method: ``minmax``: the extremes. ``percentile``: the central share of the values. ``entropy``: the clipping
             with the least Kullback-Leibler divergence (Migacz, 8-bit Inference with TensorRT, GTC 2017). ``mse``: the
             clipping with the least expected squared error.

@@ -19,7 +19,6 @@ def recorded_moments(
     """Yield recorded samples; for a policy that keeps values, each after the earlier ones of its episode.
 
     Args:
-        recording: Recording of observations.
         samples: Collector of the hash of each sample.
     """
     keeps = keeps_values(bundle.manifest.program)

@@ -26,7 +26,6 @@ def to_float8(values: Array, axis: int | None, name: str) -> tuple[Array, Array]
     Args:
         values: float32, any shape.
         axis: Axis with one scale for each entry; one scale for all when None.
-        name: Name of the weight in messages.
 
     Returns:
         The codes as uint8 in the shape of ``values``, and float32 scales: () or (entries of the axis,).

@@ -57,7 +57,6 @@ def write_records(records: list[Record], plan: str, directory: Path, processes: 
     """Write all records to ``directory/data``, resuming an earlier run of the same plan.
 
     Args:
-        records: Records of the file, in order.
         plan: Identifier of everything that the bytes depend on; work of another plan is discarded.
         directory: A locked work directory.
         processes: Number of worker processes; with 0 everything is computed here, in order.
