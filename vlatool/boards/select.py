@@ -199,8 +199,8 @@ def _reason(best: Outcome, state: str, results: Sequence[Outcome], wants: Wants)
 
 def _headroom(best: Outcome, results: Sequence[Outcome], wants: Wants) -> str:
     """Say what the chosen precision leaves over, and why a more faithful one is not taken."""
-    place = FIDELITY.index(best.candidate.precision)
-    better = [other for other in results if FIDELITY.index(other.candidate.precision) < place and other.latency.known]
+    rank = FIDELITY.index(best.candidate.precision)
+    better = [other for other in results if FIDELITY.index(other.candidate.precision) < rank and other.latency.known]
     faithful = ""
     if better:
         nearest = min(better, key=lambda other: other.latency.high)

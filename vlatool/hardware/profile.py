@@ -351,7 +351,7 @@ def _folder(entry: EntryPoint) -> Path | None:
 def _find_profiles() -> dict[str, Path]:
     """Profile name -> file; the first directory that has it wins."""
     package = Path(__file__).resolve().parents[1]
-    shipped = next((place for place in (package / "_profiles", package.parent / "profiles") if place.is_dir()), None)
+    shipped = next((folder for folder in (package / "_profiles", package.parent / "profiles") if folder.is_dir()), None)
     own = [Path(entry) for entry in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if entry]
     brought = [_folder(entry) for entry in registry.plugins("profiles").values()]
     files = [

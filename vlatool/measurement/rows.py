@@ -24,8 +24,6 @@ ENERGY_S = 10.0
 """Seconds below which the energy of a run says little (MLPerf Tiny: runs of 10 s)."""
 OWN_COUNTERS = ("process.cpu", "process.involuntary_switches")
 """Counters that the measurements hold over exactly the timed part."""
-OTHER_BOARDS = ("this is no ", "virtual machine or ", "NVIDIA card", "NVML tells nothing")
-"""What the reason says where a source of telemetry belongs to another kind of board: told in one line."""
 WINDOW = 0.1
 """Share of a sustained run that is its start, and its end."""
 
@@ -195,8 +193,8 @@ def _telemetry(telemetry: Summary) -> dict[str, list[dict[str, Any]]]:
 
 def _absent_table(absent: Sequence[Absent]) -> list[dict[str, str]]:
     """Return what is unmeasured and why; sources of other kinds of boards in one line."""
-    others = [part.reader for part in absent if any(sign in part.reason for sign in OTHER_BOARDS)]
-    lines = [{"what": part.reader, "why": part.reason} for part in absent if part.reader not in others]
+    others = [part.reader for part in absent if part.other_board]
+    lines = [{"what": part.reader, "why": part.reason} for part in absent if not part.other_board]
     if others:
         why = "this machine does not have them; vlatool telemetry says more"
         lines.append({"what": ", ".join(sorted(others)), "why": why})

@@ -142,7 +142,7 @@ def notes(report: Report, origin: str, where: str | None = None) -> list[str]:
     return [f"{', '.join(labels)}: {note}" for note, labels in by_note.items()]
 
 
-def unmeasured(report: Report, shown: Callable[[str], bool], *, further: bool = False) -> list[str]:
+def missing_reasons(report: Report, shown: Callable[[str], bool], *, further: bool = False) -> list[str]:
     """Return a sentence for each reason for which numbers could not be had; variants are named unless it holds for all.
 
     Args:

@@ -57,7 +57,7 @@ class Decision:
         return math.exp(math.log1p(self.margin) + reach(self.processes, self.alpha) * self.spread) - 1
 
     @property
-    def wanted(self) -> int:
+    def processes_needed(self) -> int:
         """Processes, all in all, that would decide if the centre is where it seems to be; 0 when it is decided.
 
         None would do where the centre lies on the margin: then it is a million.

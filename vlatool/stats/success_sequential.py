@@ -88,7 +88,7 @@ class Decision:
         return self.verdict != GO_ON
 
     @property
-    def saved(self) -> float:
+    def saved_share(self) -> float:
         """Share of the episodes that need not be played."""
         return 1 - self.pairs / self.most
 

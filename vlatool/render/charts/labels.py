@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from vlatool.render.charts.svg import CHARACTER, Canvas, shorten
 
 Box = tuple[float, float, float, float]
-WIDE = CHARACTER + 0.9
+CHARACTER_WIDTH = CHARACTER + 0.9
 ROW, ROWS = 17.0, 9
 REACHES = (13.0, 42.0)
 CLOSE = 17.0
@@ -45,7 +45,7 @@ class Label:
     @property
     def box(self) -> Box:
         """What it covers."""
-        wide = len(self.text) * WIDE
+        wide = len(self.text) * CHARACTER_WIDTH
         start = self.x if self.anchor == "start" else self.x - wide
         return start, self.y - 11, start + wide, self.y + 4
 

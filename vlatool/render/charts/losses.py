@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vlatool.render._format import fixed, significant, tick
+from vlatool.render._format import fixed_decimals, significant, tick
 from vlatool.render.charts.samples import envelope
 from vlatool.render.charts.svg import Axis, Canvas, axis_for
 from vlatool.render.charts.timeline import draw_bands
 
-HEIGHT, LEFT, RIGHT, TOP = 170, 54.0, 14.0, 26.0
+HEIGHT, LEFT_MARGIN, RIGHT, TOP = 170, 54.0, 14.0, 26.0
 ENDS = 20
 """The loss at the start and at the end are means of this part of the steps each."""
 
@@ -51,14 +51,14 @@ def loss_curve(curve: Curve, key: str, width: int) -> Canvas:
     canvas = Canvas(f"loss-{key}-{width}", width, HEIGHT, f"Loss of {curve.name}", words)
     base, right = HEIGHT - 34.0, width - RIGHT
     steps = [float(step + 1) for step in range(len(curve.losses))]
-    across = Axis(1.0, steps[-1], LEFT, right)
+    across = Axis(1.0, steps[-1], LEFT_MARGIN, right)
     bands = envelope(steps, curve.losses, min(len(steps), 180 if width > 500 else 90))
     up = axis_for([edge for band in bands for edge in (band.low, band.high)], base, TOP)
-    canvas.up(up, LEFT, right, {value: tick(value) for value in up.ticks(4)})
+    canvas.up(up, LEFT_MARGIN, right, {value: tick(value) for value in up.ticks(4)})
     canvas.across(across, base, base, 8 if width > 500 else 4)
     for step in curve.rounds:
         canvas.line(across(step), TOP, across(step), base, "limit")
     draw_bands(canvas, bands, across, up, curve.css)
-    canvas.heading(14, right, curve.name, f"{fixed(len(steps), 0)} steps", f"name ink halo {curve.css}")
+    canvas.heading(14, right, curve.name, f"{fixed_decimals(len(steps), 0)} steps", f"name ink halo {curve.css}")
     canvas.text(right, HEIGHT - 4, "step", "note", "end")
     return canvas

@@ -30,7 +30,7 @@ class Share:
     count: int
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """The share in words."""
         span = "" if self.low is None or self.high is None else f" ({percent(self.low)} to {percent(self.high)} %)"
         return f"{self.variant}: {percent(self.value)} %{span} of {self.count} episodes"
@@ -49,7 +49,7 @@ def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, 
     named = {share.variant: share.css for _, group in groups for share in group}
     top = TOP + (HEAD if len(named) > 1 else 0.0)
     height = top + sum(GAP + LINE * len(group) for _, group in groups) + FOOT
-    words = "; ".join(f"{name}: {', '.join(share.told for share in group)}" for name, group in groups)
+    words = "; ".join(f"{name}: {', '.join(share.text for share in group)}" for name, group in groups)
     canvas = Canvas(f"shares-{key}-{width}", width, round(height), title, words)
     least = min(share.value if share.low is None else share.low for _, group in groups for share in group)
     across = Axis(max(0.0, min(0.9, least - 0.02)), 1.0, left + 8, width - 24.0)
@@ -74,7 +74,7 @@ def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, 
 def _draw(canvas: Canvas, across: Axis, y: float, share: Share) -> None:
     if share.low is not None and share.high is not None:
         canvas.line(across(share.low), y, across(share.high), y, f"line {share.css}")
-    canvas.add("circle", f"dot {share.css}", share.told, cx=across(share.value), cy=y, r=3.5)
+    canvas.add("circle", f"dot {share.css}", share.text, cx=across(share.value), cy=y, r=3.5)
 
 
 def percent(value: float) -> str:

@@ -11,7 +11,7 @@ from vlatool.measures.tables import UNDER
 from vlatool.render._format import plain
 from vlatool.render.charts.curves import Curve, curves
 from vlatool.render.charts.shares import Share, shares
-from vlatool.render.charts.svg import tinted
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import Chart
 from vlatool.report import Report
 from vlatool.stats.intervals import wilson
@@ -37,7 +37,7 @@ def worst_first(groups: dict[str, list[Share]]) -> Groups:
     return sorted(groups.items(), key=lambda item: min(share.value for share in item[1]))
 
 
-def disturbed(report: Report, caption: str) -> Chart | None:
+def disturbance_chart(report: Report, caption: str) -> Chart | None:
     """Return the drawing of what disturbances cost, None where none were played.
 
     Args:
@@ -77,19 +77,19 @@ def _played(report: Report) -> Iterator[tuple[str, float, Share]]:
     """Yield disturbance, strength and how often a variant succeeds then: the baseline once, then each variant."""
     base = next((row.name for row in report.rows if row.role == "baseline"), "baseline")
     known: set[tuple[str, float]] = set()
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         for record in row.details.get(UNDER, ()):
             kind = plain(record.get("disturbance", ""))
-            place = (kind, _strength(record.get("strength")))
+            condition = (kind, _strength(record.get("strength")))
             count = record.get("episodes")
-            before = None if place in known else share_of(base, "s-base", record.get("baseline"), count)
+            before = None if condition in known else share_of(base, "s-base", record.get("baseline"), count)
             own = share_of(row.name, css, record.get("success"), count)
-            known.add(place)
-            yield from ((*place, share) for share in (before, own) if share)
+            known.add(condition)
+            yield from ((*condition, share) for share in (before, own) if share)
 
 
 def _undisturbed(report: Report) -> Iterator[Share]:
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         rate = row.get(SUCCESS)
         if rate is not None and (share := share_of(row.name, css, rate.value, rate.samples)):
             yield share
