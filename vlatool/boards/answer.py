@@ -213,7 +213,8 @@ def simulate(
     model = load_model().condition(measured_questions())
     outcome = outcomes([candidate], load, model)[0]
     if not outcome.latency.known:
-        raise DataError(f"{source} on {board}: {outcome.latency.why}.", _fix_of(load))
+        fix = FIXED_SHAPES if load.unknown else "try another --engine or --precision"
+        raise DataError(f"{source} on {board}: {outcome.latency.why}.", fix)
     phases = bounds(outcome, model.shares)
     return {
         "source": source, "profile": board, "mode": name, "engine": candidate.engine,
@@ -246,10 +247,6 @@ FIXED_SHAPES = (
     "give every axis a number: write the shapes into the spec of a policy.yaml beside the ONNX file, or export it with "
     "fixed shapes"
 )
-
-
-def _fix_of(load: Workload) -> str:
-    return FIXED_SHAPES if load.unknown else "try another --engine or --precision"
 
 
 def _part_lines(phases: list[dict[str, Any]]) -> list[str]:

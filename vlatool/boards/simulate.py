@@ -39,7 +39,7 @@ class Change:
     """What one change would give.
 
     Args:
-        name: In words.
+        name: Name in words.
         outcome: The changed policy on the same board.
     """
 

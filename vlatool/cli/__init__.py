@@ -126,7 +126,7 @@ def main(arguments: list[str] | None = None) -> None:
     With ``--json``, standard output holds one JSON document, of an error too.
 
     Args:
-        arguments: Its words; when None, those that the process was started with, and the process ends with this call.
+        arguments: Words of the command line; when None, those of the process, which then ends with this call.
     """
     _open_standard_files()
     _end_on_signals()

@@ -30,7 +30,7 @@ class BoardSummary:
     Args:
         board: Name of the profile.
         before, after: Bytes of the graphs; before is None where the source has no graphs.
-        predictions: For the board, with their intervals.
+        predictions: Predictions for the board, with their intervals.
         error: How the actions differ from the source's on recorded observations, None where that cannot be said.
         missing: What could not be predicted or compared, and why, in words.
     """

@@ -146,7 +146,7 @@ def refuse_existing(
     Args:
         out: The output, None when there is none.
         force: Whether what vlatool wrote there may be replaced.
-        inputs: What the command reads.
+        inputs: Files that the command reads.
         kind: What is written: only the same is replaced (None: whatever is there).
 
     Raises:
@@ -169,7 +169,7 @@ def refuse_video(
         video: The file, None when there is none.
         force: Whether one that vlatool wrote there may be replaced.
         out: The directory of the report.
-        inputs: What the command reads.
+        inputs: Files that the command reads.
 
     Raises:
         UsageError: when its suffix names no format, or it is in the directory of the report.

@@ -32,7 +32,7 @@ class Output:
     """What a command line that asks for JSON leaves on standard output.
 
     Args:
-        printed: What takes the text of an option that is answered at once, None for a command.
+        printed: Buffer for the text of ``--help`` and ``--version``; None for a command.
     """
 
     def __init__(self, printed: io.StringIO | None = None) -> None:

@@ -18,7 +18,7 @@ def launch_for(command: str, *, trains: bool) -> Launch | None:
     """Return which of torchrun's processes this one is; None where torchrun did not start it.
 
     Args:
-        command: As typed, for messages.
+        command: The command as typed, for messages.
         trains: Whether the command trains.
 
     Raises:

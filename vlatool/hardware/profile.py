@@ -89,7 +89,7 @@ class Unit(Strict):
     Args:
         cores: Processor cores, or streaming multiprocessors / execution units of a GPU.
         clock_mhz: The highest clock; the peaks hold at it.
-        bandwidth_gb_s: Of its way to memory where that is less than the board's: a processor beside a graphics card,
+        bandwidth_gb_s: Bandwidth to memory, where that is less than the board's: a processor beside a graphics card,
             a module behind PCI Express.
         peak_tops: dtype -> 10^12 operations per second, dense, where a multiply-accumulate is two operations.
         isa: Instruction set features that inference libraries use, as ``/proc/cpuinfo`` names them. Those of an x86
@@ -161,7 +161,7 @@ class Profile(Strict):
     """A hardware target.
 
     Args:
-        name: As on the command line; lower case, digits and hyphens.
+        name: Name on the command line; lower case, digits and hyphens.
         aliases: Other names that people type for it.
         model_strings: Names of the board in its firmware or processor (see ``vlatool.machine.host.matches``).
         memory_gb: Memory in GB (10^9 bytes), shared by CPU and GPU where ``unified``.

@@ -48,16 +48,13 @@ def measurements(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | 
         numbers = [replace(number, note=number.note or note) for number in numbers]
         numbers += paced_measurements(pace, len(samples), rate)
     else:
-        numbers.append(_throughput(samples))
+        rate_of_calls = 1e3 / float(np.mean(samples))
+        numbers.append(latency.THROUGHPUT.measurement(rate_of_calls, samples=len(samples), note="back to back"))
     numbers.append(_jitter(samples))
     busy = measured.cpu_s / max(measured.wall_s, 1e-9)
     numbers.append(resources.CPU.measurement(busy, note="user and system time of the process over the run"))
     board = _board(measured, pace.inferences if pace else len(samples))
     return [*numbers, *board, *_golden(policy), *cold_rows(policy)]
-
-
-def _throughput(samples: Sequence[float]) -> Measurement:
-    return latency.THROUGHPUT.measurement(1e3 / float(np.mean(samples)), samples=len(samples), note="back to back")
 
 
 def _jitter(samples: Sequence[float]) -> Measurement:

@@ -8,7 +8,7 @@ from typing import Any
 
 from vlatool.measures import Quantity
 from vlatool.render._format import cell, count, fixed_decimals, plain, quantity, span
-from vlatool.render._view import notes
+from vlatool.render._view import is_number, notes
 from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import MISSING, Bar, Cell, Column, Line, Notes, Table
 from vlatool.report import Measurement, Report
@@ -79,7 +79,7 @@ def records_table(report: Report, title: str, bars_of: str = "") -> Table | None
 
     Args:
         report: The report.
-        title: Of the details.
+        title: Title of the details.
         bars_of: Name of the number that gets a bar.
     """
     records = [
@@ -97,7 +97,9 @@ def records_table(report: Report, title: str, bars_of: str = "") -> Table | None
         records.sort(key=lambda item: order.index(cell(item[2].get(keys[0]))))
     contents = [[record.get(key) for _, _, record in records] for key in keys]
     first, *others = [
-        Column(plain(key), all(map(_is_number, content)), minor=bool(bars_of) and key == "calls")
+        Column(
+            plain(key), all(each is None or is_number(each) for each in content), minor=bool(bars_of) and key == "calls"
+        )
         for key, content in zip(keys, contents, strict=True)
     ]
     lines, before = [], ""
@@ -118,13 +120,8 @@ def records_table(report: Report, title: str, bars_of: str = "") -> Table | None
     return Table(columns, tuple(lines), heading, style="parts" if bars_of else "groups")
 
 
-def _is_number(content: Any) -> bool:
-    return isinstance(content, int | float | None) and not isinstance(content, bool)
-
-
 def _length(content: Any) -> float:
-    drawn = content is not None and _is_number(content) and math.isfinite(content) and content > 0
-    return float(content) if drawn else 0.0
+    return float(content) if is_number(content) and math.isfinite(content) and content > 0 else 0.0
 
 
 def _texts(contents: Sequence[Any]) -> list[str]:

@@ -31,11 +31,11 @@ class Shot:
     """The episode of one variant.
 
     Args:
-        variant: Its name.
-        pictures: Of the reset and after each step, uint8 (H, W, 3); iterated more than once.
-        count: Of the pictures.
+        variant: Name of the variant.
+        pictures: Pictures of the reset and after each step, uint8 (H, W, 3); iterated more than once.
+        count: Number of the pictures.
         size: Height and width of each.
-        steps: Of the whole episode, which may be longer than what was filmed.
+        steps: Steps of the whole episode, which may be longer than what was filmed.
         success: How it ended.
         seams: Steps, from 1, at which a new chunk begins; none where each step does.
     """
@@ -149,8 +149,8 @@ class _Pen:
         Args:
             x, y: Its left end, or its right one, and its top.
             text: One line.
-            colour: Of the ink.
-            width: At most, in pixels.
+            colour: Colour of the ink.
+            width: Largest width in pixels.
             right: Whether it ends at ``x``.
         """
         if self._length(text) > width:

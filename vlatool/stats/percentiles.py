@@ -65,7 +65,7 @@ def percentile(
     """Return a percentile with its upper confidence bound, from dependent calls.
 
     Args:
-        samples: In the order in which they were taken, any unit.
+        samples: Samples in the order in which they were taken, any unit.
         processes: Which process each call was made in; all in one when None.
         percent: Above 0 and below 100.
         confidence: One-sided confidence of the bound.

@@ -21,7 +21,7 @@ class Curve:
     """One variant under one disturbance.
 
     Args:
-        variant: Its name.
+        variant: Name of the variant.
         css: Class of its colour.
         points: Strength, and how often it succeeds then; in the order of strength.
     """
@@ -36,8 +36,8 @@ def curves(groups: Sequence[tuple[str, Sequence[Curve]]], title: str, width: int
 
     Args:
         groups: Disturbance -> the curves of the variants, the worst first.
-        title: What it shows.
-        width: In pixels.
+        title: Title of the drawing.
+        width: Width in pixels.
     """
     columns = min(len(groups), 3 if width > 500 else 2)
     wide = (width - GAP * (columns - 1)) / columns

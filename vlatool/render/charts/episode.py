@@ -21,7 +21,7 @@ class Played:
     """What one variant did in the episode.
 
     Args:
-        variant: Its name.
+        variant: Name of the variant.
         css: Class of its colour.
         series: ``position.x``, ``action.NAME`` (or ``action``) and ``fresh`` -> a number a step.
     """
@@ -42,7 +42,7 @@ def episode(played: Sequence[Played], title: str, width: int) -> Canvas:
     Args:
         played: The variants, the baseline first.
         title: Which episode it is.
-        width: In pixels.
+        width: Width in pixels.
     """
     views = [(one, two, words) for one, two, words in VIEWS
              if all({f"position.{one}", f"position.{two}"} <= set(each.series) for each in played)]  # fmt: skip

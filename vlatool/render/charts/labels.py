@@ -93,7 +93,7 @@ def labels(marks: Sequence[Mark], frame: Box, taken: Sequence[Box], longest: flo
     Args:
         marks: The points.
         frame: Pixels inside which labels stay: left, top, right, bottom.
-        taken: What else stands in the chart.
+        taken: Boxes of what else stands in the chart.
         longest: Pixels that a name may take.
     """
     named = _placed(marks, [shorten(mark.name, longest) for mark in marks], frame, taken)

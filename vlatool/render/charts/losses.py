@@ -20,8 +20,8 @@ class Curve:
     """One training.
 
     Args:
-        name: Of the variant, and the stage.
-        losses: Of the steps, all finite, two or more.
+        name: Name of the variant, and the stage.
+        losses: Losses of the steps, all finite, two or more.
         rounds: Steps before which rows were added.
         css: Class of the variant's colour.
     """
@@ -42,9 +42,9 @@ def loss_curve(curve: Curve, key: str, width: int) -> Canvas:
     """Return the drawing of one training.
 
     Args:
-        curve: What is drawn.
-        key: Unique in the page.
-        width: In pixels.
+        curve: The curve to draw.
+        key: Unique key in the page.
+        width: Width in pixels.
     """
     first, last = curve.ends
     words = f"Loss {significant(first)} in the first steps, {significant(last)} in the last."

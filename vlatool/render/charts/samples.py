@@ -70,8 +70,8 @@ def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> lis
 
     Args:
         times: When each sample was taken, ascending.
-        samples: As many as there are times.
-        bins: How many stretches.
+        samples: One sample for each time.
+        bins: Number of stretches.
     """
     first, last = times[0], times[-1]
     wide = (last - first) / bins
@@ -104,7 +104,7 @@ class Sampled:
 
     Args:
         name, css: The variant and the class of its colour.
-        samples: In ms, as they came.
+        samples: Latencies in ms, as they came.
         ordered: The same, ascending.
         known: Share -> the percentile that the report has.
         times: When each call began, in seconds since the start of the run; empty when that is not known.

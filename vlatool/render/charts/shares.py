@@ -16,7 +16,7 @@ class Share:
     """How often one variant succeeds.
 
     Args:
-        variant: Its name.
+        variant: Name of the variant.
         css: Class of its colour.
         value, low, high: Shares from 0 to 1; ends of the interval are None when they are not known.
         count: Episodes.
@@ -41,9 +41,9 @@ def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, 
 
     Args:
         groups: Title -> the shares of the variants, the worst first.
-        title: What it shows.
-        key: Unique in the page.
-        width: In pixels.
+        title: Title of the drawing.
+        key: Unique key in the page.
+        width: Width in pixels.
     """
     left = min(0.34 * width, 12.0 + 6.2 * max(len(name) for name, _ in groups))
     named = {share.variant: share.css for _, group in groups for share in group}

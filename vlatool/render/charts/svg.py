@@ -95,10 +95,10 @@ class Canvas:
     """One drawing with a title and a description for those who cannot see it.
 
     Args:
-        key: Unique in the page; names the title and the description.
+        key: Unique key in the page; names the title and the description.
         width, height: Size in pixels, which may grow; the drawing scales down, and up to its width.
-        title: What it shows.
-        description: What one sees in it.
+        title: Title of the drawing.
+        description: Description of the drawing.
     """
 
     def __init__(self, key: str, width: int, height: int, title: str, description: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from vlatool.measures.success import SUCCESS
 from vlatool.measures.tables import UNDER
 from vlatool.render._format import plain
+from vlatool.render._view import is_number
 from vlatool.render.charts.curves import Curve, curves
 from vlatool.render.charts.shares import Share, shares
 from vlatool.render.charts.svg import with_colours
@@ -27,7 +28,7 @@ Groups = list[tuple[str, list[Share]]]
 
 def share_of(variant: str, css: str, value: Any, count: Any) -> Share | None:
     """Return a share with Wilson's interval; None where a report from elsewhere does not have its numbers."""
-    if type(count) is not int or count < 1 or not _is_number(value) or not 0 <= value <= 1:
+    if type(count) is not int or count < 1 or not is_number(value) or not 0 <= value <= 1:
         return None
     return Share(plain(variant), css, value, *wilson(round(value * count), count), count)
 
@@ -97,8 +98,4 @@ def _undisturbed(report: Report) -> Iterator[Share]:
 
 def _strength(value: Any) -> float:
     """Return a strength; 1 where a report from elsewhere says something else."""
-    return float(value) if _is_number(value) and 0 <= value <= STRONGEST else 1.0
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float)
+    return float(value) if is_number(value) and 0 <= value <= STRONGEST else 1.0
