@@ -234,8 +234,7 @@ def require(module: str, extra: str) -> ModuleType:
         top = module.partition(".")[0]
         if error.name is not None and error.name.partition(".")[0] != top:
             raise MissingExtra(
-                f"'{module}' is installed, but '{error.name}', which it needs, is not.",
-                pip_install(extra),
+                f"'{module}' is installed, but '{error.name}', which it needs, is not.", pip_install(extra)
             ) from error
         raise _missing(top, extra) from error
 

@@ -83,7 +83,7 @@ class Row:
         name: Name of the variant, for example ``static_int8``.
         role: ``baseline``, ``chosen``, ``within`` or ``outside`` the limits, ``failed``, or ``subject``.
         reason: Why it has this role, in words.
-        measurements: By no particular order; names are unique within a row and origin.
+        measurements: Measurements in no particular order; names are unique within a row and origin.
         raw: Series name (``vlatool.measures.series``) -> raw samples in the order in which they were taken; NaN where
             one is not known.
         details: Tables that belong to the row: title (``vlatool.measures.tables``) -> list of {column: cell}.

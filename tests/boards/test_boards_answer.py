@@ -17,10 +17,10 @@ from vlatool.boards.answer import (
     Asked,
     _change,
     carry_count,
-    counted,
-    opened,
+    count_workload,
+    open_bundle,
     select_boards,
-    simulated,
+    simulate,
     simulation_lines,
 )
 from vlatool.boards.simulate import Change
@@ -52,12 +52,12 @@ def kept() -> list[Path]:
 
 
 def test_a_count_is_kept_and_read_again(float_bundle: Bundle) -> None:
-    first = counted(float_bundle, Context())
+    first = count_workload(float_bundle, Context())
     assert first == workload(float_bundle)
     (file,) = kept()
     assert file.suffix == ".json"
     file.write_text(file.read_text().replace('"layers": ', '"layers": 1'))
-    assert counted(float_bundle, Context()).layers > first.layers, "it was read, not counted"
+    assert count_workload(float_bundle, Context()).layers > first.layers, "it was read, not counted"
 
 
 @pytest.mark.parametrize(
@@ -65,15 +65,15 @@ def test_a_count_is_kept_and_read_again(float_bundle: Bundle) -> None:
                 b'{"layout": 4, "graphs": {"m": {"colour": 1}}, "runs": {}}', b"\xff\xfe"]
 )  # fmt: skip
 def test_a_damaged_count_is_made_again(float_bundle: Bundle, content: bytes) -> None:
-    wanted = counted(float_bundle, Context())
+    wanted = count_workload(float_bundle, Context())
     kept()[0].write_bytes(content)
-    assert counted(float_bundle, Context()) == wanted
+    assert count_workload(float_bundle, Context()) == wanted
     assert json.loads(kept()[0].read_text())["layout"] == LAYOUT_VERSION
 
 
 def test_a_cache_that_cannot_be_written_costs_time_alone(float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLATOOL_CACHE", "/proc/none")
-    assert counted(float_bundle, Context()) == workload(float_bundle)
+    assert count_workload(float_bundle, Context()) == workload(float_bundle)
 
 
 def forget() -> None:
@@ -86,12 +86,12 @@ def test_a_policy_that_carries_its_count_is_not_counted_again(
 ) -> None:
     file = carry_count(str(policy_dir), Context())
     assert file == policy_dir / "workload.json"
-    wanted = counted(opened(str(policy_dir), Context()), Context())
+    wanted = count_workload(open_bundle(str(policy_dir), Context()), Context())
     forget()
     monkeypatch.setattr(select_boards_module, "counted_apart", None)
-    assert counted(opened(str(policy_dir), Context()), Context()) == wanted
+    assert count_workload(open_bundle(str(policy_dir), Context()), Context()) == wanted
     file.write_text(file.read_text().replace('"layers": ', '"layers": 1'))
-    assert counted(opened(str(policy_dir), Context()), Context()).layers > wanted.layers, "it was read"
+    assert count_workload(open_bundle(str(policy_dir), Context()), Context()).layers > wanted.layers, "it was read"
 
 
 @pytest.mark.parametrize("change", ["code", "spec", "damage", "another version"])
@@ -109,8 +109,8 @@ def test_a_count_of_something_else_is_made_again(
         description.write_text(description.read_text().replace("control_hz: 10", "control_hz: 20"))
     elif change == "another version":
         monkeypatch.setattr("vlatool.graph.workload_file.VERSION", "99")
-    bundle = opened(str(policy_dir), Context())
-    assert counted(bundle, Context()) == torch_workload(bundle)
+    bundle = open_bundle(str(policy_dir), Context())
+    assert count_workload(bundle, Context()) == torch_workload(bundle)
 
 
 @pytest.mark.parametrize(
@@ -119,20 +119,23 @@ def test_a_count_of_something_else_is_made_again(
 )
 def test_a_carried_count_with_odd_values_is_made_again(change: dict[str, Any], policy_dir: Path) -> None:
     file = carry_count(str(policy_dir), Context())
-    wanted = counted(opened(str(policy_dir), Context()), Context())
+    wanted = count_workload(open_bundle(str(policy_dir), Context()), Context())
     forget()
     data = json.loads(file.read_text())
     data["graphs"]["main"] |= change
     file.write_text(json.dumps(data))
-    assert counted(opened(str(policy_dir), Context()), Context()) == wanted
+    assert count_workload(open_bundle(str(policy_dir), Context()), Context()) == wanted
 
 
 def test_a_pruned_policy_does_not_take_the_count_of_the_whole_one(policy_dir: Path, tmp_path: Path) -> None:
     carry_count(str(policy_dir), Context())
-    whole = opened(str(policy_dir), Context())
+    whole = open_bundle(str(policy_dir), Context())
     pruned = run_transform(Neurons(ratio=0.5), whole, tmp_path / "pruned", Context())
-    assert counted(pruned, Context()) == torch_workload(pruned)
-    assert counted(pruned, Context()).graphs["main"].weights < counted(whole, Context()).graphs["main"].weights
+    assert count_workload(pruned, Context()) == torch_workload(pruned)
+    assert (
+        count_workload(pruned, Context()).graphs["main"].weights
+        < count_workload(whole, Context()).graphs["main"].weights
+    )
     with pytest.raises(UsageError, match="is a bundle; only a policy with code carries a count"):
         carry_count(str(pruned.path), Context())
 
@@ -148,15 +151,15 @@ def test_only_a_policy_with_code_carries_a_count(float_bundle: Bundle, policy_di
 @pytest.mark.parametrize("sample", sorted(path.parent.name for path in SAMPLES.glob("*/policy.yaml")))
 def test_the_sample_policies_carry_true_counts(sample: str) -> None:
     """After a change of their code: vlatool hwselect sample_models/NAME --carry-count."""
-    bundle = opened(str(SAMPLES / sample), Context())
+    bundle = open_bundle(str(SAMPLES / sample), Context())
     carried = read_workload(SAMPLES / sample / "workload.json", digest(bundle))
     assert carried is not None, "it is of another code, weights, spec or version"
     assert carried == torch_workload(bundle)
 
 
 def test_a_policy_and_an_onnx_file_are_opened_as_sources(policy_template: Path, float_bundle: Bundle) -> None:
-    assert opened(str(float_bundle.path), Context()).hash == float_bundle.hash
-    source = opened(str(policy_template), Context())
+    assert open_bundle(str(float_bundle.path), Context()).hash == float_bundle.hash
+    source = open_bundle(str(policy_template), Context())
     assert not source.manifest.graphs
     assert "factory" in source.manifest.source
 
@@ -168,7 +171,7 @@ def test_a_damaged_bundle_is_not_answered_for(float_bundle: Bundle, copied: Call
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
     with pytest.raises(BundleError, match=r"main\.onnx"):
-        opened(str(damaged.path), Context())
+        open_bundle(str(damaged.path), Context())
 
 
 def test_an_unknown_precision_is_refused_before_anything_is_read() -> None:
@@ -217,7 +220,7 @@ def test_a_platform_on_mains_power_has_no_battery_life(platform: str, has: bool,
 def tried(board: str, engine: str, precision: str, source: str) -> dict[str, Any] | None:
     """Simulate; None where there is no ground."""
     try:
-        return simulated(source, board, None, engine, precision, Context())
+        return simulate(source, board, None, engine, precision, Context())
     except DataError as error:
         if board in error.message and error.fix:
             return None
@@ -254,7 +257,7 @@ def test_every_engine_has_its_turn() -> None:
 
 
 def test_a_change_that_cannot_be_predicted_is_json_without_nan(float_bundle: Bundle) -> None:
-    load = counted(float_bundle, Context())
+    load = count_workload(float_bundle, Context())
     way = Candidate(load_profile("raspberry-pi-5-hailo8"), "default", "hailort", "int8")
     outcome = outcomes([way], load, load_model())[0]
     assert not outcome.latency.known
@@ -271,10 +274,10 @@ def test_a_graph_with_free_axes_is_refused_with_a_remedy_that_works(tmp_path: Pa
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=8), model)
     asked = (str(model), "raspberry-pi-5", None, None, "", Context())
     with pytest.raises(SourceError, match="has the free axes rows") as caught:
-        simulated(*asked)
+        simulate(*asked)
     assert "--shape x=1,rows,4" in caught.value.fix
     (tmp_path / "policy.yaml").write_text(
         "name: free\nspec:\n  inputs: [{name: x, shape: [1, 5, 4]}]\n  outputs: [{name: y, shape: [1, 5, 2]}]\n"
         "  control_hz: 10\n  chunk: 5\n"
     )
-    assert simulated(*asked)["latency_ms"][0] > 0
+    assert simulate(*asked)["latency_ms"][0] > 0

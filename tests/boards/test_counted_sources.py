@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from vlatool.boards.answer import counted, opened
+from vlatool.boards.answer import count_workload, open_bundle
 from vlatool.stage.base import Context
 
 YAML = """\
@@ -97,6 +97,6 @@ def test_a_policy_is_counted_however_its_weights_are_loaded(kind: str, tmp_path:
     }  # fmt: skip
     torch.save(weights, folder / "weights.pt")
     save_file(weights, str(folder / "weights.safetensors"))
-    found = counted(opened(str(folder), Context()), Context()).graphs["main"]
+    found = count_workload(open_bundle(str(folder), Context()), Context()).graphs["main"]
     assert found.macs == {"float32": 6 * 8 + 8 * 2}
     assert (found.weights, found.layers, found.unknown) == (6 * 8 + 8 * 2, 2, ())

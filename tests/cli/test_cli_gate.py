@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from vlatool.cli._console import MISSED
+from vlatool.cli._console import MISSED_FIX
 from vlatool.gate import run, timed
 from vlatool.measurement.agreement import run_agreement
 from vlatool.measurement.pairs import Pairs
@@ -57,7 +57,7 @@ def test_json_junit_and_a_directory_of_reports(vlatool, float_bundle, slowdown, 
     assert code == 1
     found = json.loads(out)
     assert (found["kind"], found["verdict"]) == ("gate", "fail")
-    error = {"type": "GateFailed", "message": found["summary"][0], "fix": MISSED, "exit_code": 1}
+    error = {"type": "GateFailed", "message": found["summary"][0], "fix": MISSED_FIX, "exit_code": 1}
     assert found["error"] == error, "the verdict stands beside its report"
     assert found["command"].startswith("vlatool")
     assert ElementTree.parse(tmp_path / "deep/gate.xml").getroot().get("failures") == "1"

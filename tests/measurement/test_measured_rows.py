@@ -26,7 +26,7 @@ def recorded(root, seconds):
     recorder.sample(every=True)
     now[0] += seconds
     recorder.sample(every=True)
-    return recorder.recorded
+    return recorder.summary
 
 
 def found(telemetry=None, calls=100, **more):
@@ -107,7 +107,7 @@ def test_a_nuc_counts_energy_over_the_wrap_around(tmp_path):
     (package / "energy_uj").write_text("140000000")
     now[0] = 20.0
     recorder.sample(every=True)
-    told = numbers(found(recorder.recorded))
+    told = numbers(found(recorder.summary))
     assert told["power_mean"].value == pytest.approx(240 / 20)
     assert told["energy_per_action"].value == pytest.approx(2.4)
 
@@ -136,6 +136,15 @@ def test_what_is_absent_is_told_and_never_zero():
     told = tables(what, what.policies[0], alone=True)
     assert told["unmeasured"] == [{"what": "rapl", "why": "no RAPL"}]
     assert "power_mean" not in numbers(what)
+
+
+def test_sources_of_other_boards_share_a_line(tmp_path):
+    absent = [each for each in open_all(tmp_path) if isinstance(each, Absent) and each.reader != "process"]
+    what = found(replace(QUIET, unmeasured=(*absent, Absent("fan", "its file cannot be read"))))
+    *own, others = tables(what, what.policies[0], alone=True)["unmeasured"]
+    assert own[-1] == {"what": "fan", "why": "its file cannot be read"}
+    assert {"ina", "nvpmodel", "rapl", "thermal", "vcgencmd"} <= set(others["what"].split(", "))
+    assert not {"ina", "rapl"} & {each["what"] for each in own}
 
 
 def test_memory_and_cold_start_by_part():

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlatool.render.filmstrip import AHEAD, BAD, BAR, EDGE, GAP, GOOD, INK, LINE, MUTED, SEEN, TINTS, Shot, filmstrip
+from vlatool.render.filmstrip import AHEAD_INK, BAD, BAR, EDGE, GAP, GOOD, INK, LINE, MUTED_INK, TINTS, Shot, filmstrip
+from vlatool.render.filmstrip import PICTURE_HEIGHT as HEIGHT
 
 TOP = EDGE + 2 * LINE
 
@@ -48,7 +49,7 @@ def test_the_factor_makes_small_pictures_visible_and_wide_ones_no_wider(size: tu
     one = shot(size=size, steps=1)
     assert one.factor == factor
     (picture, _) = drawn(one)
-    assert picture.shape[1] == max(SEEN, size[1] * factor) + 2 * EDGE
+    assert picture.shape[1] == max(HEIGHT, size[1] * factor) + 2 * EDGE
 
 
 def captions(picture: np.ndarray, wide: int = 256) -> list[np.ndarray]:
@@ -72,7 +73,7 @@ def test_no_caption_leaves_its_panel_however_long_the_name():
         between = picture[:, EDGE + 256 : EDGE + 256 + GAP]
         assert not has(between[EDGE + LINE :], TINTS[0])
         assert not has(between[EDGE + LINE :], INK)
-        assert not has(picture[:, -EDGE:], MUTED)
+        assert not has(picture[:, -EDGE:], MUTED_INK)
 
 
 def test_the_bar_is_the_whole_episode_with_a_mark_at_each_seam():
@@ -82,11 +83,11 @@ def test_the_bar_is_the_whole_episode_with_a_mark_at_each_seam():
         bar = picture[middle, EDGE : EDGE + 256]
         reached = int((bar == TINTS[1]).all(axis=-1).sum())
         assert abs(reached - 256 * step / 8) <= 1
-        assert int((bar == AHEAD).all(axis=-1).sum()) == 256 - reached
+        assert int((bar == AHEAD_INK).all(axis=-1).sum()) == 256 - reached
         mark = picture[middle - 4, EDGE : EDGE + 256]
-        assert [int(place) for place in np.flatnonzero((mark == (TINTS[1] if step >= 5 else AHEAD)).all(axis=-1))] == [
-            128
-        ]
+        assert [
+            int(place) for place in np.flatnonzero((mark == (TINTS[1] if step >= 5 else AHEAD_INK)).all(axis=-1))
+        ] == [128]
 
 
 def test_a_seam_is_said_when_it_is_shown():
@@ -99,7 +100,7 @@ def test_a_seam_is_said_when_it_is_shown():
 def test_what_was_not_filmed_to_the_end_tells_no_end():
     last = drawn(shot(steps=50, count=4))[-1]
     caption = last[EDGE + LINE : TOP]
-    assert has(caption, MUTED)
+    assert has(caption, MUTED_INK)
     assert not has(caption, GOOD)
 
 

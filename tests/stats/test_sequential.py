@@ -71,7 +71,7 @@ def test_the_same_ratio_every_time_is_decided_exactly() -> None:
     same = judge([math.log(1.02)] * 10, 0.05)
     assert (same.verdict, same.spread) == ("pass", 0)
     assert same.detectable == pytest.approx(0.05)
-    assert same.wanted == 0
+    assert same.processes_needed == 0
 
 
 @pytest.mark.parametrize("processes", [10, 20])
@@ -90,9 +90,9 @@ def test_what_could_be_found_narrows_with_processes_and_widens_with_the_spread()
 
 def test_it_says_how_many_processes_would_decide() -> None:
     near, far = (Decision("inconclusive", ratio, 0.9, 1.2, 0.05, 40, 0.03) for ratio in (1.045, 1.02))
-    assert near.wanted > far.wanted > 40
-    assert Decision("inconclusive", 1.05, 0.9, 1.2, 0.05, 40, 0.03).wanted == 1_000_000
-    assert Decision("fail", 1.2, 1.1, 1.3, 0.05, 40, 0.03).wanted == 0
+    assert near.processes_needed > far.processes_needed > 40
+    assert Decision("inconclusive", 1.05, 0.9, 1.2, 0.05, 40, 0.03).processes_needed == 1_000_000
+    assert Decision("fail", 1.2, 1.1, 1.3, 0.05, 40, 0.03).processes_needed == 0
 
 
 @pytest.mark.parametrize("interim_analyses", [(), (5,), (20, 10), (10, 10), (8, 20, 40)])

@@ -196,9 +196,9 @@ def test_a_recorder_samples_at_the_start_and_at_the_end() -> None:
     with Recorder([reader, Absent("rapl", "no")], NEVER_S, clock) as found:
         clock.now += 10.0
     assert reader.count == 2
-    assert found.recorded.energy[0].joules == 50.0
-    assert found.recorded.seconds == 10.0
-    assert reasons(found.recorded) == {"rapl": "no"}
+    assert found.summary.energy[0].joules == 50.0
+    assert found.summary.seconds == 10.0
+    assert reasons(found.summary) == {"rapl": "no"}
 
 
 def test_a_slow_reader_is_asked_once_in_its_period_and_at_the_ends() -> None:
@@ -227,7 +227,7 @@ def test_the_thread_samples_by_itself_and_stops() -> None:
     count = reader.count
     assert count >= 5
     assert not any(thread.name == "telemetry" for thread in threading.enumerate())
-    assert found.recorded.gauges["ina.VDD_IN"].mean == 1.0
+    assert found.summary.gauges["ina.VDD_IN"].mean == 1.0
 
 
 def test_a_reader_that_fails_is_dropped_and_named() -> None:
@@ -238,8 +238,8 @@ def test_a_reader_that_fails_is_dropped_and_named() -> None:
         found.sample()
         clock.now += 1.0
     assert bad.count == 2
-    assert "bus error" in reasons(found.recorded)["slow"]
-    assert found.recorded.energy[0].joules == 4.0
+    assert "bus error" in reasons(found.summary)["slow"]
+    assert found.summary.energy[0].joules == 4.0
 
 
 def test_an_error_of_the_run_is_not_hidden() -> None:
@@ -262,7 +262,7 @@ def test_a_reader_that_does_not_return_costs_the_last_samples_only(monkeypatch: 
 
     with Recorder([Stuck(watts(1.0))], period_s=0.001) as found:
         assert entered.wait(5.0)
-    assert "did not return" in reasons(found.recorded)["recorder"]
+    assert "did not return" in reasons(found.summary)["recorder"]
     held.set()
 
 
@@ -282,8 +282,8 @@ def test_every_file_of_the_folder_is_a_reader_or_the_recorder() -> None:
 def test_this_machine_can_be_recorded_whatever_it_has() -> None:
     with Recorder(open_all(), NEVER_S) as found:
         pass
-    assert found.recorded.seconds >= 0
-    json.dumps(asdict(found.recorded), allow_nan=False)
+    assert found.summary.seconds >= 0
+    json.dumps(asdict(found.summary), allow_nan=False)
 
 
 def test_entries_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:

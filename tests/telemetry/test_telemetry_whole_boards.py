@@ -38,7 +38,7 @@ def recorded_between(root: Path, later: dict[str, Any], answers: dict[str, str |
     ) as found:
         clock.now += 10.0
         write(root, later)
-    return found.recorded
+    return found.summary
 
 
 def test_a_virtual_machine_has_its_process_and_nothing_else(tmp_path: Path) -> None:
@@ -67,8 +67,8 @@ def test_tegrastats_stands_in_where_the_monitors_are_hidden(tmp_path: Path) -> N
     readers = open_all(write(tmp_path, VM), lambda command: next(lines) if command[0] == "sh" else None)
     with Recorder(readers, NEVER_S, clock) as found:
         clock.now += 2.0
-    assert found.recorded.energy[0].joules == pytest.approx(12.0)
-    assert "ina" in reasons(found.recorded)
+    assert found.summary.energy[0].joules == pytest.approx(12.0)
+    assert "ina" in reasons(found.summary)
 
 
 def test_an_agx_orin_as_a_whole(tmp_path: Path) -> None:
@@ -113,9 +113,9 @@ def test_a_pi_5_that_sagged_between_the_samples(tmp_path: Path) -> None:
     with Recorder(open_all(write(tmp_path, {**PI, **VM}), commands(answers)), NEVER_S, clock) as found:
         clock.now += 10.0
         answers["get_throttled"] = "throttled=0x10000\n"
-    (one,) = found.recorded.energy
+    (one,) = found.summary.energy
     assert (one.label, one.mean_w) == ("PMIC rails, without USB", pytest.approx(PI5_WATTS))
-    assert found.recorded.throttling == ("under-voltage (1 more)",)
+    assert found.summary.throttling == ("under-voltage (1 more)",)
 
 
 def test_a_summary_holds_only_json_numbers(tmp_path: Path) -> None:

@@ -41,10 +41,10 @@ COLD_STARTS = 3
 LOG_LINES = 40
 CALLS, FEWEST_TICKS = 200, 20
 LONGEST_S = 86_400
-HERE = "this host"
+THIS_HOST = "this host"
 SPARSE = 0.2
 """Share of zeros, above those of the first policy, from which a policy counts as sparse."""
-GAINED = 1.05
+MIN_GAIN = 1.05
 """Speed-up that its interval must lie above before a policy is said to gain by its zeros."""
 
 
@@ -166,7 +166,7 @@ class Latency(Measure):
                 raise UsageError(f"The memory of eager torch is not limited: {bundle.path} has no graph.", "export it")
         job = self._job(bundles)
         if context.measure_remotely is None:
-            return self._report(bundles, job, agent.measure(job, context.progress), HERE)
+            return self._report(bundles, job, agent.measure(job, context.progress), THIS_HOST)
         answer = context.measure_remotely(to_json(job), [bundle.path for bundle in bundles], context.progress)
         try:
             measured = from_json(Benchmark, answer, "answer")
@@ -227,7 +227,7 @@ class Latency(Measure):
             summary=(self._sentence(rows, run.host, valid, seen),),
             rows=tuple(rows),
             limits={"hz": self.rate} if self.rate else {},
-            environment={**run.host, "run": self._told(), **({"target": run.target} if run.target else {})},
+            environment={**run.host, "run": self._run_settings(), **({"target": run.target} if run.target else {})},
             validity=valid,
             findings=seen,
         )
@@ -247,7 +247,7 @@ class Latency(Measure):
             text += f"its action, on {where}"
         return text + "."
 
-    def _told(self) -> dict[str, Any]:
+    def _run_settings(self) -> dict[str, Any]:
         """Return how it was measured, for the environment of the report: what makes two reports differ."""
         options = {"threads": self.threads, "rate_hz": self.rate, "pin": self.pin, "cores": self.cores,
                 "memory_limit_mb": self.memory_mb, "emulates": self._board}  # fmt: skip
@@ -273,7 +273,7 @@ def processors(text: str) -> tuple[int, ...]:
     """Return the numbers of ``0-3,6``; none for an empty text.
 
     Raises:
-        UsageError: when it is no such list.
+        UsageError: when it is not such a list.
     """
     if not text:
         return ()
@@ -307,7 +307,7 @@ def _sparse(bundles: Sequence[Bundle], rows: Sequence[Row], run: Benchmark) -> I
         speedup = row.get(SPEEDUP)
         if speedup is None:
             continue
-        gained = speedup.low is not None and speedup.low > GAINED
+        gained = speedup.low is not None and speedup.low > MIN_GAIN
         titles = ", ".join(dict.fromkeys(str(engine_class(graph.engine).title) for graph in policy.engines))
         verdict = "gains by them" if gained else "multiplies them like other numbers: nothing is faster"
         yield Finding(

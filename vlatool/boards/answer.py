@@ -32,7 +32,7 @@ from vlatool.sources import open_source, source_bundle
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_transform
 
-CARRIED = "workload.json"
+WORKLOAD_FILE = "workload.json"
 """File beside ``policy.yaml`` that holds the count of a policy."""
 
 
@@ -75,8 +75,8 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
             battery_wh=asked.battery_wh or sheet.battery_wh,
         )
     boards = [load_profile(name) for name in (asked.boards or profile_names())]
-    bundle = opened(source, context)
-    load = counted(bundle, context)
+    bundle = open_bundle(source, context)
+    load = count_workload(bundle, context)
     spec = bundle.manifest.spec
     asked = replace(asked, execute=spec.executed_actions)
     if asked.hz is None and asked.latency_ms is None:
@@ -99,12 +99,12 @@ def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wa
     return min(fitting, key=lambda choice: prices[choice.profile.name].value, default=None)  # type: ignore[union-attr]
 
 
-def opened(source: str, context: Context) -> Bundle:
+def open_bundle(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or the source bundle of a policy."""
     return source_bundle(open_source(source), cache_directory(), context)
 
 
-def counted(bundle: Bundle, context: Context) -> Workload:
+def count_workload(bundle: Bundle, context: Context) -> Workload:
     """Return the work of one inference of a bundle or source.
 
     It is kept in the cache by the bundle's hash; a policy may carry its count, too (``carry_count``).
@@ -151,7 +151,7 @@ def carry_count(source: str, context: Context) -> Path:
             a package, whose changes nobody would notice.
         OutputError: when the file cannot be written, or is none that was counted.
     """
-    bundle = opened(source, context)
+    bundle = open_bundle(source, context)
     if not _may_carry(bundle):
         if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
             raise UsageError(
@@ -165,9 +165,9 @@ def carry_count(source: str, context: Context) -> Path:
             "would notice.",
             "put the code beside policy.yaml, or leave --carry-count out: the count is in the cache",
         )
-    file = origin_of(bundle).folder / CARRIED
+    file = origin_of(bundle).folder / WORKLOAD_FILE
     refuse_foreign_file(file)
-    load = counted(bundle, context)
+    load = count_workload(bundle, context)
     try:
         write_workload(file, load, digest(bundle))
         add_to_ledger(file)
@@ -185,10 +185,10 @@ def _may_carry(bundle: Bundle) -> bool:
 
 
 def _beside(bundle: Bundle) -> Path:
-    return read_location(bundle.path) / CARRIED
+    return read_location(bundle.path) / WORKLOAD_FILE
 
 
-def simulated(
+def simulate(
     source: str, board: str, mode: str | None, engine: str | None, precision: str, context: Context
 ) -> dict[str, Any]:
     """Return what ``vlatool simulate`` prints, as JSON values.
@@ -207,13 +207,14 @@ def simulated(
             f"--precision is '{precision}'; {suggest(precision, asked.figures.dtypes)}.",
             fix_for(precision, asked.figures.dtypes),
         )
-    bundle = opened(source, context)
-    spec, load = bundle.manifest.spec, counted(bundle, context)
+    bundle = open_bundle(source, context)
+    spec, load = bundle.manifest.spec, count_workload(bundle, context)
     candidate = asked if engine or precision else replace(asked, engine=_engine_of(bundle, profile, load))
     model = load_model().condition(measured_questions())
     outcome = outcomes([candidate], load, model)[0]
     if not outcome.latency.known:
-        raise DataError(f"{source} on {board}: {outcome.latency.why}.", _fix_of(load))
+        fix = FIXED_SHAPES if load.unknown else "try another --engine or --precision"
+        raise DataError(f"{source} on {board}: {outcome.latency.why}.", fix)
     phases = bounds(outcome, model.shares)
     return {
         "source": source, "profile": board, "mode": name, "engine": candidate.engine,
@@ -232,11 +233,7 @@ def simulated(
 
 
 def _engine_of(bundle: Bundle, profile: Profile, load: Workload) -> str:
-    """Return the engine of a board that runs a bundle.
-
-    Raises:
-        DataError: when none does.
-    """
+    """Return the engine of a board that runs a bundle."""
     if engine := engine_for(profile, load, bundle.manifest.engine):
         return engine
     raise DataError(
@@ -250,10 +247,6 @@ FIXED_SHAPES = (
     "give every axis a number: write the shapes into the spec of a policy.yaml beside the ONNX file, or export it with "
     "fixed shapes"
 )
-
-
-def _fix_of(load: Workload) -> str:
-    return FIXED_SHAPES if load.unknown else "try another --engine or --precision"
 
 
 def _part_lines(phases: list[dict[str, Any]]) -> list[str]:

@@ -25,12 +25,12 @@ class Wants:
 
     Args:
         hz: Inferences in a second; control ticks in a second when ``per_chunk``.
-        latency_ms: Of one inference.
+        latency_ms: Latency of one inference.
         watts: The board's limit, by its power mode.
-        price: In US dollars.
-        memory_gb: What the policy may take of the board (10^9 bytes).
-        battery_wh: Of the robot; only the battery life follows from it.
-        robots, years, hours_a_day: For the cost.
+        price: Price in US dollars.
+        memory_gb: Memory of the board that the policy may take (10^9 bytes).
+        battery_wh: Battery of the robot; only the battery life follows from it.
+        robots, years, hours_a_day: Usage that the cost is computed for.
         kwh_price: US dollars.
         network_ms: Way to a cloud machine and back.
         precisions: Those that are allowed; all when empty.
@@ -72,7 +72,7 @@ class Choice:
     Args:
         state: One of ``STATES``.
         outcome: None when it was ruled out before anything was computed.
-        reason: In words.
+        reason: Reason in words.
         others: Further ways that were looked at on this board.
     """
 
@@ -199,8 +199,8 @@ def _reason(best: Outcome, state: str, results: Sequence[Outcome], wants: Wants)
 
 def _headroom(best: Outcome, results: Sequence[Outcome], wants: Wants) -> str:
     """Say what the chosen precision leaves over, and why a more faithful one is not taken."""
-    place = FIDELITY.index(best.candidate.precision)
-    better = [other for other in results if FIDELITY.index(other.candidate.precision) < place and other.latency.known]
+    rank = FIDELITY.index(best.candidate.precision)
+    better = [other for other in results if FIDELITY.index(other.candidate.precision) < rank and other.latency.known]
     faithful = ""
     if better:
         nearest = min(better, key=lambda other: other.latency.high)
@@ -228,7 +228,7 @@ class Cost:
         cloud: US dollars for the same inferences on a rented machine; NaN where none can do them.
         break_even_hours: Hours of work after which the board is cheaper than the rent; NaN without.
         battery_hours: How long the robot's battery drives the board alone; NaN without a battery.
-        average_watts: At the wall, idle times included.
+        average_watts: Power at the wall, idle times included.
     """
 
     owned: float

@@ -11,7 +11,7 @@ from vlatool.latency_model.board import Candidate, Outcome, Phase, outcomes, res
 from vlatool.latency_model.features import Shares, roofline_parts
 from vlatool.latency_model.model import LatencyModel, part_of
 
-PRUNED = 0.7
+PRUNED_SHARE = 0.7
 SMALLER = 0.5
 """Share of the pixels, and so of the tokens, that images keep at 0.7 of their side."""
 
@@ -39,7 +39,7 @@ class Change:
     """What one change would give.
 
     Args:
-        name: In words.
+        name: Name in words.
         outcome: The changed policy on the same board.
     """
 
@@ -88,7 +88,7 @@ def changes(candidate: Candidate, load: Workload, model: LatencyModel) -> list[C
     name = widest(load)
     images = rescale(load, {name: (SMALLER, 1.0, SMALLER)})
     asked.append((f"images of 0.7 of the side, where {name} works on image tokens alone", candidate, images))
-    pruned = dict.fromkeys(load.graphs, (PRUNED, PRUNED, math.sqrt(PRUNED)))
+    pruned = dict.fromkeys(load.graphs, (PRUNED_SHARE, PRUNED_SHARE, math.sqrt(PRUNED_SHARE)))
     asked.append(("30 % of each layer pruned, whole channels", candidate, rescale(load, pruned)))
     return [Change(title, outcomes([way], changed, model)[0]) for title, way, changed in asked]
 

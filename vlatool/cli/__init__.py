@@ -14,9 +14,9 @@ import typer
 
 from vlatool.cli._commands import Commands
 from vlatool.cli._console import plain_warnings
-from vlatool.cli._document import Output, forget_kept, lost, output
-from vlatool.cli._early import start_early
-from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
+from vlatool.cli._document import Output, forget_kept, output, take_print_failure
+from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPT_CODE, Failure, failure
+from vlatool.cli._process_server import start_early
 from vlatool.errors import refuse_two_distributions
 from vlatool.files.printable import printable
 from vlatool.machine.version import VERSION
@@ -126,7 +126,7 @@ def main(arguments: list[str] | None = None) -> None:
     With ``--json``, standard output holds one JSON document, of an error too.
 
     Args:
-        arguments: Its words; when None, those that the process was started with, and the process ends with this call.
+        arguments: Words of the command line; when None, those of the process, which then ends with this call.
     """
     _open_standard_files()
     _end_on_signals()
@@ -136,7 +136,7 @@ def main(arguments: list[str] | None = None) -> None:
         start_early(words)
     with output(words, for_good=for_good) as document:
         code = _run(words, document, for_good=for_good)
-    unprinted = lost()
+    unprinted = take_print_failure()
     forget_kept(printed=unprinted is None)
     if unprinted:
         _say(str(unprinted), unprinted.fix)
@@ -151,12 +151,12 @@ def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
         with plain_warnings(), trust.forget_named():
             refuse_two_distributions()
             code = app(words, standalone_mode=False) or 0
-        if code == INTERRUPTED:  # typer catches Ctrl-C itself
+        if code == INTERRUPT_CODE:  # typer catches Ctrl-C itself
             raise KeyboardInterrupt
     except SystemExit as left:  # a closed pipe: typer puts a wrapper around stdout and leaves with 1
         code = 0 if type(sys.stdout).__name__ == "PacifyFlushWrapper" else left.code
         if code and document:
-            document.failed(failure(left, words))
+            document.fail(failure(left, words))
     except BaseException as error:  # the seam: whatever happened becomes an exit code
         if not isinstance(error, Exception | KeyboardInterrupt):
             raise
@@ -164,7 +164,7 @@ def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         fault = failure(error, words)
         if document and fault.exit_code:
-            document.failed(fault)
+            document.fail(fault)
         _tell(error, fault)
         code = fault.exit_code
     return code

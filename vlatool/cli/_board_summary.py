@@ -20,7 +20,7 @@ SAMPLES = 64
 """Recorded observations that the actions are compared on."""
 SMALLER = 1.05
 """Smallest ratio at which a bundle is reported as smaller than its source."""
-SHOWN = {quantity.name: quantity.words for quantity in (LATENCY_P50, MEMORY)}
+WORDS_OF = {quantity.name: quantity.words for quantity in (LATENCY_P50, MEMORY)}
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class BoardSummary:
     Args:
         board: Name of the profile.
         before, after: Bytes of the graphs; before is None where the source has no graphs.
-        predictions: For the board, with their intervals.
+        predictions: Predictions for the board, with their intervals.
         error: How the actions differ from the source's on recorded observations, None where that cannot be said.
         missing: What could not be predicted or compared, and why, in words.
     """
@@ -45,7 +45,7 @@ class BoardSummary:
     def lines(self) -> list[str]:
         """Return what a person wants to know."""
         predicted = [
-            f"{SHOWN[number.name]} on {self.board}, predicted: {_number(number)}" for number in self.predictions
+            f"{WORDS_OF[number.name]} on {self.board}, predicted: {_number(number)}" for number in self.predictions
         ]
         error = [_error_text(self.error)] if self.error is not None else []
         return [*([self._size()] if self.after else []), *predicted, *error, *self.missing]
@@ -98,7 +98,7 @@ def _noting(missing: list[str], what: str) -> Iterator[None]:
 def _predicted(bundle: Bundle, profile: Profile) -> tuple[Measurement, ...]:
     from vlatool.latency_model.predict import predictions
 
-    return tuple(number for number in predictions(profile, bundle) if number.name in SHOWN)
+    return tuple(number for number in predictions(profile, bundle) if number.name in WORDS_OF)
 
 
 def _error(bundle: Bundle, source: Bundle | None, context: Context) -> Measurement | None:

@@ -9,14 +9,14 @@ import typer
 from typer.core import TyperGroup
 
 from vlatool import registry
-from vlatool.cli._once import once
-from vlatool.cli._stages import DEFAULTS, StageGroup, built, failing
+from vlatool.cli._flag_conflicts import refuse_conflicting_flags
+from vlatool.cli._stages import DEFAULTS, StageGroup, build_command, failing_command
 from vlatool.errors import PluginError, UsageError, suggest
 from vlatool.stage.build import stage_kinds
 
-FIRST = "optimize"
+FIRST_COMMAND = "optimize"
 """What most people want comes first in the help."""
-HIDDEN = ("sources",)
+HIDDEN_KINDS = ("sources",)
 """Kinds of stages that are not commands: a source is an argument of every command."""
 
 
@@ -25,9 +25,9 @@ class Commands(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the commands: the one for everything, then the others by name."""
-        kinds = [kind for kind in stage_kinds() if kind not in HIDDEN and registry.names(kind)]
+        kinds = [kind for kind in stage_kinds() if kind not in HIDDEN_KINDS and registry.names(kind)]
         commands = {name.replace("_", "-") for name in (*registry.names("commands"), *kinds)}
-        return sorted(commands, key=lambda name: (name != FIRST, name))
+        return sorted(commands, key=lambda name: (name != FIRST_COMMAND, name))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the named command; for an unknown one, suggest the nearest."""
@@ -48,20 +48,20 @@ class Commands(TyperGroup):
         try:
             source = registry.module("commands", cmd_name)
         except PluginError as error:
-            return failing(cmd_name, error)
+            return failing_command(cmd_name, error)
         command = getattr(source, "app", None) or getattr(source, cmd_name.replace("-", "_"), None)
         if not isinstance(command, typer.Typer) and not callable(command):
             missing = f"neither a function of that name nor a Typer 'app' is in {source.__name__}"
             words = f"The package {registry.plugin_of(source.__name__)} adds the command '{cmd_name}', but {missing}."
-            return failing(cmd_name, PluginError(words, "report it to its authors"))
+            return failing_command(cmd_name, PluginError(words, "report it to its authors"))
         return _built(command, cmd_name)
 
 
 def _built(source: Any, name: str) -> Any:
     """Return the click command of a Typer application or of a function."""
     if not isinstance(source, typer.Typer):
-        return built(source, name)
+        return build_command(source, name)
     source._add_completion = False
     command = typer.main.get_command(source)
     command.name = name
-    return once(command)
+    return refuse_conflicting_flags(command)

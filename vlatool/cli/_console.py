@@ -17,7 +17,7 @@ from typing import Any
 
 import typer
 
-from vlatool.cli._document import document, put, report_document, written
+from vlatool.cli._document import document, note_written, put, report_document
 from vlatool.errors import GateFailed, Inconclusive, OutputError, UsageError
 from vlatool.files.directory_writer import write_directory
 from vlatool.files.outputs import REPORT, refuse_inputs, refuse_replacing
@@ -30,7 +30,7 @@ from vlatool.workers import PROCESSES, launcher, parse_workers
 
 PLACES = ("-o", "--output", "--cache", "--junit", "--video")
 """Options that name a place to write to: paths are not recorded."""
-EVERY = 30.0
+REPEAT_S = 30.0
 """Seconds between plain lines that differ in their numbers alone."""
 
 
@@ -103,13 +103,13 @@ def progress(workers: int = 1, launched_by: str = PROCESSES) -> Iterator[Context
 
 
 def _plain_lines() -> OnProgress:
-    """Write what is new at once, and only numbers that changed every ``EVERY`` seconds."""
+    """Write what is new at once, and only numbers that changed every ``REPEAT_S`` seconds."""
     last, told = "", 0.0
 
     def tell(what: str, share: float | None) -> None:
         nonlocal last, told
         kind, now = re.sub(r"[\d.,%]+", "", what), time.monotonic()
-        if kind != last or now - told >= EVERY:
+        if kind != last or now - told >= REPEAT_S:
             last, told = kind, now
             with contextlib.suppress(OSError):  # its reader is gone: no reason to stop
                 typer.echo(f"... {one_line(what)}", err=True)
@@ -146,7 +146,7 @@ def refuse_existing(
     Args:
         out: The output, None when there is none.
         force: Whether what vlatool wrote there may be replaced.
-        inputs: What the command reads.
+        inputs: Files that the command reads.
         kind: What is written: only the same is replaced (None: whatever is there).
 
     Raises:
@@ -169,7 +169,7 @@ def refuse_video(
         video: The file, None when there is none.
         force: Whether one that vlatool wrote there may be replaced.
         out: The directory of the report.
-        inputs: What the command reads.
+        inputs: Files that the command reads.
 
     Raises:
         UsageError: when its suffix names no format, or it is in the directory of the report.
@@ -237,7 +237,7 @@ def show(
     if out is not None:
         with write_directory(out, force=force) as draft:
             write_reports(report, draft)
-    written(unfinished)
+    note_written(unfinished)
     if out is not None and not as_json:
         put(f"report: {out / 'report.html'}\n")
     raise_verdict(report)
@@ -268,8 +268,8 @@ def _printable(value: Any) -> Any:
     return value
 
 
-MISSED = "change the policy, the options or the limit: each limit stands above with what was measured"
-UNDECIDED = (
+MISSED_FIX = "change the policy, the options or the limit: each limit stands above with what was measured"
+UNDECIDED_FIX = (
     "where samples are missing, measure more (--episodes, --samples, --iterations); where the reference fails, look at "
     "its wrapper and data first: vlatool verify; the report says which"
 )
@@ -283,6 +283,6 @@ def raise_verdict(report: Report) -> None:
         Inconclusive: for the verdict ``inconclusive``.
     """
     if report.verdict == "fail":
-        raise GateFailed(report.summary[0] if report.summary else "The limits are not kept.", MISSED)
+        raise GateFailed(report.summary[0] if report.summary else "The limits are not kept.", MISSED_FIX)
     if report.verdict == "inconclusive":
-        raise Inconclusive(report.summary[0] if report.summary else "The samples cannot decide.", UNDECIDED)
+        raise Inconclusive(report.summary[0] if report.summary else "The samples cannot decide.", UNDECIDED_FIX)

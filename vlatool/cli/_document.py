@@ -24,7 +24,7 @@ from vlatool.files.resumable_work import remove_all_unused
 from vlatool.report import Report, without_nan
 
 FLAG = "--json"
-ANSWERED_AT_ONCE = ("--help", "--version")
+EAGER_OPTIONS = ("--help", "--version")
 """Options whose text is the result of the command line that has them."""
 
 
@@ -32,7 +32,7 @@ class Output:
     """What a command line that asks for JSON leaves on standard output.
 
     Args:
-        printed: What takes the text of an option that is answered at once, None for a command.
+        printed: Buffer for the text of ``--help`` and ``--version``; None for a command.
     """
 
     def __init__(self, printed: io.StringIO | None = None) -> None:
@@ -45,7 +45,7 @@ class Output:
         """Take a command's result, and the text that it is written as when that matters."""
         self._value, self._text = value, text
 
-    def failed(self, failure: Failure) -> None:
+    def fail(self, failure: Failure) -> None:
         """Take what went wrong."""
         self._failure = failure
 
@@ -55,8 +55,8 @@ class Output:
         if self._printed is not None and value is None and self._failure is None:
             value = {"text": self._printed.getvalue()}
         if self._failure is None:
-            return self._text or dumped(value)
-        return dumped({**(value if isinstance(value, dict) else {}), "error": asdict(self._failure)})
+            return self._text or json_text(value)
+        return json_text({**(value if isinstance(value, dict) else {}), "error": asdict(self._failure)})
 
 
 _now: list[Output] = []
@@ -72,15 +72,15 @@ def document(value: Any, text: str = "") -> None:
 
     Args:
         value: The result.
-        text: How it is written, when not as ``dumped`` does.
+        text: How it is written, when not as ``json_text`` does.
     """
     if _now:
         _now[-1].take(value, text)
     else:
-        typer.echo(text or dumped(value), nl=False)
+        typer.echo(text or json_text(value), nl=False)
 
 
-def dumped(value: Any) -> str:
+def json_text(value: Any) -> str:
     """Return a value as JSON in ASCII, which every terminal and every locale can print."""
     return json.dumps(without_nan(value), indent=1, allow_nan=False, default=str) + "\n"
 
@@ -120,7 +120,7 @@ def output(words: Sequence[str], *, for_good: bool) -> Iterator[Output | None]:
     if not wants_json(words):
         yield None
         return
-    at_once = any(word in ANSWERED_AT_ONCE for word in words)
+    at_once = any(word in EAGER_OPTIONS for word in words)
     printed = io.StringIO() if at_once else None
     stdout, kept = sys.stdout, _set_aside()
     sys.stdout = printed or sys.stderr
@@ -154,7 +154,7 @@ def _flush(stream: Any) -> None:
 
 
 def put(text: str) -> None:
-    """Print on standard output. A reader that is gone (``| head``) is no error; a full disk is noted for ``lost``."""
+    """Print on standard output. A closed pipe is not an error; ``take_print_failure`` reports a full disk."""
     try:
         typer.echo(text, nl=False)
         sys.stdout.flush()
@@ -165,7 +165,7 @@ def put(text: str) -> None:
             _lost.append(error.strerror or str(error))
 
 
-def written(unfinished: Sequence[Path]) -> None:
+def note_written(unfinished: Sequence[Path]) -> None:
     """Note that a result was written as far as files go: what was kept of its run goes once it is printed, too."""
     _kept.extend(unfinished)
 
@@ -177,7 +177,7 @@ def forget_kept(*, printed: bool) -> None:
     _kept.clear()
 
 
-def lost() -> Failure | None:
+def take_print_failure() -> Failure | None:
     """Return why a result did not reach standard output since this was asked, None when all of it did."""
     if not _lost:
         return None

@@ -17,7 +17,7 @@ from vlatool.files.printable import file_of, message_of
 OK = 0
 INPUT = 3
 OUR_BUG = 70
-INTERRUPTED = 130
+INTERRUPT_CODE = 130
 CLICK_EXCEPTION: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 """The base of usage errors: from the click inside typer, or the one that it imports, depending on its version."""
 KEEPING = frozenset(("optimize", "export", "quantize"))
@@ -71,7 +71,7 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
         return Failure(type(error).__name__, error.message, fix, error.exit_code)
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         kept = "; finished stages are kept" if KEEPING.intersection(words) else ""
-        return Failure("Interrupted", f"interrupted{kept}", "", INTERRUPTED)
+        return Failure("Interrupted", f"interrupted{kept}", "", INTERRUPT_CODE)
     if isinstance(error, BrokenPipeError):
         return Failure("OSError", "the reader of the output is gone.", "", OK)
     if isinstance(error, OSError):

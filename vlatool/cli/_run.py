@@ -180,15 +180,7 @@ def _graph_source(export: Transform, source: Source) -> Transform:
 
 
 def _refuse(bundle: Bundle, baseline: str = "") -> None:
-    """Fail when a stage marked the bundle as wrong; it stays where it is, for inspection.
-
-    Args:
-        bundle: The new bundle.
-        baseline: The bundle that it was made from, where a path leads to it.
-
-    Raises:
-        GateFailed: naming the first finding.
-    """
+    """Fail when a stage marked the bundle as wrong; it stays where it is, for inspection."""
     for finding in bundle.manifest.findings:
         beside = f" --baseline {shlex.quote(baseline)}" if baseline else ""
         overrule = f"load, optimize and gate refuse the bundle (to overrule: {finding['name']})"

@@ -14,7 +14,7 @@ TEXT: Schema = {"type": "string"}
 NUMBER: Schema = {"type": ["number", "null"]}
 INTEGER: Schema = {"type": "integer"}
 FLAG: Schema = {"type": "boolean"}
-ANYTHING: Schema = {"type": "object"}
+ANY_OBJECT: Schema = {"type": "object"}
 ERROR: Schema = {"$ref": "#/$defs/error"}
 
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -76,12 +76,12 @@ def record(**properties: Schema) -> Schema:
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
-STAGE = record(stage=TEXT, options=ANYTHING)
-SOURCE = record(policy={"type": ["string", "null"]}, stage=TEXT, options=ANYTHING)
+STAGE = record(stage=TEXT, options=ANY_OBJECT)
+SOURCE = record(policy={"type": ["string", "null"]}, stage=TEXT, options=ANY_OBJECT)
 PLAN = record(
-    source=SOURCE, export=many(STAGE), candidates=by_name(many(STAGE)), search=FLAG, pruning=ANYTHING,
+    source=SOURCE, export=many(STAGE), candidates=by_name(many(STAGE)), search=FLAG, pruning=ANY_OBJECT,
     benchmark=record(iterations=INTEGER, threads=INTEGER), evaluate=record(recorded=FLAG, episodes=INTEGER),
-    limits=ANYTHING, profile={"type": ["string", "null"]}, computes={"type": ["string", "null"]}, cache=TEXT,
+    limits=ANY_OBJECT, profile={"type": ["string", "null"]}, computes={"type": ["string", "null"]}, cache=TEXT,
 )  # fmt: skip
 PHASE = record(name=TEXT, runs=INTEGER, ms=NUMBER, shares=by_name(NUMBER), parts=by_name(NUMBER))
 SHIFT = record(recorded=TEXT, installed=TEXT)
@@ -122,7 +122,7 @@ def _documents() -> dict[str, Schema]:
         "made": document(
             "A bundle that was written; precision: graph -> dtype -> share of its multiply-accumulates; pruned: shares "
             "of the work asked for and reached, and who keeps the rest.",
-            bundle=TEXT, hash=TEXT, bytes=INTEGER, precision=by_name(by_name(NUMBER)), findings=many(ANYTHING),
+            bundle=TEXT, hash=TEXT, bytes=INTEGER, precision=by_name(by_name(NUMBER)), findings=many(ANY_OBJECT),
             pruned={"anyOf": [record(
                 asked=NUMBER, reached=NUMBER, macs=many(INTEGER), keeps=by_name(NUMBER), without_rule=many(TEXT),
             ), {"type": "null"}]},
@@ -162,15 +162,16 @@ def _documents() -> dict[str, Schema]:
         ),
         "telemetry": document(
             "What the machine reported; a reading's times are seconds.",
-            seconds=NUMBER, energy=many(ANYTHING), throttled={"type": ["boolean", "null"]}, throttling=many(TEXT),
-            gauges=by_name(GAUGE), counters=by_name(COUNTER), unmeasured=many(record(reader=TEXT, reason=TEXT)),
+            seconds=NUMBER, energy=many(ANY_OBJECT), throttled={"type": ["boolean", "null"]}, throttling=many(TEXT),
+            gauges=by_name(GAUGE), counters=by_name(COUNTER),
+            unmeasured=many(record(reader=TEXT, reason=TEXT, other_board=FLAG)),
         ),
         "score": {"type": "object", "description": "Error and coverage.", "properties": {"error": ERROR}},
         "scores": by_name({"$ref": "#/$defs/score"}),
         "profiles": many({"$ref": "#/$defs/profile"}),
         "differences": many({"type": "object", "required": ["field"]}),
         "validated": document("Profiles by name, and what is wrong with others.", valid=many(TEXT), wrong=many(TEXT)),
-        "calibrated": document("Measurements given to the latency model.", kept_in=TEXT, measured=many(ANYTHING)),
+        "calibrated": document("Measurements given to the latency model.", kept_in=TEXT, measured=many(ANY_OBJECT)),
         "written": document("Files that were written.", written=many(TEXT)),
         "samples": many(record(name=TEXT, description=TEXT)),
         "sample": document("A policy that was written.", policy=TEXT, sample=TEXT, seed=INTEGER),

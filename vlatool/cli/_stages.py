@@ -17,7 +17,7 @@ from pydantic_core import PydanticUndefined
 from vlatool import registry
 from vlatool.cli import _complete, _run, _torchrun
 from vlatool.cli._default import DefaultGroup
-from vlatool.cli._once import once
+from vlatool.cli._flag_conflicts import refuse_conflicting_flags
 from vlatool.errors import PluginError, UsageError, fix_for, suggest
 from vlatool.stage.base import Measure, Stage, Transform
 from vlatool.stage.build import stage_from
@@ -47,8 +47,8 @@ class StageGroup(DefaultGroup):
         try:
             stage = registry.load(self.name or "", cmd_name)
         except PluginError as error:
-            return failing(cmd_name, error)
-        return built(stage_function(stage), cmd_name, stage.__doc__)
+            return failing_command(cmd_name, error)
+        return build_command(stage_function(stage), cmd_name, stage.__doc__)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse a first word that is nearly a method."""
@@ -62,22 +62,22 @@ class StageGroup(DefaultGroup):
         return super().parse_args(ctx, args)
 
 
-def built(function: Callable[..., Any], name: str, text: str | None = None, **settings: Any) -> Any:
+def build_command(function: Callable[..., Any], name: str, text: str | None = None, **settings: Any) -> Any:
     """Return the click command of a function."""
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
     single.command(name, help=text, context_settings=settings)(function)
     command = typer.main.get_command(single)
     command.name = name
-    return once(command)
+    return refuse_conflicting_flags(command)
 
 
-def failing(name: str, error: PluginError) -> Any:
+def failing_command(name: str, error: PluginError) -> Any:
     """Return a command that says why another package's cannot run, so that ``--help`` lists all others."""
 
     def fails(words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None) -> None:
         raise error
 
-    return built(fails, name, f"Does not work: {error.message}", ignore_unknown_options=True)
+    return build_command(fails, name, f"Does not work: {error.message}", ignore_unknown_options=True)
 
 
 def stage_function(stage: type[Stage]) -> Callable[..., None]:

@@ -18,11 +18,11 @@ def launch_for(command: str, *, trains: bool) -> Launch | None:
     """Return which of torchrun's processes this one is; None where torchrun did not start it.
 
     Args:
-        command: As typed, for messages.
+        command: The command as typed, for messages.
         trains: Whether the command trains.
 
     Raises:
-        UsageError: when it is no training.
+        UsageError: when the command does not train.
         RecipeError: when the variables of torchrun are incomplete.
     """
     if "WORLD_SIZE" not in os.environ:
@@ -64,10 +64,10 @@ def train(stage: Transform, launch: Launch, source: str, **arguments: Any) -> No
             _run.transform(stage, source, **arguments)
         return
 
-    def named() -> None:
+    def check_source() -> None:
         from vlatool.sources import is_bundle, source_stage
 
         if not is_bundle(source):  # what is typed may run here, too
             source_stage(source)
 
-    follow(launch, stage.name(), named)
+    follow(launch, stage.name(), check_source)

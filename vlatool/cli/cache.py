@@ -75,11 +75,11 @@ def prune(
         )
     age = 0.0 if everything else _amount("--older-than", older_than, SECONDS, "30d") if older_than else None
     most = int(_amount("--max-size", max_size, BYTES, "5GB")) if max_size else None
-    place = _place(cache)
-    removed = kept.prune(place, older_than_s=age, most_bytes=most, dry_run=dry_run)
-    left = kept.contents(place).bytes - (removed.freed if dry_run else 0)
+    root = _cache_root(cache)
+    removed = kept.prune(root, older_than_s=age, most_bytes=most, dry_run=dry_run)
+    left = kept.contents(root).bytes - (removed.freed if dry_run else 0)
     if as_json:
-        document({"cache": str(place), "dry_run": dry_run, "removed": [entry.name for entry in removed.entries],
+        document({"cache": str(root), "dry_run": dry_run, "removed": [entry.name for entry in removed.entries],
                   "freed_bytes": removed.freed, "bytes": left, "stays": removed.stays})  # fmt: skip
         return
     for entry in removed.entries:
@@ -87,25 +87,25 @@ def prune(
     for name, reason in removed.stays.items():
         typer.echo(f"warning: {name} stays: it {reason}", err=True)
     word = "would free" if dry_run else "freed"
-    typer.echo(f"{place}: {word} {_human(removed.freed)}, {_human(left)} kept")
+    typer.echo(f"{root}: {word} {_human(removed.freed)}, {_human(left)} kept")
 
 
-def _place(cache: Path | None) -> Path:
+def _cache_root(cache: Path | None) -> Path:
     from vlatool.machine.host import cache_directory
     from vlatool.stage.cache import looks_like_cache
 
-    place = cache or cache_directory()
-    if (cache is not None or place.exists()) and not place.is_dir():
-        raise DataError(f"No such directory: {place}.", "name the directory of a cache")
-    if cache is not None and not looks_like_cache(place):
-        raise DataError(f"{place} is not a cache: vlatool keeps nothing in it.", "name the directory of a cache")
-    return place
+    root = cache or cache_directory()
+    if (cache is not None or root.exists()) and not root.is_dir():
+        raise DataError(f"No such directory: {root}.", "name the directory of a cache")
+    if cache is not None and not looks_like_cache(root):
+        raise DataError(f"{root} is not a cache: vlatool keeps nothing in it.", "name the directory of a cache")
+    return root
 
 
 def _contents(cache: Path | None) -> Contents:
     from vlatool.stage.cache import contents
 
-    return contents(_place(cache))
+    return contents(_cache_root(cache))
 
 
 def _amount(option: str, text: str, units: dict[str, int], example: str) -> float:

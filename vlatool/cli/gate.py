@@ -80,7 +80,7 @@ def run(
         raise BundleError(f"No baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
     refuse_existing(output, force, candidate, *_read_by(gate, base), config)
     if junit is not None:
-        _place(junit, candidate, *_read_by(gate, base), config)
+        _check_junit(junit, candidate, *_read_by(gate, base), config)
     with progress(*crew(workers)) as context:
         bundle = open_with_graphs(candidate, context)
         report = run_gate(bundle, Bundle.open(base), gate, context, seed)
@@ -156,12 +156,8 @@ def _gate(config: Path | None, margin: float | None) -> Gate:
     return gate if margin is None else gate.with_options("latency", margin=margin)
 
 
-def _place(junit: Path, *inputs: str | Path | None) -> None:
-    """Refuse, before the work, a file that cannot be written, is or lies in an input, or is not vlatool's to replace.
-
-    Raises:
-        OutputError: when it cannot.
-    """
+def _check_junit(junit: Path, *inputs: str | Path | None) -> None:
+    """Refuse, before the work, a file that cannot be written, lies in an input, or is not vlatool's to replace."""
     if junit.is_dir():
         raise OutputError(f"--junit {junit} is a directory.", "name a file")
     above = next(folder for folder in junit.absolute().parents if folder.exists())

@@ -24,8 +24,7 @@ app = typer.Typer(
 )  # fmt: skip
 
 Profiles = Annotated[
-    list[str] | None,
-    typer.Option(help="look at this profile only; may be repeated", autocompletion=_complete.profiles),
+    list[str] | None, typer.Option(help="look at this profile only; may be repeated", autocompletion=_complete.profiles)
 ]
 POINTS = "published latencies: a CSV file with device, device_class, runtime, model, precision, metric, value"
 
@@ -69,8 +68,7 @@ def select(
     ] = None,
     boards: Profiles = None,
     calibration: Annotated[
-        Path | None,
-        typer.Option(help="file that `vlatool profiles calibrate` keeps; all of them when not given"),
+        Path | None, typer.Option(help="file that `vlatool profiles calibrate` keeps; all of them when not given")
     ] = None,
     carry: Annotated[
         bool,
@@ -103,11 +101,7 @@ def select(
 
 
 def _check(asked: Asked) -> None:
-    """Refuse numbers that mean nothing.
-
-    Raises:
-        UsageError: names the option.
-    """
+    """Refuse numbers that mean nothing."""
     above_zero = {
         "hz": asked.hz, "latency-ms": asked.latency_ms, "max-watts": asked.watts, "max-price": asked.price,
         "memory": asked.memory_gb, "battery-wh": asked.battery_wh, "years": asked.years, "hours": asked.hours_a_day,

@@ -37,8 +37,7 @@ PolicySource = Annotated[
 Board = Annotated[
     str | None,
     typer.Option(
-        help="board to optimise for (see: vlatool profiles list); this host if unset",
-        autocompletion=_complete.profiles,
+        help="board to optimise for (see: vlatool profiles list); this host if unset", autocompletion=_complete.profiles
     ),
 ]
 Drop = Annotated[str | None, typer.Option(help="largest drop against float32: 1% (default), METRIC=VALUE, or 0.002m")]
@@ -143,11 +142,7 @@ def optimize(
 def _limits(
     max_drop: str | None, shares: dict[str, str | None], accept: list[str] | None, numbers: dict[str, float | None]
 ) -> dict[str, Any]:
-    """Return the limits that were given: field of ``Limits`` -> value.
-
-    Raises:
-        UsageError: for one that is not a number above 0, or not a drop or a share.
-    """
+    """Return the limits that were given: field of ``Limits`` -> value."""
     limits: dict[str, Any] = {} if max_drop is None else budget(max_drop)
     limits |= {name: share(text, f"--{name.replace('_', '-')}") for name, text in shares.items() if text is not None}
     for name, value in numbers.items():
@@ -177,11 +172,7 @@ def _recipe(
 
 
 def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str | None) -> Pruning:
-    """Return what a recipe says of trials with the options that were given.
-
-    Raises:
-        UsageError: for steps of a training that the recipe does not name, or a study without a place.
-    """
+    """Return what a recipe says of trials with the options that were given."""
     if study is not None and not study.strip():
         raise UsageError("--study names no place.", "name a file or the address of a database, or leave it out")
     update: dict[str, Any] = {"trials": trials, "study": study}

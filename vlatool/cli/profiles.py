@@ -33,10 +33,7 @@ def list_profiles(as_json: AsJson = False) -> None:
 
 
 @app.command("show")
-def show_profile(
-    name: ProfileName,
-    as_json: AsJson = False,
-) -> None:
+def show_profile(name: ProfileName, as_json: AsJson = False) -> None:
     """Print one profile with the source of every figure."""
     from vlatool.hardware.profile import load_profile
 
@@ -96,9 +93,9 @@ def validate_profiles(
         inside = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES) if path.is_dir() else [name]
         if not inside:
             raise ProfileError(f"No profiles in {path}.", "its files end in .yaml")
-        for place in inside:
+        for file in inside:
             try:
-                profile = load_profile(place)
+                profile = load_profile(file)
             except ProfileError as error:
                 wrong.append(error.message)
             else:

@@ -18,9 +18,9 @@ from vlatool.files.outputs import BUNDLE
 if TYPE_CHECKING:
     from vlatool.rebuild.rebuild import RebuildResult
 
-RECORDED = "the versions are the recorded ones"
-CHANGED = "the bundle was changed after it was made"
-OTHERS = "check on the kind of processor that made the bundle, since others round otherwise"
+SAME_VERSIONS = "the versions are the recorded ones"
+CHANGED_BUNDLE = "the bundle was changed after it was made"
+OTHER_PROCESSOR_FIX = "check on the kind of processor that made the bundle, since others round otherwise"
 Versions = dict[str, tuple[str, str]]
 
 
@@ -120,11 +120,7 @@ def _as_json(rebuilt: RebuildResult, versions: Versions, output: Path | None) ->
 
 
 def _fail(rebuilt: RebuildResult, versions: Versions) -> None:
-    """Raise for the first file that differs.
-
-    Raises:
-        GateFailed: with the likely cause as the fix.
-    """
+    """Raise for the first file that differs."""
     first = rebuilt.first_difference
     if first is None:
         return
@@ -132,9 +128,11 @@ def _fail(rebuilt: RebuildResult, versions: Versions) -> None:
     if versions:
         cause = f"the likely cause are the versions ({_shifts(versions)}); install the recorded ones"
     elif since:
-        cause = f"{RECORDED}: {OTHERS}; on the same kind, look for random numbers or the time in the policy's code"
+        code = "on the same kind, look for random numbers or the time in the policy's code"
+        cause = f"{SAME_VERSIONS}: {OTHER_PROCESSOR_FIX}; {code}"
     elif rebuilt.machine_may_differ:
-        cause = f"{RECORDED}, and so are the graphs; golden outputs and tolerances are of one machine: there, {CHANGED}"
+        goldens = "golden outputs and tolerances are of one machine"
+        cause = f"{SAME_VERSIONS}, and so are the graphs; {goldens}: there, {CHANGED_BUNDLE}"
     else:
-        cause = f"{RECORDED}, and every stage gave the recorded graphs: {CHANGED}"
+        cause = f"{SAME_VERSIONS}, and every stage gave the recorded graphs: {CHANGED_BUNDLE}"
     raise GateFailed(f"{first.file} differs: {first.why}.{since}", cause)

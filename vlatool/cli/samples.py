@@ -19,9 +19,7 @@ app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_
 
 
 @app.command("list")
-def list_samples(
-    as_json: AsJson = False,
-) -> None:
+def list_samples(as_json: AsJson = False) -> None:
     """List the shapes that can be made."""
     descriptions = {name: registry.module("samples", name).DESCRIPTION for name in _complete.samples("")}
     if as_json:

@@ -26,10 +26,10 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Show where a policy's time would go on a board, and what int8, fewer steps or pruning would give. Predicted."""
-    from vlatool.boards.answer import simulated, simulation_lines
+    from vlatool.boards.answer import simulate, simulation_lines
 
     with progress() as context:
-        prediction = simulated(source, profile, mode, engine, precision, context)
+        prediction = simulate(source, profile, mode, engine, precision, context)
     if as_json:
         document(prediction)
         return

@@ -38,7 +38,7 @@ def telemetry(
         raise DataError(f"No such directory: {root}.", "check the path; leave --root out to read this machine")
     with Recorder(open_all(root), period) as recorder:
         time.sleep(seconds)
-    recorded = recorder.recorded
+    recorded = recorder.summary
     if as_json:
         document(to_json(recorded))
         return

@@ -144,7 +144,7 @@ def phase_sentences(effects: Sequence[Phases], again: str) -> list[str]:
     """Return the sentences for a reader, the bad news first.
 
     Args:
-        effects: From ``measure_phases``.
+        effects: Result of ``measure_phases``.
         again: Command that makes the bundle again.
     """
     sentences = []

@@ -146,7 +146,7 @@ def measure(
     Args:
         bundle: The bundle to explain.
         baseline: The float32 bundle.
-        tried: From ``plan_candidates``.
+        tried: Result of ``plan_candidates``.
         observations: Raw observations for errors and latencies.
         scratch: Directory of the candidates.
         threads: Number of intra-op threads.

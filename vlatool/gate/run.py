@@ -89,7 +89,7 @@ def _examined(gate: Gate, evidence: Evidence) -> tuple[list[_Result], tuple[Find
             for claim in claims:
                 found = claim.verdicts(evidence).items()
                 results += (_Result(title, verdict, claim.sentence(verdict)) for title, verdict in found)
-        findings += tuple(throttling(board.recorded.throttling))
+        findings += tuple(throttling(board.summary.throttling))
     return results, findings
 
 

@@ -89,7 +89,7 @@ class Unit(Strict):
     Args:
         cores: Processor cores, or streaming multiprocessors / execution units of a GPU.
         clock_mhz: The highest clock; the peaks hold at it.
-        bandwidth_gb_s: Of its way to memory where that is less than the board's: a processor beside a graphics card,
+        bandwidth_gb_s: Bandwidth to memory, where that is less than the board's: a processor beside a graphics card,
             a module behind PCI Express.
         peak_tops: dtype -> 10^12 operations per second, dense, where a multiply-accumulate is two operations.
         isa: Instruction set features that inference libraries use, as ``/proc/cpuinfo`` names them. Those of an x86
@@ -161,7 +161,7 @@ class Profile(Strict):
     """A hardware target.
 
     Args:
-        name: As on the command line; lower case, digits and hyphens.
+        name: Name on the command line; lower case, digits and hyphens.
         aliases: Other names that people type for it.
         model_strings: Names of the board in its firmware or processor (see ``vlatool.machine.host.matches``).
         memory_gb: Memory in GB (10^9 bytes), shared by CPU and GPU where ``unified``.
@@ -351,7 +351,7 @@ def _folder(entry: EntryPoint) -> Path | None:
 def _find_profiles() -> dict[str, Path]:
     """Profile name -> file; the first directory that has it wins."""
     package = Path(__file__).resolve().parents[1]
-    shipped = next((place for place in (package / "_profiles", package.parent / "profiles") if place.is_dir()), None)
+    shipped = next((folder for folder in (package / "_profiles", package.parent / "profiles") if folder.is_dir()), None)
     own = [Path(entry) for entry in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if entry]
     brought = [_folder(entry) for entry in registry.plugins("profiles").values()]
     files = [

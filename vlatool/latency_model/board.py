@@ -19,7 +19,7 @@ BUSY, BUSY_LOW, BUSY_HIGH = 0.65, 0.45, 0.95
 Orin 32 GB and AGX Xavier (MLPerf, wall power) the medians by runtime lie at 0.46-0.82."""
 IDLE = 0.3
 """Share of the limit drawn when nothing runs, where the profile lacks it."""
-PACKED, PACKED_HIGH = 1.3, 2.0
+PACKED_RATIO, PACKED_RATIO_HIGH = 1.3, 2.0
 """Memory of a process for weights, relative to their size: engines keep packed copies of some. Measured with ONNX
 Runtime and OpenVINO on an x86 host: 1.0 to 1.9."""
 ARENA, ARENA_HIGH = 3.0, 5.0
@@ -226,8 +226,8 @@ def memory_mb(candidate: Candidate, load: Workload) -> tuple[float, float, float
     width = PRECISIONS[candidate.precision][1] / FLOAT32 if candidate.precision else 1.0
     live = load.peak_bytes * width / 1e6
     return (
-        base + PACKED * weights + ARENA * live + EXTRA_MB, base + weights + live,
-        base + PACKED_HIGH * weights + ARENA_HIGH * live + EXTRA_HIGH_MB,
+        base + PACKED_RATIO * weights + ARENA * live + EXTRA_MB, base + weights + live,
+        base + PACKED_RATIO_HIGH * weights + ARENA_HIGH * live + EXTRA_HIGH_MB,
     )  # fmt: skip
 
 

@@ -250,11 +250,7 @@ def fit(
 
 
 def _refuse_foreign_files(out: Path) -> None:
-    """Refuse files with the model's names that are not a model.
-
-    Raises:
-        OutputError: when there are such files.
-    """
+    """Refuse files with the model's names that are not a model."""
     present = [out / name for name in ("latency.npz", "latency.json") if os.path.lexists(out / name)]
     if not present:
         return

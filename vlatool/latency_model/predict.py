@@ -15,7 +15,7 @@ from vlatool.measures.latency import LATENCY_P50, LATENCY_PER_ACTION
 from vlatool.measures.resources import ENERGY, ENERGY_PER_ACTION, MEMORY, USABLE_MEMORY, WATTS
 from vlatool.report import Measurement
 
-SHOWN = (LATENCY_P50.name, MEMORY.name, ENERGY.name)
+SHOWN_QUANTITIES = (LATENCY_P50.name, MEMORY.name, ENERGY.name)
 
 
 def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Measurement]:
@@ -33,7 +33,7 @@ def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Meas
     if not engine:
         why = f"no engine of {profile.name} runs this bundle, whose graphs are {stored_quantization(load)}"
         outcome = replace(outcome, latency=Prediction(math.nan, why=why))
-    return [measurement for measurement in numbers(outcome) if measurement.name in SHOWN]
+    return [measurement for measurement in numbers(outcome) if measurement.name in SHOWN_QUANTITIES]
 
 
 def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
@@ -47,13 +47,13 @@ def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
 
     measurements = [
         LATENCY_P50.prediction(latency.ms, where, low, high, LEVEL, note),
-        MEMORY.prediction(memory[0], where, memory[1], memory[2], LEVEL, JUDGED),
+        MEMORY.prediction(memory[0], where, memory[1], memory[2], LEVEL, BOUNDS_NOTE),
         USABLE_MEMORY.prediction(usable, where),
-        WATTS.prediction(power[0], where, power[1], power[2], LEVEL, JUDGED),
+        WATTS.prediction(power[0], where, power[1], power[2], LEVEL, BOUNDS_NOTE),
     ]
     if latency.known:
         ends = (power[1] * latency.low / 1e3, power[2] * latency.high / 1e3)
-        measurements.append(ENERGY.prediction(outcome.joules, where, *ends, LEVEL, JUDGED))
+        measurements.append(ENERGY.prediction(outcome.joules, where, *ends, LEVEL, BOUNDS_NOTE))
         for quantity, value in ((LATENCY_PER_ACTION, latency.ms), (ENERGY_PER_ACTION, outcome.joules)):
             measurements.append(quantity.prediction(value / execute, where))
     return measurements
@@ -64,4 +64,4 @@ EVIDENCE = {
     "unseen": "from other devices, runtimes or precisions",
     "calibrated": "with your own measurement on this device",
 }
-JUDGED = "bounds are a judgement, not a confidence interval"
+BOUNDS_NOTE = "bounds are a judgement, not a confidence interval"

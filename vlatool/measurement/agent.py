@@ -91,7 +91,7 @@ def _run_worker(job: LatencyJob, limits: Limits, tell: OnProgress) -> Benchmark:
                     _send(worker)
                 case child.Result() as result:
                     measured = child.result_of(result, Benchmark, about)
-                    telemetry = recorder.recorded if recorder else None
+                    telemetry = recorder.summary if recorder else None
                     return replace(measured, telemetry=telemetry, log=_end_of(log))
                 case child.Raised() as raised:
                     raise child.error_of(raised, limits)

@@ -24,8 +24,6 @@ ENERGY_S = 10.0
 """Seconds below which the energy of a run says little (MLPerf Tiny: runs of 10 s)."""
 OWN_COUNTERS = ("process.cpu", "process.involuntary_switches")
 """Counters that the measurements hold over exactly the timed part."""
-OTHER_BOARDS = ("this is no ", "virtual machine or ", "NVIDIA card", "NVML tells nothing")
-"""What the reason says where a source of telemetry belongs to another kind of board: told in one line."""
 WINDOW = 0.1
 """Share of a sustained run that is its start, and its end."""
 
@@ -50,16 +48,13 @@ def measurements(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | 
         numbers = [replace(number, note=number.note or note) for number in numbers]
         numbers += paced_measurements(pace, len(samples), rate)
     else:
-        numbers.append(_throughput(samples))
+        rate_of_calls = 1e3 / float(np.mean(samples))
+        numbers.append(latency.THROUGHPUT.measurement(rate_of_calls, samples=len(samples), note="back to back"))
     numbers.append(_jitter(samples))
     busy = measured.cpu_s / max(measured.wall_s, 1e-9)
     numbers.append(resources.CPU.measurement(busy, note="user and system time of the process over the run"))
     board = _board(measured, pace.inferences if pace else len(samples))
     return [*numbers, *board, *_golden(policy), *cold_rows(policy)]
-
-
-def _throughput(samples: Sequence[float]) -> Measurement:
-    return latency.THROUGHPUT.measurement(1e3 / float(np.mean(samples)), samples=len(samples), note="back to back")
 
 
 def _jitter(samples: Sequence[float]) -> Measurement:
@@ -195,8 +190,8 @@ def _telemetry(telemetry: Summary) -> dict[str, list[dict[str, Any]]]:
 
 def _absent_table(absent: Sequence[Absent]) -> list[dict[str, str]]:
     """Return what is unmeasured and why; sources of other kinds of boards in one line."""
-    others = [part.reader for part in absent if any(sign in part.reason for sign in OTHER_BOARDS)]
-    lines = [{"what": part.reader, "why": part.reason} for part in absent if part.reader not in others]
+    others = [part.reader for part in absent if part.other_board]
+    lines = [{"what": part.reader, "why": part.reason} for part in absent if not part.other_board]
     if others:
         why = "this machine does not have them; vlatool telemetry says more"
         lines.append({"what": ", ".join(sorted(others)), "why": why})

@@ -163,11 +163,7 @@ class Turns:
         return Call(observation, noise, (outputs[0], outputs[1]))
 
     def _skip(self, index: int, failed: Mapping[int, GraphError]) -> None:
-        """Leave out what the baseline cannot answer.
-
-        Raises:
-            GraphError: when it is the candidate alone that cannot.
-        """
+        """Leave out what the baseline cannot answer."""
         if 0 not in failed:
             what = f"{self.job.candidate} fails where the baseline answers ({self._describe(index)})"
             raise GraphError(f"{what}: {failed[1].message}", failed[1].fix)

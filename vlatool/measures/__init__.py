@@ -33,14 +33,14 @@ class Quantity:
     """What is measured or predicted, such as the median latency; a ``Measurement`` is one value of it.
 
     Args:
-        name: In reports and in their JSON.
-        unit: As in ``Measurement``; empty where it depends on the policy.
-        title: In words; the name with spaces when empty.
+        name: Name in reports and in their JSON.
+        unit: Unit, as in ``Measurement``; empty where it depends on the policy.
+        title: Title in words; the name with spaces when empty.
         better: ``less``, ``more``, or empty where neither is.
         section: One of ``SECTIONS``.
         order: Position within its section; those without one follow in the order of the report.
         column: Title of its column in the table of variants; ``title`` when empty.
-        host_column: The same in a report for another board than this host; empty for what holds on any machine.
+        host_column: The same in a report for a board other than this host; empty for what holds on any machine.
         form: One of ``FORMS``.
         interval: How its interval is derived; empty where it has none.
         of: Derives its measurement from a row whose other measurements and raw samples are complete, None where the row

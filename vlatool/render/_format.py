@@ -10,7 +10,7 @@ from typing import Any
 from vlatool.measures import PERCENT, PLAIN, POINTS, quantity_of
 from vlatool.report import COUNT, NO_INTERVAL, Measurement
 
-UNMEASURED = "unmeasured"
+UNMEASURED_TEXT = "unmeasured"
 NARROW_SPACE = "\u202f"
 MINUS = "\u2212"
 LIMIT_UNITS = {
@@ -41,7 +41,7 @@ def decimals_of(value: float, digits: int = 3) -> int:
     return max(0, digits - 1 - math.floor(math.log10(abs(rounded))))
 
 
-def fixed(value: float, decimals: int) -> str:
+def fixed_decimals(value: float, decimals: int) -> str:
     """Return a number with that many decimals, a true minus sign, and thin spaces in thousands from 10 000 on."""
     if math.isinf(value):
         return "∞" if value > 0 else f"{MINUS}∞"
@@ -59,20 +59,20 @@ def number(value: float, digits: int = 3) -> str:
         ('0.0123', '1234', '5')
     """
     if math.isnan(value):
-        return UNMEASURED
+        return UNMEASURED_TEXT
     if float(value).is_integer() and abs(value) < 1e9:
-        return fixed(value, 0)
+        return fixed_decimals(value, 0)
     if _scientific(value):
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa.replace('-', MINUS)}e{int(exponent)}"
-    return fixed(value, decimals_of(value, digits))
+    return fixed_decimals(value, decimals_of(value, digits))
 
 
 def significant(value: float) -> str:
     """Return a measured number: three significant digits, trailing zeros kept, because they are known."""
     if value == 0 or not math.isfinite(value) or _scientific(value):
         return number(value)
-    return fixed(value, decimals_of(value))
+    return fixed_decimals(value, decimals_of(value))
 
 
 def tick(value: float) -> str:
@@ -86,7 +86,7 @@ def _scientific(value: float) -> bool:
 
 def count(samples: int) -> str:
     """Return ``n = 1000``, or nothing when the count is not known."""
-    return f"n = {fixed(samples, 0)}" if samples > 0 else ""
+    return f"n = {fixed_decimals(samples, 0)}" if samples > 0 else ""
 
 
 def is_share(measurement: Measurement) -> bool:
@@ -129,11 +129,11 @@ def _decimals(measurement: Measurement, value: float) -> int:
 def value(measurement: Measurement) -> str:
     """Return the number without its unit, shares in per cent."""
     if not measurement.known:
-        return UNMEASURED
+        return UNMEASURED_TEXT
     shown = measurement.value * _scale(measurement)[0]
     if not is_share(measurement) and _scientific(shown):
         return number(shown)
-    return fixed(shown, _decimals(measurement, shown) if shown or is_share(measurement) else 0)
+    return fixed_decimals(shown, _decimals(measurement, shown) if shown or is_share(measurement) else 0)
 
 
 def interval(measurement: Measurement) -> str:
@@ -148,11 +148,13 @@ def interval(measurement: Measurement) -> str:
     low, high = (None if bound is None else bound * factor for bound in (measurement.low, measurement.high))
     if low is None or high is None:
         alone = ((sign, bound) for sign, bound in (("≥", low), ("≤", high)) if bound is not None)
-        return "".join(f"{sign} {fixed(bound, decimals)}" for sign, bound in alone)
+        return "".join(f"{sign} {fixed_decimals(bound, decimals)}" for sign, bound in alone)
     while decimals < 6 and low != high and round(low, decimals) == round(high, decimals):
         decimals += 1
     rough = _scientific(measurement.value * factor) or math.isinf(low) or math.isinf(high)
-    ends = [number(end) if rough and not is_share(measurement) else fixed(end, decimals) for end in (low, high)]
+    ends = [
+        number(end) if rough and not is_share(measurement) else fixed_decimals(end, decimals) for end in (low, high)
+    ]
     return " to ".join(ends) if low < 0 else "–".join(ends)
 
 
@@ -169,7 +171,7 @@ def span(measurement: Measurement) -> str:
     return ends if is_usual(measurement) else f"{number(measurement.confidence * 100)} %: {ends}"
 
 
-def aside(measurement: Measurement) -> str:
+def bracket_text(measurement: Measurement) -> str:
     """Return what stands in brackets behind a number: interval and count."""
     return ", ".join(part for part in (span(measurement), count(measurement.samples)) if part)
 
@@ -190,8 +192,8 @@ def full(measurement: Measurement) -> str:
         '98.4 % (97.4–99.0, n = 1000)'
     """
     if not measurement.known:
-        return f"{UNMEASURED}: {plain(measurement.note)}" if measurement.note else UNMEASURED
-    brackets = aside(measurement)
+        return f"{UNMEASURED_TEXT}: {plain(measurement.note)}" if measurement.note else UNMEASURED_TEXT
+    brackets = bracket_text(measurement)
     return f"{quantity(measurement)} ({brackets})" if brackets else quantity(measurement)
 
 

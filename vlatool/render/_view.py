@@ -142,7 +142,7 @@ def notes(report: Report, origin: str, where: str | None = None) -> list[str]:
     return [f"{', '.join(labels)}: {note}" for note, labels in by_note.items()]
 
 
-def unmeasured(report: Report, shown: Callable[[str], bool], *, further: bool = False) -> list[str]:
+def missing_reasons(report: Report, shown: Callable[[str], bool], *, further: bool = False) -> list[str]:
     """Return a sentence for each reason for which numbers could not be had; variants are named unless it holds for all.
 
     Args:
@@ -183,16 +183,17 @@ def latency(report: Report) -> Latency:
     present = quantities(report)
     for_board = quantities(report, "predicted") and report.kind == "optimize" and ON_BOARD not in report.environment
     for name, limit in () if for_board else report.limits.items():
-        limited = latency_of_limit(name) if _is_number(limit) else None
+        limited = latency_of_limit(name) if is_number(limit) else None
         if limited is not None and quantity_of(limited.name) in present:
             return Latency(quantity_of(limited.name), float(limit), "deadline" if "deadline" in name else "limit")
     rate = report.limits.get("hz")
-    if report.kind in ("benchmark", "compare") and _is_number(rate) and rate > 0:
+    if report.kind in ("benchmark", "compare") and is_number(rate) and rate > 0:
         return Latency(LATENCY_P50, 1e3 / rate, "deadline")
     return Latency(LATENCY_P50, None)
 
 
-def _is_number(value: Any) -> TypeGuard[int | float]:
+def is_number(value: Any) -> TypeGuard[int | float]:
+    """Say whether a value of a report is a number; a flag is not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -208,7 +209,7 @@ def accuracy(report: Report) -> Quantity | None:
 def floor(report: Report, quantity: Quantity) -> float | None:
     """Return the least success that the limits allow: given, or the baseline's less the allowed drop."""
     for key, limit in report.limits.items():
-        if quantity != SUCCESS or SUCCESS.name not in key or not _is_number(limit):
+        if quantity != SUCCESS or SUCCESS.name not in key or not is_number(limit):
             continue
         share = limit / 100 if key.endswith(("_points", "_percent")) else float(limit)
         if "drop" not in key:

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from vlatool.measures import Quantity
-from vlatool.render._format import cell, count, fixed, plain, quantity, span
-from vlatool.render._view import notes
-from vlatool.render.charts.svg import tinted
+from vlatool.render._format import cell, count, fixed_decimals, plain, quantity, span
+from vlatool.render._view import is_number, notes
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import MISSING, Bar, Cell, Column, Line, Notes, Table
 from vlatool.report import Measurement, Report
 
@@ -38,7 +38,7 @@ def matrix(report: Report, shown: Sequence[Quantity], origin: str, where: str | 
         where: Only the numbers from there.
     """
     variants = []
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         items = {item.name: item for item in row.measurements if item.origin == origin and where in (None, item.where)}
         if any(each.name in items for each in shown):
             variants.append((Column(plain(row.name), css=css), items))
@@ -79,11 +79,14 @@ def records_table(report: Report, title: str, bars_of: str = "") -> Table | None
 
     Args:
         report: The report.
-        title: Of the details.
+        title: Title of the details.
         bars_of: Name of the number that gets a bar.
     """
     records = [
-        (plain(row.name), css, one) for row, css in tinted(report.rows) for one in row.details.get(title, ()) if one
+        (plain(row.name), css, one)
+        for row, css in with_colours(report.rows)
+        for one in row.details.get(title, ())
+        if one
     ]
     if not records:
         return None
@@ -94,7 +97,9 @@ def records_table(report: Report, title: str, bars_of: str = "") -> Table | None
         records.sort(key=lambda item: order.index(cell(item[2].get(keys[0]))))
     contents = [[record.get(key) for _, _, record in records] for key in keys]
     first, *others = [
-        Column(plain(key), all(map(_is_number, content)), minor=bool(bars_of) and key == "calls")
+        Column(
+            plain(key), all(each is None or is_number(each) for each in content), minor=bool(bars_of) and key == "calls"
+        )
         for key, content in zip(keys, contents, strict=True)
     ]
     lines, before = [], ""
@@ -115,13 +120,8 @@ def records_table(report: Report, title: str, bars_of: str = "") -> Table | None
     return Table(columns, tuple(lines), heading, style="parts" if bars_of else "groups")
 
 
-def _is_number(content: Any) -> bool:
-    return isinstance(content, int | float | None) and not isinstance(content, bool)
-
-
 def _length(content: Any) -> float:
-    drawn = content is not None and _is_number(content) and math.isfinite(content) and content > 0
-    return float(content) if drawn else 0.0
+    return float(content) if is_number(content) and math.isfinite(content) and content > 0 else 0.0
 
 
 def _texts(contents: Sequence[Any]) -> list[str]:
@@ -132,5 +132,6 @@ def _texts(contents: Sequence[Any]) -> list[str]:
         return [cell(item) for item in contents]
     decimals = max((len(text.partition(".")[2]) for text in shown), default=0)
     return [
-        fixed(item, decimals) if isinstance(item, float) and math.isfinite(item) else cell(item) for item in contents
+        fixed_decimals(item, decimals) if isinstance(item, float) and math.isfinite(item) else cell(item)
+        for item in contents
     ]

@@ -64,7 +64,7 @@ class Cell:
     css: str = ""
 
     @property
-    def aside(self) -> list[str]:
+    def brackets(self) -> list[str]:
         """What stands in brackets behind the number."""
         return [part for part in (self.interval, self.count) if part]
 
@@ -77,7 +77,7 @@ class Column:
     """The head of a column.
 
     Args:
-        title: In words; the first column names the lines.
+        title: Title in words; the first column names the lines.
         numeric: Whether it is aligned right.
         css: Class of the colour of the variant whose numbers these are.
         bars: Whether bars stand below its numbers.
@@ -96,7 +96,7 @@ class Line:
     """One line of a table, and why it is as it is.
 
     Args:
-        cells: As many as there are columns.
+        cells: One cell for each column.
         role, note: What the line stands for (``chosen``) and why, shown below it.
         best: Whether to point it out.
     """
@@ -137,12 +137,12 @@ class Table:
         if wrong is not None:
             raise ValueError(f"a line has {wrong} cells, the table {len(self.columns)} columns")
 
-    def worded(self) -> list[int]:
+    def filled_columns(self) -> list[int]:
         """Return the places of the columns that say something without bars."""
         return [
-            place
-            for place, column in enumerate(self.columns)
-            if not place or column.title or any(line.cells[place].text for line in self.lines)
+            index
+            for index, column in enumerate(self.columns)
+            if not index or column.title or any(line.cells[index].text for line in self.lines)
         ]
 
 
@@ -200,10 +200,10 @@ class Section:
 
     Args:
         title: Heading.
-        blocks: What it shows, in order.
+        blocks: Contents, in order.
         order: Sections stand in the order of this number: 10 predictions for a board, 20 variants, 90 further numbers,
             100 details, 130 environment.
-        origin: ``measured``, ``predicted``, or empty for what is no number.
+        origin: ``measured``, ``predicted``, or empty for what is not a number.
         where: The origin in words; what was measured says on which machine, unless this does.
         about: A sentence or more on how to read it.
         brief: Whether a brief terminal report has it.
@@ -249,7 +249,7 @@ class Document:
         reasons: (effect, reason, remedy) of each finding.
         limits: (name, value) of what was asked for.
         sides: What was measured here beside what is predicted for the board.
-        sections: In order.
+        sections: Sections, in order.
     """
 
     report: Report

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import require
-from vlatool.render._format import fixed, plain
+from vlatool.render._format import fixed_decimals, plain
 from vlatool.render.video import Picture, Video
 
 EXTRA = "video"
-PAPER, INK, MUTED, GOOD, BAD = (20, 23, 26), (231, 233, 236), (140, 148, 156), (111, 211, 155), (255, 139, 152)
+PAPER, INK, MUTED_INK, GOOD, BAD = (20, 23, 26), (231, 233, 236), (140, 148, 156), (111, 211, 155), (255, 139, 152)
 TINTS = ((155, 164, 173), (107, 184, 247))
 """Of the baseline and of the variant, as in the report; of a variant alone, the second."""
-AHEAD = (70, 76, 83)
+AHEAD_INK = (70, 76, 83)
 """Of the steps that are still to come."""
-INKS = (PAPER, INK, MUTED, GOOD, BAD, AHEAD, *TINTS)
-SEEN, WIDEST = 192, 640
+INKS = (PAPER, INK, MUTED_INK, GOOD, BAD, AHEAD_INK, *TINTS)
+PICTURE_HEIGHT, MAX_PICTURE_WIDTH = 192, 640
 """Pixels that a picture has in height, by a whole factor, unless it gets wider than the second."""
 EDGE, GAP, LINE, BAR = 8, 12, 16, 10
 """Pixels around all, between the variants, of a line of text and of the bar of steps."""
@@ -31,11 +31,11 @@ class Shot:
     """The episode of one variant.
 
     Args:
-        variant: Its name.
-        pictures: Of the reset and after each step, uint8 (H, W, 3); iterated more than once.
-        count: Of the pictures.
+        variant: Name of the variant.
+        pictures: Pictures of the reset and after each step, uint8 (H, W, 3); iterated more than once.
+        count: Number of the pictures.
         size: Height and width of each.
-        steps: Of the whole episode, which may be longer than what was filmed.
+        steps: Steps of the whole episode, which may be longer than what was filmed.
         success: How it ended.
         seams: Steps, from 1, at which a new chunk begins; none where each step does.
     """
@@ -52,7 +52,7 @@ class Shot:
     def factor(self) -> int:
         """How many times larger the pictures are shown."""
         height, width = self.size
-        return max(1, min(-(-SEEN // height), WIDEST // width))
+        return max(1, min(-(-PICTURE_HEIGHT // height), MAX_PICTURE_WIDTH // width))
 
 
 def filmstrip(shots: Sequence[Shot], title: str, hz: float) -> Video:
@@ -79,7 +79,7 @@ def _composed(shots: Sequence[Shot], title: str, count: int) -> Iterator[Picture
             panel.draw(sheet, step, EDGE + LINE, corner)
             corner += panel.width + GAP
         pen.begin(sheet)
-        pen.write(EDGE, EDGE, title, MUTED, width)
+        pen.write(EDGE, EDGE, title, MUTED_INK, width)
         corner = EDGE
         for panel in panels:
             panel.caption(pen, step, EDGE + LINE, corner)
@@ -94,7 +94,7 @@ class _Panel:
         self._shot, self._tint = shot, tint
         self._pictures = iter(shot.pictures)
         self._last: Picture = np.zeros((1, 1, 3), np.uint8)
-        self.width = max(SEEN, shot.size[1] * shot.factor)
+        self.width = max(PICTURE_HEIGHT, shot.size[1] * shot.factor)
         self.height = LINE + shot.size[0] * shot.factor + BAR
 
     def draw(self, sheet: Picture, step: int, top: int, left: int) -> None:
@@ -106,21 +106,21 @@ class _Panel:
         sheet[top + LINE : top + LINE + height, left : left + width] = self._last
         middle = top + LINE + height + BAR // 2 + 1
         reached = left + round(self.width * min(step, shot.steps) / max(1, shot.steps))
-        sheet[middle - 1 : middle + 1, left : left + self.width] = AHEAD
+        sheet[middle - 1 : middle + 1, left : left + self.width] = AHEAD_INK
         sheet[middle - 1 : middle + 1, left:reached] = self._tint
         for seam in shot.seams:
             at = left + round((self.width - 1) * (seam - 1) / max(1, shot.steps))
-            sheet[middle - 4 : middle + 4, at] = self._tint if seam <= step else AHEAD
+            sheet[middle - 4 : middle + 4, at] = self._tint if seam <= step else AHEAD_INK
 
     def caption(self, pen: _Pen, step: int, top: int, left: int) -> None:
         """Write whose picture it is, and how far the episode is or how it ended."""
         shot, done = self._shot, min(step, self._shot.count - 1)
-        where, colour = f"step {fixed(done, 0)}", INK
+        where, colour = f"step {fixed_decimals(done, 0)}", INK
         if done >= shot.steps:
             where, colour = ("success", GOOD) if shot.success else ("failure", BAD)
-            where = f"{where} at step {fixed(shot.steps, 0)}"
+            where = f"{where} at step {fixed_decimals(shot.steps, 0)}"
         elif step > done or done == shot.count - 1 > 0:
-            where, colour = f"step {fixed(done, 0)}, not filmed further", MUTED
+            where, colour = f"step {fixed_decimals(done, 0)}, not filmed further", MUTED_INK
         elif step in shot.seams:
             where = f"{where}, new chunk"
         room = pen.write(left + self.width, top, where, colour, self.width, right=True)
@@ -149,8 +149,8 @@ class _Pen:
         Args:
             x, y: Its left end, or its right one, and its top.
             text: One line.
-            colour: Of the ink.
-            width: At most, in pixels.
+            colour: Colour of the ink.
+            width: Largest width in pixels.
             right: Whether it ends at ``x``.
         """
         if self._length(text) > width:

@@ -35,7 +35,7 @@ class Video:
 
     Args:
         pictures: Begins anew: yields uint8 (H, W, 3), all of one size.
-        count: How many there are.
+        count: Number of pictures.
         hz: Pictures a second.
         inks: Colours (R, G, B) of what is written and drawn on pictures, which a format with few colours keeps.
     """
@@ -89,7 +89,7 @@ def check_video(path: Path, *, force: bool) -> None:
     """Refuse a video that cannot be written, as far as that is known before there is anything to show.
 
     Args:
-        path: Of the file; its folder must exist.
+        path: Path of the file; its folder must exist.
         force: Whether a video that vlatool wrote, and nobody changed, may be replaced.
 
     Raises:
@@ -112,8 +112,8 @@ def write_video(video: Video, path: Path, *, force: bool = False) -> str:
     """Write a video; the file appears whole or not at all, and not over one that came meanwhile.
 
     Args:
-        video: What is written.
-        path: Of the file.
+        video: The video to write.
+        path: Path of the file.
         force: See ``check_video``.
 
     Returns:

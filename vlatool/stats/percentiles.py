@@ -65,7 +65,7 @@ def percentile(
     """Return a percentile with its upper confidence bound, from dependent calls.
 
     Args:
-        samples: In the order in which they were taken, any unit.
+        samples: Samples in the order in which they were taken, any unit.
         processes: Which process each call was made in; all in one when None.
         percent: Above 0 and below 100.
         confidence: One-sided confidence of the bound.
@@ -180,10 +180,10 @@ def effective_sample_size(series: Array, share: float, processes: Sequence[int] 
 
 def intraclass(values: Array, processes: Sequence[int]) -> float:
     """Return the intraclass correlation: which share of the variance lies between processes (Fisher 1925)."""
-    _, place, counts = np.unique(np.asarray(processes), return_inverse=True, return_counts=True)
+    _, group, counts = np.unique(np.asarray(processes), return_inverse=True, return_counts=True)
     groups, total = len(counts), len(values)
-    means = np.bincount(place, values) / counts
-    within = float(((values - means[place]) ** 2).sum()) / max(1, total - groups)
+    means = np.bincount(group, values) / counts
+    within = float(((values - means[group]) ** 2).sum()) / max(1, total - groups)
     between = float((counts * (means - values.mean()) ** 2).sum()) / (groups - 1)
     size = (total - float((counts**2).sum()) / total) / (groups - 1)
     spread = between + (size - 1) * within

@@ -37,7 +37,7 @@ class Decision:
         ratio: Candidate over baseline, Hodges-Lehmann centre; 1.1 is a tenth slower.
         low, high: Bounds of the ratio, each at the error of one analysis.
         margin: The largest slowdown that passes, a share.
-        processes: How many were measured.
+        processes: Number of measured processes.
         spread: Standard deviation of the log ratios of single processes.
         alpha: Chance of a false verdict of the analysis, on either side.
     """
@@ -57,7 +57,7 @@ class Decision:
         return math.exp(math.log1p(self.margin) + reach(self.processes, self.alpha) * self.spread) - 1
 
     @property
-    def wanted(self) -> int:
+    def processes_needed(self) -> int:
         """Processes, all in all, that would decide if the centre is where it seems to be; 0 when it is decided.
 
         None would do where the centre lies on the margin: then it is a million.
@@ -122,7 +122,7 @@ def judge_jointly(
 
     Args:
         measure: Called with the number of the process, from 0; returns a log ratio for each statistic.
-        statistics: How many.
+        statistics: Number of statistics.
         margin: The largest slowdown that passes, a share.
         interim_analyses: After how many processes they are judged, ascending.
         alpha: Chance of a false verdict over all interim analyses, on either side.

@@ -72,12 +72,12 @@ def _rank(count: int, alpha: float) -> int:
     ways = [1]
     for rank in range(1, count + 1):  # sums of subsets of 1..n: each rank is positive or not
         longer = ways + [0] * rank
-        for place, number in enumerate(ways):
-            longer[place + rank] += number
+        for index, number in enumerate(ways):
+            longer[index + rank] += number
         ways = longer
     allowed, total = Fraction(alpha) * 2**count, 0
-    for place, number in enumerate(ways):
+    for index, number in enumerate(ways):
         total += number
         if total > allowed:
-            return place
+            return index
     return len(ways)

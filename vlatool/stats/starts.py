@@ -61,7 +61,7 @@ def wilson_of(wins: int, starts: Sequence[Hashable]) -> tuple[float, float]:
 
     Args:
         wins: Episodes that succeed.
-        starts: Of each episode; as many as there are episodes, from 1.
+        starts: Start of each episode; as many as there are episodes, from 1.
     """
     size = independent_starts(starts)
     share = wins * size / len(starts)

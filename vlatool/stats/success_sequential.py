@@ -88,7 +88,7 @@ class Decision:
         return self.verdict != GO_ON
 
     @property
-    def saved(self) -> float:
+    def saved_share(self) -> float:
         """Share of the episodes that need not be played."""
         return 1 - self.pairs / self.most
 
@@ -223,7 +223,7 @@ def plan(
         most: Pairs to play at most; rounded up to a multiple of the tasks.
         alpha: Chance of a false verdict over all interim analyses, on either side.
         tasks: Each analysis has equally many pairs of each.
-        analyses: How many, the last one included; fewer where there are not as many pairs of each task.
+        analyses: Number of analyses, the last one included; fewer where there are not as many pairs of each task.
         futile: Chance of a verdict below which the comparison ends as inconclusive; 0 plays all pairs.
 
     Raises:

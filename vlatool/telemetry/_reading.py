@@ -71,10 +71,12 @@ class Absent:
     Args:
         reader: Name of the reader, or of the reading.
         reason: Why it cannot be read and what to do about it.
+        other_board: Whether this kind of machine does not have the source.
     """
 
     reader: str
     reason: str
+    other_board: bool = False
 
 
 class Reader(ABC):
@@ -102,9 +104,9 @@ class Reader(ABC):
         """Return missing parts of this source."""
         return []
 
-    def or_absent(self: R, reason: str) -> R | Absent:
-        """Return this reader, or an ``Absent`` with the reason when it reads nothing."""
-        return self if self.read() else Absent(self.name, reason)
+    def or_absent(self: R, reason: str, *, other_board: bool = False) -> R | Absent:
+        """Return this reader, or an ``Absent`` with these fields when it reads nothing."""
+        return self if self.read() else Absent(self.name, reason, other_board)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ class Series:
     Args:
         first: The first reading; name, unit, kind and wrap-around are the same for all.
         times: Seconds.
-        values: In the unit of ``first``.
+        values: Values in the unit of ``first``.
         notes: The different notes, in the order in which they came.
     """
 

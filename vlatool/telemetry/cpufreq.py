@@ -41,7 +41,7 @@ class CpufreqReader(Reader):
         policies = find(root, f"{CPUS}/cpufreq", "policy*")
         counts = find(root, CPUS, "cpu[0-9]*/thermal_throttle/*_throttle_count")
         return cls(root, policies, counts).or_absent(
-            "neither clocks nor throttle counters are visible (virtual machine or container)"
+            "neither clocks nor throttle counters are visible (virtual machine or container)", other_board=True
         )
 
     def read(self) -> list[Reading]:

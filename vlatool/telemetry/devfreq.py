@@ -32,4 +32,6 @@ class DevfreqReader(FileReader):
         for index, folder in enumerate(folders):
             files.append(NumberFile(f"devfreq.gpu{index or ''}.load", f"{folder}/device/load", 1e-3, SHARE))
             files.append(NumberFile(f"devfreq.gpu{index or ''}.clock", f"{folder}/cur_freq", 1e-6, MEGAHERTZ))
-        return cls(root, files).or_absent("no GPU has a frequency policy in /sys/class/devfreq: this is not a Jetson")
+        return cls(root, files).or_absent(
+            "no GPU has a frequency policy in /sys/class/devfreq: this is not a Jetson", other_board=True
+        )

@@ -67,7 +67,7 @@ class InaReader(Reader):
         """Find the rails; absent where there is no monitor or none of its rails can be read."""
         rails = _with_indexes(_hwmon(root) or list(_iio(root)))
         if not rails:
-            return Absent(cls.name, REASON)
+            return Absent(cls.name, REASON, other_board=True)
         return cls(root, rails).or_absent("there are power monitors, but none of their rails can be read; check dmesg")
 
     def read(self) -> list[Reading]:

@@ -47,14 +47,16 @@ class NvmlReader(Reader):
         try:
             library = importlib.import_module("pynvml")
         except ImportError:
-            return Absent(cls.name, "nvidia-ml-py is not installed; with an NVIDIA card: pip install nvidia-ml-py")
+            reason = "nvidia-ml-py is not installed; with an NVIDIA card: pip install nvidia-ml-py"
+            return Absent(cls.name, reason, other_board=True)
         try:
             library.nvmlInit()
             cards = [library.nvmlDeviceGetHandleByIndex(index) for index in range(library.nvmlDeviceGetCount())]
         except library.NVMLError as error:
-            return Absent(cls.name, f"NVML cannot be opened ({error}): there is no NVIDIA card or driver")
+            reason = f"NVML cannot be opened ({error}): there is no NVIDIA card or driver"
+            return Absent(cls.name, reason, other_board=True)
         return cls(library, cards).or_absent(
-            "NVML supports nothing here, as on most Jetsons; their INA monitors are read instead"
+            "NVML supports nothing here, as on most Jetsons; their INA monitors are read instead", other_board=True
         )
 
     def read(self) -> list[Reading]:

@@ -26,7 +26,7 @@ class NvpmodelReader(CommandReader):
     def open(cls, root: Path = ROOT, run: Run | None = None) -> NvpmodelReader | Absent:
         """Ask for the mode; absent without an answer."""
         return cls(runner(root, run)).or_absent(
-            "nvpmodel -q prints no mode: this is not a Jetson, or the command needs sudo here"
+            "nvpmodel -q prints no mode: this is not a Jetson, or the command needs sudo here", other_board=True
         )
 
     def read(self) -> list[Reading]:

@@ -34,4 +34,6 @@ class OvercurrentReader(FileReader):
             )
             for alarm, path in paths.items()
         ]
-        return cls(root, files).or_absent("no over-current counters: this is not a Jetson with JetPack 5 or later")
+        return cls(root, files).or_absent(
+            "no over-current counters: this is not a Jetson with JetPack 5 or later", other_board=True
+        )

@@ -40,7 +40,8 @@ class RaplReader(FileReader):
                 wraps = number(root, f"{folder}/max_energy_range_uj", 1e-6)
                 files[label] = NumberFile(f"rapl.{label}", f"{folder}/energy_uj", 1e-6, JOULE, "counter", wraps, LABEL)
         if not files:
-            return Absent(cls.name, "no RAPL package is visible (virtual machine or ARM); measure at the wall")
+            reason = "no RAPL package is visible (virtual machine or ARM); measure at the wall"
+            return Absent(cls.name, reason, other_board=True)
         reader = cls(root, files.values())
         if len(reader.read()) < len(files):
             fix = f"write into /etc/udev/rules.d/70-rapl.rules, with your group for GROUP, and reboot: {UDEV_RULE}"

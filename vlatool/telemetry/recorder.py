@@ -37,10 +37,7 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        readers: Iterable[Reader | Absent],
-        period_s: float = 0.1,
-        clock: Callable[[], float] = time.monotonic,
+        self, readers: Iterable[Reader | Absent], period_s: float = 0.1, clock: Callable[[], float] = time.monotonic
     ) -> None:
         if not (math.isfinite(period_s) and period_s > 0):
             raise ValueError(f"period_s must be above zero, got {period_s}")
@@ -83,7 +80,7 @@ class Recorder:
                 self._read(reader, now)
 
     @property
-    def recorded(self) -> Summary:
+    def summary(self) -> Summary:
         """Summary of the samples so far."""
         with self._lock:
             partly = [part for reader in self._readers for part in reader.absent()]

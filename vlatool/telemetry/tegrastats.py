@@ -37,7 +37,7 @@ class TegrastatsReader(CommandReader):
     def open(cls, root: Path = ROOT, run: Run | None = None) -> TegrastatsReader | Absent:
         """Ask for one line; absent without tegrastats, or when the line has no known value."""
         return cls(runner(root, run)).or_absent(
-            "tegrastats prints nothing: this is not a Jetson, or the L4T tools are not installed"
+            "tegrastats prints nothing: this is not a Jetson, or the L4T tools are not installed", other_board=True
         )
 
     def read(self) -> list[Reading]:

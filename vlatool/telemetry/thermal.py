@@ -32,4 +32,6 @@ class ThermalReader(FileReader):
             name = f"thermal.{kind}-{counts[kind]}" if counts[kind] else f"thermal.{kind}"
             files.append(NumberFile(name, f"{folder}/temp", 1e-3, DEGREE, minimum=MIN_TEMPERATURE))
             counts[kind] += 1
-        return cls(root, files).or_absent("no thermal zone shows a temperature (virtual machine or container)")
+        return cls(root, files).or_absent(
+            "no thermal zone shows a temperature (virtual machine or container)", other_board=True
+        )

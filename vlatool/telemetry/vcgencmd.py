@@ -17,7 +17,7 @@ BITS = {0: "under-voltage", 1: "arm frequency capped", 2: "throttled", 3: "soft 
 """Current state; the same bits from 16 on tell whether it occurred since the machine started."""
 SINCE_START = 16
 TEMPERATURE = re.compile(r"temp=(-?\d+(?:\.\d+)?)'C")
-THROTTLED = re.compile(r"throttled=0x([0-9a-fA-F]{1,8})\b")
+THROTTLE_BITS = re.compile(r"throttled=0x([0-9a-fA-F]{1,8})\b")
 CURRENT = re.compile(r"^\s*(\w+)_A current\(\d+\)=(\d+(?:\.\d+)?)A\s*$", re.MULTILINE)
 VOLTAGE = re.compile(r"^\s*(\w+)_V volt\(\d+\)=(\d+(?:\.\d+)?)V\s*$", re.MULTILINE)
 REASON = "vcgencmd fails: this is not a Raspberry Pi, or it needs 'sudo usermod -aG video $USER' and a new login"
@@ -45,7 +45,7 @@ class VcgencmdReader(Reader):
         bits = parse_throttling(ask(("vcgencmd", "get_throttled")) or "")
         degrees = parse_temperature(ask(("vcgencmd", "measure_temp")) or "")
         if bits is None and degrees is None:
-            return Absent(cls.name, REASON)
+            return Absent(cls.name, REASON, other_board=True)
         rails = parse_pmic_watts(ask(("vcgencmd", "pmic_read_adc")) or "")
         return cls(ask, bool(rails), (bits or 0) >> SINCE_START)
 
@@ -92,7 +92,7 @@ def parse_temperature(text: str) -> float | None:
 
 def parse_throttling(text: str) -> int | None:
     """Return the bits of ``throttled=0x50000``; None when there are none."""
-    bits = THROTTLED.search(text)
+    bits = THROTTLE_BITS.search(text)
     return int(bits[1], 16) if bits else None
 
 

@@ -139,9 +139,11 @@ def decision_words(decision: Decision) -> str:
 
 def _advice(decision: Decision) -> str:
     """Return how many processes would decide; why none would where that is not a sensible number."""
-    if decision.wanted <= MAX_PROCESSES:
-        return f"about {decision.wanted} processes would decide"
-    if replace(decision, ratio=1.0).wanted > MAX_PROCESSES:  # not even two equal bundles could be shown to be so
+    if decision.processes_needed <= MAX_PROCESSES:
+        return f"about {decision.processes_needed} processes would decide"
+    if (
+        replace(decision, ratio=1.0).processes_needed > MAX_PROCESSES
+    ):  # not even two equal bundles could be shown to be so
         return "this machine is too noisy to decide it: let nothing else run"
     return "it is too close to what is allowed for more processes to decide"
 

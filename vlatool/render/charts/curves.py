@@ -9,10 +9,10 @@ from vlatool.render._format import tick
 from vlatool.render.charts.shares import Share, percent
 from vlatool.render.charts.svg import Axis, Canvas, shorten
 
-TALL, HEAD, FOOT, LEFT, GAP = 118.0, 30.0, 20.0, 42.0, 14.0
+TALL, HEAD, FOOT, LEFT_MARGIN, GAP = 118.0, 30.0, 20.0, 42.0, 14.0
 TOP = 24.0
 """Of the line that names the variants."""
-APART = 3.0
+SPACING = 3.0
 """Pixels between the variants at one strength, so that no interval covers another."""
 
 
@@ -21,7 +21,7 @@ class Curve:
     """One variant under one disturbance.
 
     Args:
-        variant: Its name.
+        variant: Name of the variant.
         css: Class of its colour.
         points: Strength, and how often it succeeds then; in the order of strength.
     """
@@ -36,17 +36,17 @@ def curves(groups: Sequence[tuple[str, Sequence[Curve]]], title: str, width: int
 
     Args:
         groups: Disturbance -> the curves of the variants, the worst first.
-        title: What it shows.
-        width: In pixels.
+        title: Title of the drawing.
+        width: Width in pixels.
     """
     columns = min(len(groups), 3 if width > 500 else 2)
     wide = (width - GAP * (columns - 1)) / columns
     named = {curve.variant: curve.css for _, group in groups for curve in group}
     rows = -(-len(groups) // columns)
     height = TOP + rows * (HEAD + TALL + FOOT + GAP) + 10
-    told = (f"{name} at strength {tick(strength)}: {share.told}"
+    words = (f"{name} at strength {tick(strength)}: {share.text}"
             for name, group in groups for curve in group for strength, share in curve.points)  # fmt: skip
-    canvas = Canvas(f"curves-{width}", width, round(height), title, "; ".join(told))
+    canvas = Canvas(f"curves-{width}", width, round(height), title, "; ".join(words))
     canvas.legend(named)
     every = [point for _, group in groups for curve in group for point in curve.points]
     least = min(share.value if share.low is None else share.low for _, share in every)
@@ -62,25 +62,25 @@ def _panel(
     canvas: Canvas,
     name: str,
     group: Sequence[Curve],
-    place: tuple[float, float, float],
+    box: tuple[float, float, float],
     strengths: tuple[float, float],
     least: float,
 ) -> None:
-    left, top, wide = place
+    left, top, wide = box
     base = top + HEAD + TALL
-    across = Axis(*strengths, left + LEFT + 6, left + wide - 10)
+    across = Axis(*strengths, left + LEFT_MARGIN + 6, left + wide - 10)
     up = Axis(least, 1.0, base, top + HEAD)
     canvas.text(left, top + 14, shorten(name, wide), "name")
-    canvas.up(up, left + LEFT, left + wide, {value: f"{percent(value)} %" for value in up.ticks(4)})
-    canvas.line(left + LEFT, base, left + wide, base, "axis")
+    canvas.up(up, left + LEFT_MARGIN, left + wide, {value: f"{percent(value)} %" for value in up.ticks(4)})
+    canvas.line(left + LEFT_MARGIN, base, left + wide, base, "axis")
     for strength in sorted({strength for curve in group for strength, _ in curve.points}):
         canvas.text(across(strength), base + 15, tick(strength), "tick", "middle")
     for number, curve in enumerate(group):
-        aside = APART * (number - (len(group) - 1) / 2)
+        aside = SPACING * (number - (len(group) - 1) / 2)
         spots = [(across(strength) + aside, share) for strength, share in curve.points]
         line = "L".join(f"{x:.1f} {up(share.value):.1f}" for x, share in spots)
         canvas.add("path", f"line {curve.css}", d=f"M{line}", fill="none")
         for x, share in spots:
             if share.low is not None and share.high is not None:
                 canvas.line(x, up(share.low), x, up(share.high), f"whisker {curve.css}")
-            canvas.add("circle", f"dot {curve.css}", share.told, cx=x, cy=up(share.value), r=3.5)
+            canvas.add("circle", f"dot {curve.css}", share.text, cx=x, cy=up(share.value), r=3.5)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vlatool.render._format import fixed, significant, tick
+from vlatool.render._format import fixed_decimals, significant, tick
 from vlatool.render._view import Latency
 from vlatool.render.charts.samples import Sampled, ecdf, histogram
 from vlatool.render.charts.svg import Axis, Canvas, axis_for
@@ -19,7 +19,7 @@ def beyond(variants: Sequence[Sampled], limit: float | None) -> str:
     for variant in variants:
         outside = sum(sample > axis.high for sample in variant.samples)
         if outside:
-            share = f"{fixed(outside, 0)} of {fixed(len(variant.samples), 0)}"
+            share = f"{fixed_decimals(outside, 0)} of {fixed_decimals(len(variant.samples), 0)}"
             outliers.append(f"{variant.name}: {share}, up to {significant(variant.ordered[-1])} ms")
     return "Beyond the right end: " + "; ".join(outliers) + "." if outliers else ""
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from vlatool.render._format import fixed, tick
+from vlatool.render._format import fixed_decimals, tick
 from vlatool.render.charts.svg import Axis, Canvas
 
-ROW, GAP, LEFT, RIGHT, HEAD = 74.0, 18.0, 54.0, 14.0, 22.0
+ROW, GAP, LEFT_MARGIN, RIGHT, HEAD = 74.0, 18.0, 54.0, 14.0, 22.0
 MOST_ACTIONS, MOST_POINTS = 6, 400
 DISCRETE = "action"
 """The series of a discrete action: its index, of each step."""
@@ -21,7 +21,7 @@ class Played:
     """What one variant did in the episode.
 
     Args:
-        variant: Its name.
+        variant: Name of the variant.
         css: Class of its colour.
         series: ``position.x``, ``action.NAME`` (or ``action``) and ``fresh`` -> a number a step.
     """
@@ -42,7 +42,7 @@ def episode(played: Sequence[Played], title: str, width: int) -> Canvas:
     Args:
         played: The variants, the baseline first.
         title: Which episode it is.
-        width: In pixels.
+        width: Width in pixels.
     """
     views = [(one, two, words) for one, two, words in VIEWS
              if all({f"position.{one}", f"position.{two}"} <= set(each.series) for each in played)]  # fmt: skip
@@ -52,13 +52,13 @@ def episode(played: Sequence[Played], title: str, width: int) -> Canvas:
     tall = min(220.0, 0.8 * side)
     top = HEAD + (tall + GAP) * (min(1, len(views)) if beside else len(views))
     height = top + (ROW + GAP) * len(actions) + 22
-    steps = "; ".join(f"{one.variant}: {fixed(one.steps, 0)} steps" for one in played)
+    steps = "; ".join(f"{one.variant}: {fixed_decimals(one.steps, 0)} steps" for one in played)
     canvas = Canvas(f"episode-{width}", width, round(height), title, f"{steps}.")
     canvas.legend({one.variant: one.css for one in played})
     for number, view in enumerate(views):
         corner = (number * (side + GAP), HEAD) if beside else (0.0, HEAD + number * (tall + GAP))
         _paths(canvas, played, view, corner, (side, tall))
-    across = Axis(1.0, float(max(2, *(one.steps for one in played))), LEFT, width - RIGHT)
+    across = Axis(1.0, float(max(2, *(one.steps for one in played))), LEFT_MARGIN, width - RIGHT)
     for number, name in enumerate(actions):
         _action(canvas, played, name, across, top + number * (ROW + GAP))
     base = top + (ROW + GAP) * len(actions) - GAP
@@ -96,7 +96,7 @@ def _action(canvas: Canvas, played: Sequence[Played], name: str, across: Axis, t
     room = 0.06 * (high - low) or abs(high) * 0.1 or 1.0
     up = Axis(low - room, high + room, top + ROW, top + 12)
     discrete = name == DISCRETE
-    canvas.up(up, LEFT, across.end, {value: tick(value) for value in _ticks(up, low, high, discrete)})
+    canvas.up(up, LEFT_MARGIN, across.end, {value: tick(value) for value in _ticks(up, low, high, discrete)})
     for one in played:
         own = one.series.get(name, ())
         if own:

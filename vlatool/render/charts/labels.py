@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from vlatool.render.charts.svg import CHARACTER, Canvas, shorten
 
 Box = tuple[float, float, float, float]
-WIDE = CHARACTER + 0.9
+CHARACTER_WIDTH = CHARACTER + 0.9
 ROW, ROWS = 17.0, 9
 REACHES = (13.0, 42.0)
 CLOSE = 17.0
@@ -45,7 +45,7 @@ class Label:
     @property
     def box(self) -> Box:
         """What it covers."""
-        wide = len(self.text) * WIDE
+        wide = len(self.text) * CHARACTER_WIDTH
         start = self.x if self.anchor == "start" else self.x - wide
         return start, self.y - 11, start + wide, self.y + 4
 
@@ -93,7 +93,7 @@ def labels(marks: Sequence[Mark], frame: Box, taken: Sequence[Box], longest: flo
     Args:
         marks: The points.
         frame: Pixels inside which labels stay: left, top, right, bottom.
-        taken: What else stands in the chart.
+        taken: Boxes of what else stands in the chart.
         longest: Pixels that a name may take.
     """
     named = _placed(marks, [shorten(mark.name, longest) for mark in marks], frame, taken)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vlatool.render._format import fixed, significant, tick
+from vlatool.render._format import fixed_decimals, significant, tick
 from vlatool.render.charts.samples import envelope
 from vlatool.render.charts.svg import Axis, Canvas, axis_for
 from vlatool.render.charts.timeline import draw_bands
 
-HEIGHT, LEFT, RIGHT, TOP = 170, 54.0, 14.0, 26.0
+HEIGHT, LEFT_MARGIN, RIGHT, TOP = 170, 54.0, 14.0, 26.0
 ENDS = 20
 """The loss at the start and at the end are means of this part of the steps each."""
 
@@ -20,8 +20,8 @@ class Curve:
     """One training.
 
     Args:
-        name: Of the variant, and the stage.
-        losses: Of the steps, all finite, two or more.
+        name: Name of the variant, and the stage.
+        losses: Losses of the steps, all finite, two or more.
         rounds: Steps before which rows were added.
         css: Class of the variant's colour.
     """
@@ -42,23 +42,23 @@ def loss_curve(curve: Curve, key: str, width: int) -> Canvas:
     """Return the drawing of one training.
 
     Args:
-        curve: What is drawn.
-        key: Unique in the page.
-        width: In pixels.
+        curve: The curve to draw.
+        key: Unique key in the page.
+        width: Width in pixels.
     """
     first, last = curve.ends
     words = f"Loss {significant(first)} in the first steps, {significant(last)} in the last."
     canvas = Canvas(f"loss-{key}-{width}", width, HEIGHT, f"Loss of {curve.name}", words)
     base, right = HEIGHT - 34.0, width - RIGHT
     steps = [float(step + 1) for step in range(len(curve.losses))]
-    across = Axis(1.0, steps[-1], LEFT, right)
+    across = Axis(1.0, steps[-1], LEFT_MARGIN, right)
     bands = envelope(steps, curve.losses, min(len(steps), 180 if width > 500 else 90))
     up = axis_for([edge for band in bands for edge in (band.low, band.high)], base, TOP)
-    canvas.up(up, LEFT, right, {value: tick(value) for value in up.ticks(4)})
+    canvas.up(up, LEFT_MARGIN, right, {value: tick(value) for value in up.ticks(4)})
     canvas.across(across, base, base, 8 if width > 500 else 4)
     for step in curve.rounds:
         canvas.line(across(step), TOP, across(step), base, "limit")
     draw_bands(canvas, bands, across, up, curve.css)
-    canvas.heading(14, right, curve.name, f"{fixed(len(steps), 0)} steps", f"name ink halo {curve.css}")
+    canvas.heading(14, right, curve.name, f"{fixed_decimals(len(steps), 0)} steps", f"name ink halo {curve.css}")
     canvas.text(right, HEIGHT - 4, "step", "note", "end")
     return canvas

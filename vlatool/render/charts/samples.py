@@ -9,11 +9,11 @@ from itertools import pairwise
 
 from vlatool.measures import series
 from vlatool.measures.latency import LATENCY
-from vlatool.render.charts.svg import tinted
+from vlatool.render.charts.svg import with_colours
 from vlatool.report import Report, Row
 
-MOST = 8
-MARKED = {"p50": 0.5, "p90": 0.9, "p99": 0.99}
+MAX_VARIANTS = 8
+MARKED_PERCENTILES = {"p50": 0.5, "p90": 0.9, "p99": 0.99}
 """The percentiles that are marked on the curve and below the histogram."""
 
 
@@ -36,11 +36,11 @@ def ecdf(ordered: Sequence[float], points: int = 120) -> list[tuple[float, float
     return [(ordered[0], 1 / size), *((quantile(ordered, share), share) for share in shares)]
 
 
-def histogram(samples: Sequence[float], place: Callable[[float], float], bins: int) -> list[int]:
+def histogram(samples: Sequence[float], position_of: Callable[[float], float], bins: int) -> list[int]:
     """Count samples in equal bins of ``place(sample)``, which is 0-1 inside; those outside are not counted."""
     counts = [0] * bins
     for sample in samples:
-        position = place(sample)
+        position = position_of(sample)
         if 0 <= position <= 1:
             counts[min(bins - 1, int(position * bins))] += 1
     return counts
@@ -70,8 +70,8 @@ def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> lis
 
     Args:
         times: When each sample was taken, ascending.
-        samples: As many as there are times.
-        bins: How many stretches.
+        samples: One sample for each time.
+        bins: Number of stretches.
     """
     first, last = times[0], times[-1]
     wide = (last - first) / bins
@@ -79,11 +79,11 @@ def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> lis
     for moment, sample in zip(times, samples, strict=True):
         stretches[min(bins - 1, int((moment - first) / wide)) if wide > 0 else 0].append(sample)
     bands = []
-    for place, part in enumerate(stretches):
+    for index, part in enumerate(stretches):
         if part:
             part.sort()
             inner = quantile(part, 0.1), part[len(part) // 2], quantile(part, 0.9)
-            bands.append(Band(first + (place + 0.5) * wide, part[0], *inner, part[-1]))
+            bands.append(Band(first + (index + 0.5) * wide, part[0], *inner, part[-1]))
     return bands
 
 
@@ -104,7 +104,7 @@ class Sampled:
 
     Args:
         name, css: The variant and the class of its colour.
-        samples: In ms, as they came.
+        samples: Latencies in ms, as they came.
         ordered: The same, ascending.
         known: Share -> the percentile that the report has.
         times: When each call began, in seconds since the start of the run; empty when that is not known.
@@ -120,7 +120,7 @@ class Sampled:
     @property
     def marks(self) -> dict[str, float]:
         """The percentiles that are marked, name -> share: those that the report has, all where it has none."""
-        return {name: share for name, share in MARKED.items() if share in self.known or not self.known}
+        return {name: share for name, share in MARKED_PERCENTILES.items() if share in self.known or not self.known}
 
     def at(self, share: float) -> float:
         """Return a quantile in ms; the reported one where the report has it."""
@@ -129,17 +129,17 @@ class Sampled:
 
 def left_out(report: Report) -> str:
     """Return a sentence about the variants for which the charts have no room."""
-    more = sum(len(finite(row.raw.get(series.LATENCY) or [])) > 1 for row in report.rows) - MOST
-    return f"Only the first {MOST} variants are drawn; {more} more in the tables." if more > 0 else ""
+    more = sum(len(finite(row.raw.get(series.LATENCY) or [])) > 1 for row in report.rows) - MAX_VARIANTS
+    return f"Only the first {MAX_VARIANTS} variants are drawn; {more} more in the tables." if more > 0 else ""
 
 
-def sampled(report: Report) -> list[Sampled]:
+def sampled_variants(report: Report) -> list[Sampled]:
     """Return the variants that kept latency samples, the first eight at most."""
     variants: list[Sampled] = []
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         samples, times = _timed(row)
-        if len(samples) > 1 and len(variants) < MOST:
-            reported = {share: row.value(LATENCY.quantity(name)) for name, share in MARKED.items()}
+        if len(samples) > 1 and len(variants) < MAX_VARIANTS:
+            reported = {share: row.value(LATENCY.quantity(name)) for name, share in MARKED_PERCENTILES.items()}
             known = {share: value for share, value in reported.items() if math.isfinite(value)}
             variants.append(Sampled(row.name, css, samples, sorted(samples), known, times))
     return variants

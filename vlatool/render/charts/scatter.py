@@ -16,8 +16,8 @@ class Point:
     """One variant or board.
 
     Args:
-        name, css: What it is called, and the class of its colour.
-        x, y: Its numbers.
+        name, css: Name of the point, and the class of its colour.
+        x, y: Values on the axes.
         tip: Shown when the pointer rests on it.
         shape: ``square``, ``ringed``, ``hollow`` or ``dot``.
     """
@@ -44,8 +44,8 @@ class Scatter:
 
     Args:
         key: Begins the ids of the drawing.
-        title: What it shows.
-        points: At least two.
+        title: Title of the drawing.
+        points: Points, at least two.
         across, up: Titles of the axes.
         spoken: The points in words.
         most: The limit on the number that goes across.

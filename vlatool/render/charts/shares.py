@@ -16,7 +16,7 @@ class Share:
     """How often one variant succeeds.
 
     Args:
-        variant: Its name.
+        variant: Name of the variant.
         css: Class of its colour.
         value, low, high: Shares from 0 to 1; ends of the interval are None when they are not known.
         count: Episodes.
@@ -30,7 +30,7 @@ class Share:
     count: int
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """The share in words."""
         span = "" if self.low is None or self.high is None else f" ({percent(self.low)} to {percent(self.high)} %)"
         return f"{self.variant}: {percent(self.value)} %{span} of {self.count} episodes"
@@ -41,15 +41,15 @@ def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, 
 
     Args:
         groups: Title -> the shares of the variants, the worst first.
-        title: What it shows.
-        key: Unique in the page.
-        width: In pixels.
+        title: Title of the drawing.
+        key: Unique key in the page.
+        width: Width in pixels.
     """
     left = min(0.34 * width, 12.0 + 6.2 * max(len(name) for name, _ in groups))
     named = {share.variant: share.css for _, group in groups for share in group}
     top = TOP + (HEAD if len(named) > 1 else 0.0)
     height = top + sum(GAP + LINE * len(group) for _, group in groups) + FOOT
-    words = "; ".join(f"{name}: {', '.join(share.told for share in group)}" for name, group in groups)
+    words = "; ".join(f"{name}: {', '.join(share.text for share in group)}" for name, group in groups)
     canvas = Canvas(f"shares-{key}-{width}", width, round(height), title, words)
     least = min(share.value if share.low is None else share.low for _, group in groups for share in group)
     across = Axis(max(0.0, min(0.9, least - 0.02)), 1.0, left + 8, width - 24.0)
@@ -74,7 +74,7 @@ def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, 
 def _draw(canvas: Canvas, across: Axis, y: float, share: Share) -> None:
     if share.low is not None and share.high is not None:
         canvas.line(across(share.low), y, across(share.high), y, f"line {share.css}")
-    canvas.add("circle", f"dot {share.css}", share.told, cx=across(share.value), cy=y, r=3.5)
+    canvas.add("circle", f"dot {share.css}", share.text, cx=across(share.value), cy=y, r=3.5)
 
 
 def percent(value: float) -> str:

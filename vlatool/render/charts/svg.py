@@ -76,12 +76,12 @@ def axis_for(values: Iterable[float], start: float, end: float, *, zero: bool = 
     return Axis(max(0.0, bottom) if low >= 0 else bottom, high + room, start, end)
 
 
-def tinted(rows: Sequence[Row]) -> list[tuple[Row, str]]:
+def with_colours(rows: Sequence[Row]) -> list[tuple[Row, str]]:
     """Return each row with the class of its colour: the baseline is grey, the chosen one (or the only one) blue."""
     named = {"baseline": "s-base", "chosen": "s-chosen"}
     if sum(row.role != "baseline" for row in rows) == 1:
         return [(row, named.get(row.role, "s-chosen")) for row in rows]
-    others = (f"s{place % SERIES}" for place in itertools.count())
+    others = (f"s{index % SERIES}" for index in itertools.count())
     return [(row, named.get(row.role) or next(others)) for row in rows]
 
 
@@ -95,10 +95,10 @@ class Canvas:
     """One drawing with a title and a description for those who cannot see it.
 
     Args:
-        key: Unique in the page; names the title and the description.
+        key: Unique key in the page; names the title and the description.
         width, height: Size in pixels, which may grow; the drawing scales down, and up to its width.
-        title: What it shows.
-        description: What one sees in it.
+        title: Title of the drawing.
+        description: Description of the drawing.
     """
 
     def __init__(self, key: str, width: int, height: int, title: str, description: str) -> None:

@@ -9,16 +9,16 @@ from vlatool.render._format import plain
 from vlatool.render.cells import texts
 from vlatool.render.document import Cell, Column, Line, Table
 
-SHARED = "shared"
+SHARED_ROLE = "shared"
 """The role of a line that holds the counts which all numbers of a column share."""
 
 
 def layout(table: Table, most: int) -> Table:
     """Return the first ``most`` lines of a table as one whose cells are text alone."""
-    kept = table.worded()
-    columns = tuple(replace(table.columns[place], title=plain(table.columns[place].title)) for place in kept)
-    lines = [replace(line, cells=tuple(line.cells[place] for place in kept)) for line in table.lines[:most]]
-    if any(cell.aside for line in lines for cell in line.cells[1:]):
+    kept = table.filled_columns()
+    columns = tuple(replace(table.columns[index], title=plain(table.columns[index].title)) for index in kept)
+    lines = [replace(line, cells=tuple(line.cells[index] for index in kept)) for line in table.lines[:most]]
+    if any(cell.brackets for line in lines for cell in line.cells[1:]):
         if len(lines) == 1 and len(columns) > 2:
             columns, lines = _turned(columns, lines[0].cells)
         if len(columns) == 2:
@@ -39,10 +39,10 @@ def _list(columns: Sequence[Column], lines: Sequence[Line], beside: str) -> Tabl
     for name, cell in (line.cells for line in lines):
         last = ", ".join(part for part in (cell.count, cell.note if cell.known else "") if part)
         body.append((name.text, cell.text, cell.interval, last))
-    kept = [place for place in range(4) if place < 2 or any(line[place] for line in body)]
+    kept = [index for index in range(4) if index < 2 or any(line[index] for line in body)]
     heads = (*columns, Column(beside), Column(""))
-    shown = (Line(texts(line[place] for place in kept)) for line in body)
-    return Table(tuple(heads[place] for place in kept), tuple(shown))
+    shown = (Line(texts(line[index] for index in kept)) for line in body)
+    return Table(tuple(heads[index] for index in kept), tuple(shown))
 
 
 def _joined(lines: Sequence[Line]) -> list[Line]:
@@ -57,7 +57,7 @@ def _joined(lines: Sequence[Line]) -> list[Line]:
 def _stacked(lines: Sequence[Line]) -> list[Line]:
     """Return number, interval and count below each other; a count that a column or a line shares stands once."""
     shared = [_shared(cells) if len(lines) > 1 else "" for cells in zip(*(line.cells for line in lines), strict=True)]
-    body = [Line(texts(shared), SHARED)] if any(shared) else []
+    body = [Line(texts(shared), SHARED_ROLE)] if any(shared) else []
     return body + [Line(texts(part), best=line.best) for line in lines for part in _parts(line.cells, shared)]
 
 

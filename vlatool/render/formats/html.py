@@ -43,12 +43,12 @@ def template() -> Template:
     jinja2 = require("jinja2", "build")
     markup = require("markupsafe", "build").Markup
 
-    def printed(content: Any) -> Any:
+    def printable(content: Any) -> Any:
         """Take control characters out of every text; drawings are as they are."""
         return plain(content) if isinstance(content, str) and not isinstance(content, markup) else content
 
     files = jinja2.PackageLoader("vlatool.render.formats", "")
-    environment = jinja2.Environment(autoescape=True, finalize=printed, loader=files)
+    environment = jinja2.Environment(autoescape=True, finalize=printable, loader=files)
     environment.filters.update(
         percent=lambda share: f"{100 * min(1.0, max(0.0, share)):.1f}%",
         capital=lambda text: text[:1].upper() + text[1:],

@@ -12,7 +12,7 @@ from vlatool.report import Report
 CONTROLS = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """What XML 1.0 does not allow."""
 FAULTS = {"fail": "failure", "invalid": "error"}
-SKIPPED = ("inconclusive", "suspect")
+SKIPPED_VERDICTS = ("inconclusive", "suspect")
 
 
 class JunitRenderer:
@@ -28,7 +28,7 @@ class JunitRenderer:
             "tests": len(cases),
             "failures": sum(verdict == "fail" for _, verdict, _ in cases),
             "errors": sum(verdict == "invalid" for _, verdict, _ in cases),
-            "skipped": sum(verdict in SKIPPED for _, verdict, _ in cases),
+            "skipped": sum(verdict in SKIPPED_VERDICTS for _, verdict, _ in cases),
         }
         shared = {name: str(count) for name, count in counts.items()}
         root = ElementTree.Element("testsuites", {"name": "vlatool", **shared})
@@ -39,7 +39,7 @@ class JunitRenderer:
             case = ElementTree.SubElement(suite, "testcase", {"name": name, "classname": f"vlatool.{report.kind}"})
             if verdict in FAULTS:
                 ElementTree.SubElement(case, FAULTS[verdict], {"message": clean(text)}).text = clean(report.command)
-            elif verdict in SKIPPED:
+            elif verdict in SKIPPED_VERDICTS:
                 ElementTree.SubElement(case, "skipped", {"message": clean(f"{verdict}: {text}")})
             ElementTree.SubElement(case, "system-out").text = clean(text)
         ElementTree.indent(root)

@@ -88,17 +88,17 @@ def _block(block: Block) -> list[str]:
 
 
 def _table(table: Table) -> list[str]:
-    kept = table.worded()
+    kept = table.filled_columns()
     heads, numeric = [], []
-    for place in kept:
-        heads.append(table.columns[place].title)
-        numeric.append(table.columns[place].numeric)
-        if table.beside and place:
+    for index in kept:
+        heads.append(table.columns[index].title)
+        numeric.append(table.columns[index].numeric)
+        if table.beside and index:
             heads.append(table.beside)
             numeric.append(True)
     lines = []
     for line in table.lines[:MOST_LINES]:
-        cells = [text for place in kept for text in _cell(line.cells[place], table.beside if place else "")]
+        cells = [text for index in kept for text in _cell(line.cells[index], table.beside if index else "")]
         lines.append([f"**{inline(cells[0])}**" if line.best else inline(cells[0]), *map(inline, cells[1:])])
     blocks = [_grid(heads, lines, numeric)]
     if len(table.lines) > MOST_LINES:
@@ -111,7 +111,7 @@ def _cell(cell: Cell, beside: str) -> list[str]:
     """Return the text of a cell, with what qualifies it in brackets, or in a cell of its own."""
     if beside:
         return [cell.text, cell.interval.removeprefix("≤ ") or "–"]
-    text = f"{cell.text} ({', '.join(cell.aside)})" if cell.aside else cell.text
+    text = f"{cell.text} ({', '.join(cell.brackets)})" if cell.brackets else cell.text
     return [f"{text}{', ' if cell.known else ': '}{cell.note}" if cell.note else text]
 
 

@@ -11,7 +11,7 @@ from rich.text import Text as Words
 from vlatool.render._format import plain
 from vlatool.render.document import Block, Code, Document, Line, Notes, Pairs, Section, Table, Text, build
 from vlatool.render.formats._grid import grid
-from vlatool.render.formats._layout import SHARED, layout
+from vlatool.render.formats._layout import SHARED_ROLE, layout
 from vlatool.report import Report
 
 STYLES = {"pass": "bold green", "fail": "bold red", "inconclusive": "bold yellow", "info": "bold cyan"}
@@ -82,8 +82,8 @@ class TerminalRenderer:
         elif section.origin:
             heading = re.sub(section.origin, section.origin.upper(), heading, count=1, flags=re.IGNORECASE)
         lines = [Words(), *self._wrapped(heading, style=HEADING)]
-        for place, block in enumerate(section.blocks):
-            lines += [Words()] if place and not getattr(block, "title", "") else []
+        for index, block in enumerate(section.blocks):
+            lines += [Words()] if index and not getattr(block, "title", "") else []
             lines += self._block(block)
         return [*lines, *self._wrapped(section.about, style="dim")]
 
@@ -134,4 +134,4 @@ class TerminalRenderer:
 def _style(line: Line | None) -> str:
     if line is None:
         return ""
-    return "dim" if line.role == SHARED else "bold green" if line.best else ""
+    return "dim" if line.role == SHARED_ROLE else "bold green" if line.best else ""

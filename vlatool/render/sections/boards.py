@@ -69,7 +69,7 @@ def board_table(rows: Sequence[Row]) -> Table:
         Line(texts(map(plain, cells(row))), plain(way(row).get("engine", "")), plain(row.reason), row.role == "chosen")
         for row in rows
     )
-    return Table(tuple(Column(head, place > 2) for place, head in enumerate(HEADS)), tuple(lines), style="cards")
+    return Table(tuple(Column(head, index > 2) for index, head in enumerate(HEADS)), tuple(lines), style="cards")
 
 
 def cells(row: Row) -> list[str]:
@@ -97,9 +97,9 @@ def cost_table(rows: Sequence[Row]) -> Table | None:
         ]
         money = [_money(row.get(each, "predicted")) for each in (resources.OWNED_COST, resources.CLOUD_COST)]
         body.append([plain(row.name), *power, *money, _value(row, resources.BREAK_EVEN)])
-    shown = [place for place in range(len(COST)) if any(line[place] != ABSENT for line in body)]
-    lines = tuple(Line(texts(line[place] for place in shown)) for line in body)
-    return Table(tuple(Column(COST[place], place > 0) for place in shown), lines) if lines else None
+    shown = [index for index in range(len(COST)) if any(line[index] != ABSENT for line in body)]
+    lines = tuple(Line(texts(line[index] for index in shown)) for line in body)
+    return Table(tuple(Column(COST[index], index > 0) for index in shown), lines) if lines else None
 
 
 def _spread(item: Measurement | None) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from vlatool.render._format import plain
 from vlatool.render._view import elements
 from vlatool.render.cells import bars, number
-from vlatool.render.charts.svg import tinted
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import Cell, Column, Line, Section, Table
 from vlatool.report import Report
 
@@ -18,7 +18,7 @@ class Errors:
     def build(self, report: Report) -> Iterator[Section]:
         """Return a dimension a line, a variant a column, and bars that compare the variants."""
         for group, members in elements(report).items():
-            rows = [(row, css) for row, css in tinted(report.rows) if any(row.get(each) for each in members)]
+            rows = [(row, css) for row, css in with_colours(report.rows) if any(row.get(each) for each in members)]
             lines = []
             for each in members:
                 items = [row.get(each) for row, _ in rows]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._view import further, percentiles, ranks_boards, unmeasured
+from vlatool.render._view import further, missing_reasons, percentiles, ranks_boards
 from vlatool.render.cells import matrix, remarks
 from vlatool.render.document import Block, Notes, Section
 from vlatool.report import Report
@@ -20,7 +20,7 @@ class Further:
         shown, elsewhere = further(report), {each.name for each in percentiles(report)}
         blocks: list[Block] = [matrix(report, shown, "measured")] if shown else []
         blocks += remarks(report, "measured", "Methods")
-        if missing := unmeasured(report, lambda name: name not in elsewhere, further=True):
+        if missing := missing_reasons(report, lambda name: name not in elsewhere, further=True):
             blocks.append(Notes(tuple(missing), "Unmeasured"))
         if blocks:
             title = "Further measurements and methods"

@@ -12,9 +12,9 @@ from vlatool.render.cells import matrix, records_table
 from vlatool.render.charts.episode import Played, episode
 from vlatool.render.charts.samples import finite
 from vlatool.render.charts.shares import Share, shares
-from vlatool.render.charts.svg import tinted
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import Block, Chart, Section
-from vlatool.render.sections._disturbed import disturbed, share_of, worst_first
+from vlatool.render.sections._disturbance_chart import disturbance_chart, share_of, worst_first
 from vlatool.report import Report, Row
 
 ABOUT = (
@@ -36,7 +36,7 @@ class Motion:
             blocks.append(matrix(report, shown, "measured"))
         if groups := _by_task(report):
             blocks.append(Chart(partial(shares, groups, TASKS, "task"), f"{TASKS}. {CAPTION}"))
-        if chart := disturbed(report, CAPTION):
+        if chart := disturbance_chart(report, CAPTION):
             blocks.append(chart)
         found = (
             records_table(report, title)
@@ -51,7 +51,7 @@ class Motion:
 
 def _episode(report: Report) -> list[Block]:
     """Return the drawing of the episode in which the variants differ most, and how it ended for each."""
-    played = [Played(plain(row.name), css, steps) for row, css in tinted(report.rows) if (steps := _series(row))]
+    played = [Played(plain(row.name), css, steps) for row, css in with_colours(report.rows) if (steps := _series(row))]
     table = records_table(report, tables.EPISODE)
     if len(played) < 2 or table is None:
         return []
@@ -60,7 +60,7 @@ def _episode(report: Report) -> list[Block]:
 
 
 def _series(row: Row) -> dict[str, list[float]]:
-    """Return the steps of the episode that a row shows; nothing where one of them is no number."""
+    """Return the steps of the episode that a row shows; nothing where one of them is not a number."""
     steps = {step: list(row.raw[name]) for step, name in series.EPISODE.among(row.raw).items()}
     usable = all(values and len(finite(values)) == len(values) for values in steps.values())
     lengths = {len(values) for name, values in steps.items() if name.startswith("position")}
@@ -70,7 +70,7 @@ def _series(row: Row) -> dict[str, list[float]]:
 def _by_task(report: Report) -> list[tuple[str, list[Share]]]:
     """Return task -> how often each variant succeeds, that with the worst variant first; nothing for one task."""
     groups: dict[str, list[Share]] = {}
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         for record in row.details.get(tables.BY_TASK, ()):
             if share := share_of(row.name, css, record.get("success"), record.get("episodes")):
                 groups.setdefault(plain(record.get("task", "")), []).append(share)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from functools import partial
 
 from vlatool.render._view import latency
-from vlatool.render.charts.samples import left_out, sampled
-from vlatool.render.charts.timeline import MOST_GAUGES, along_the_run, gauges, over_time, throttled
+from vlatool.render.charts.samples import left_out, sampled_variants
+from vlatool.render.charts.timeline import MOST_GAUGES, along_the_run, gauges, over_time, throttle_times
 from vlatool.render.document import Chart, Section
 from vlatool.report import Report
 
@@ -19,12 +19,12 @@ class OverTime:
 
     def build(self, report: Report) -> Iterator[Section]:
         """Return a section for the variants whose times are known, and one for the others."""
-        variants, aim = sampled(report), latency(report)
+        variants, aim = sampled_variants(report), latency(report)
         if timed := [variant for variant in variants if variant.times]:
             more = len(gauges(report)) - MOST_GAUGES
             caption = f"Line: median of a stretch of time. {BANDS} Each has its own scale, latency in ms; a band that "
             caption += "touches the top goes beyond it."
-            caption += " Vertical lines: moments of throttling." if throttled(report) else ""
+            caption += " Vertical lines: moments of throttling." if throttle_times(report) else ""
             caption += f" {more} more gauges in report.json." if more > 0 else ""
             drawing = Chart(partial(over_time, report, timed, aim), caption)
             yield Section("Latency over time", (drawing,), 50, "measured")

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 
 from vlatool.measures import Quantity
 from vlatool.measures.latency import LATENCY
-from vlatool.render._format import count, decimals_of, fixed, interval, number, plain
-from vlatool.render._view import percentiles, unmeasured
-from vlatool.render.charts.svg import tinted
+from vlatool.render._format import count, decimals_of, fixed_decimals, interval, number, plain
+from vlatool.render._view import missing_reasons, percentiles
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import ABSENT, Cell, Column, Line, Notes, Section, Table
 from vlatool.report import Measurement, Report, Row
 
@@ -20,7 +20,7 @@ class Percentiles:
     def build(self, report: Report) -> Iterator[Section]:
         """Return the table, and below it why a percentile could not be had."""
         shown = percentiles(report)
-        rows = [(row, css) for row, css in tinted(report.rows) if any(row.get(each) for each in shown)]
+        rows = [(row, css) for row, css in with_colours(report.rows) if any(row.get(each) for each in shown)]
         if not rows:
             return
         items = {each: [row.get(each) for row, _ in rows] for each in shown}
@@ -34,7 +34,7 @@ class Percentiles:
         heads = (Column("latency, ms", False), *(Column(plain(row.name), css=css) for row, css in rows))
         table = Table(heads, lines, beside=_title(known) if bounded else "", style="percentiles")
         variants = [row for row, _ in rows]
-        reasons = tuple(unmeasured(report, {each.name for each in shown}.__contains__))
+        reasons = tuple(missing_reasons(report, {each.name for each in shown}.__contains__))
         about = _calls(report, variants, shown)
         blocks = (table, Notes(reasons)) if reasons else (table,)
         yield Section("Latency percentiles", blocks, 30, "measured", about=about, brief=len(rows) == 1)
@@ -49,8 +49,8 @@ def _decimals(items: Sequence[Measurement | None]) -> int:
 def _cell(item: Measurement | None, decimals: int) -> Cell:
     if item is None or not item.known:
         return Cell(ABSENT, known=False)
-    bound = f"≤ {fixed(item.high, decimals)}" if item.low is None and item.high is not None else interval(item)
-    return Cell(fixed(item.value, decimals), bound)
+    bound = f"≤ {fixed_decimals(item.high, decimals)}" if item.low is None and item.high is not None else interval(item)
+    return Cell(fixed_decimals(item.value, decimals), bound)
 
 
 def _title(items: Sequence[Measurement]) -> str:

@@ -12,7 +12,7 @@ from vlatool.render._format import count, plain
 from vlatool.render._view import latency, percentiles
 from vlatool.render.cells import number, texts
 from vlatool.render.charts.distribution import beyond, distribution
-from vlatool.render.charts.samples import finite, left_out, sampled, sparkline
+from vlatool.render.charts.samples import finite, left_out, sampled_variants, sparkline
 from vlatool.render.document import Cell, Chart, Column, Line, Section, Table
 from vlatool.report import Report
 
@@ -27,7 +27,7 @@ class Spread:
 
     def build(self, report: Report) -> Iterator[Section]:
         """Return the drawing, with a line of blocks for each variant in its place."""
-        if variants := sampled(report):
+        if variants := sampled_variants(report):
             aim = latency(report)
             caption = " ".join(part for part in (HELP, beyond(variants, aim.limit), left_out(report)) if part)
             drawing = Chart(partial(distribution, variants, aim), caption, _blocks(report))

@@ -11,7 +11,7 @@ from vlatool.render._format import full, label, number, plain, tick, unit
 from vlatool.render._format import quantity as with_unit
 from vlatool.render._view import accuracy, floor, latency, measurements
 from vlatool.render.charts.scatter import Bound, Point, Scatter
-from vlatool.render.charts.svg import tinted
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import Chart, Section
 from vlatool.report import Report
 
@@ -51,7 +51,7 @@ def points(report: Report) -> list[Point]:
     shown: list[Point] = []
     if up is None:
         return shown
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         x, y = row.get(across), row.get(up)
         if x is not None and y is not None and math.isfinite(x.value) and math.isfinite(y.value):
             tip = f"{row.name}: {label(x.name)} {full(x)}, {label(y.name)} {full(y)}"

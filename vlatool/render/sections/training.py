@@ -12,7 +12,7 @@ from vlatool.render._format import cell, plain, significant
 from vlatool.render.cells import number, records_table, texts
 from vlatool.render.charts.losses import Curve, loss_curve
 from vlatool.render.charts.samples import finite
-from vlatool.render.charts.svg import tinted
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import MISSING, Block, Chart, Column, Line, Section, Table
 from vlatool.report import Report
 
@@ -35,7 +35,7 @@ class Training:
             return
         blocks: list[Block] = [_table(report, stages)]
         blocks += [
-            Chart(partial(loss_curve, curve, str(place)), CAPTION) for place, curve in enumerate(curves.values())
+            Chart(partial(loss_curve, curve, str(index)), CAPTION) for index, curve in enumerate(curves.values())
         ]
         titles = (title.name(stage) for stage in stages for title in (TEACHER, ROUNDS))
         blocks += [table for title in titles if (table := records_table(report, title))]
@@ -44,7 +44,7 @@ class Training:
 
 def _curves(report: Report, stage: str) -> Iterator[Curve]:
     """Yield the training by a stage of every variant that had it."""
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         losses = finite(row.raw.get(LOSSES.name(stage)) or [])
         if len(losses) > 1:
             rounds = [int(one.get("before step") or 0) for one in row.details.get(ROUNDS.name(stage), ())]

@@ -10,11 +10,11 @@ from vlatool.render._columns import about, columns
 from vlatool.render._format import plain, quantity, span
 from vlatool.render._view import brackets, latency, place, places, ranks_boards, role
 from vlatool.render.cells import bars, number, reach
-from vlatool.render.charts.svg import tinted
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import Bar, Cell, Column, Line, Section, Table, Text
 from vlatool.report import Measurement, Report, Row
 
-FAR = 2.5
+FAR_RATIO = 2.5
 """A limit that is further away than this many times the longest bar is left out."""
 
 
@@ -34,7 +34,7 @@ class Variants:
             return  # what was measured stands in another section
         heads = (Column(title, bars=each == LATENCY_P50) for each, title in shown.items())
         lines = []
-        for (row, css), bar in zip(tinted(report.rows), _bars(report), strict=True):
+        for (row, css), bar in zip(with_colours(report.rows), _bars(report), strict=True):
             items = [row.get(each) for each in shown]
             where = next((item.where for item in items if item), "this host")
             note = f"on {place(report, where)}" if len(places(report, "measured")) > 1 else ""
@@ -64,5 +64,5 @@ def _cell(row: Row, item: Measurement | None, bar: Bar | None, where: str) -> Ce
 def _bars(report: Report) -> list[Bar | None]:
     aim, items = latency(report), [row.get(LATENCY_P50) for row in report.rows]
     longest = max((reach(item) for item in items if item is not None), default=0.0)
-    near = aim.quantity == LATENCY_P50 and aim.limit is not None and aim.limit < FAR * longest
-    return bars(items, [css for _, css in tinted(report.rows)], aim.limit if near else None)
+    near = aim.quantity == LATENCY_P50 and aim.limit is not None and aim.limit < FAR_RATIO * longest
+    return bars(items, [css for _, css in with_colours(report.rows)], aim.limit if near else None)

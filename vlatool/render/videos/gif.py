@@ -22,7 +22,7 @@ ATTEMPTS = ((240, 1), (64, 1), (24, 1), (24, 2), (24, 4))
 """Colours, and the share of the pictures that is left out, until the file is small enough."""
 PICTURE_BYTES, LEAST_BYTES = 15_000, 1_000_000
 """Small enough: 3 MB for 200 pictures."""
-SAMPLED, SAMPLED_PIXELS = 12, 1_000_000
+SAMPLED_PICTURES, SAMPLED_PIXELS = 12, 1_000_000
 """Pictures, and about how many pixels of each, that the colours are chosen from."""
 CLEAR = 255
 """The index that stands for what was there before."""
@@ -90,8 +90,8 @@ def _head(width: int, height: int, palette: list[int]) -> bytes:
 
 def _palette(image: Any, video: Video, colours: int) -> Any:
     """Return a picture whose palette has the inks, and the colours that the pictures need most."""
-    wanted = set(np.linspace(0, video.count - 1, min(SAMPLED, video.count)).round().astype(int).tolist())
-    samples = [_thinned(picture) for place, picture in enumerate(video.pictures()) if place in wanted]
+    wanted = set(np.linspace(0, video.count - 1, min(SAMPLED_PICTURES, video.count)).round().astype(int).tolist())
+    samples = [_thinned(picture) for index, picture in enumerate(video.pictures()) if index in wanted]
     needed = image.fromarray(np.concatenate(samples)).quantize(colours, image.Quantize.MEDIANCUT)
     found = needed.getpalette()[: 3 * len(needed.getcolors())]
     palette = image.new("P", (1, 1))
@@ -107,11 +107,11 @@ def _thinned(picture: Picture) -> Picture:
 def _patches(image: Any, video: Video, palette: Any, every: int) -> Iterator[_Patch]:
     """Yield the first picture whole, and then what changes, at the moments at which it does."""
     before: NDArray[np.uint8] | None = None
-    for place, picture in enumerate(video.pictures()):
-        if place % every and place != video.count - 1:
+    for index, picture in enumerate(video.pictures()):
+        if index % every and index != video.count - 1:
             continue
         indices = np.asarray(image.fromarray(picture).quantize(palette=palette, dither=image.Dither.NONE))
-        start = round(100 * -(-place // every) * every / video.hz)
+        start = round(100 * -(-index // every) * every / video.hz)
         if before is None:
             yield _Patch(indices, 0, 0, start)
         elif (changed := indices != before).any():

@@ -20,7 +20,7 @@ from vlatool.render.video import HOLD_S, Picture, Video
 EXTRA = "mp4"
 CODECS = (("-c:v", "libx264", "-crf", "18"), ("-c:v", "mpeg4", "-q:v", "3"))
 """Tried one after the other: H.264, which an ffmpeg may lack, and MPEG-4."""
-TOLD = 300
+MAX_MESSAGE = 300
 """Characters of what ffmpeg says that are shown."""
 
 
@@ -92,7 +92,7 @@ def _encoded(video: Video, draft: Path, codec: tuple[str, ...]) -> str:
             process.wait()
         told.seek(0)
         said = " ".join(told.read().decode("utf-8", "replace").split())
-    return (said[:TOLD] or f"exit code {process.returncode}") if process.returncode else ""
+    return (said[:MAX_MESSAGE] or f"exit code {process.returncode}") if process.returncode else ""
 
 
 def _feed(stream: IO[bytes], first: Picture, rest: Iterator[Picture], hold: int) -> None:

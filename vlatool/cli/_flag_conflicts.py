@@ -9,27 +9,23 @@ from typing import Any
 from vlatool.errors import UsageError
 
 
-def once(command: Any) -> Any:
+def refuse_conflicting_flags(command: Any) -> Any:
     """Return a click command that refuses such flags; of a group, each of its commands does."""
     for each in (command, *getattr(command, "commands", {}).values()):
-        each.parse_args = partial(_parsed, each, each.parse_args)
+        each.parse_args = partial(_parse, each, each.parse_args)
     return command
 
 
-def _parsed(command: Any, parse: Any, ctx: Any, args: list[str]) -> list[str]:
+def _parse(command: Any, parse: Any, ctx: Any, args: list[str]) -> list[str]:
     if not ctx.resilient_parsing:
         for option in command.get_params(ctx):
-            _refuse_two(option, args)
+            _refuse_conflict(option, args)
     parsed: list[str] = parse(ctx, args)
     return parsed
 
 
-def _refuse_two(option: Any, args: Sequence[str]) -> None:
-    """Refuse words that turn a flag on and off.
-
-    Raises:
-        UsageError: naming both.
-    """
+def _refuse_conflict(option: Any, args: Sequence[str]) -> None:
+    """Refuse words that turn a flag on and off."""
     if option.param_type_name != "option" or not option.is_flag or getattr(option, "count", False):
         return
     given = list(dict.fromkeys(_given(option, args)))

@@ -9,9 +9,10 @@ from typing import Any
 from vlatool.measures.success import SUCCESS
 from vlatool.measures.tables import UNDER
 from vlatool.render._format import plain
+from vlatool.render._view import is_number
 from vlatool.render.charts.curves import Curve, curves
 from vlatool.render.charts.shares import Share, shares
-from vlatool.render.charts.svg import tinted
+from vlatool.render.charts.svg import with_colours
 from vlatool.render.document import Chart
 from vlatool.report import Report
 from vlatool.stats.intervals import wilson
@@ -27,7 +28,7 @@ Groups = list[tuple[str, list[Share]]]
 
 def share_of(variant: str, css: str, value: Any, count: Any) -> Share | None:
     """Return a share with Wilson's interval; None where a report from elsewhere does not have its numbers."""
-    if type(count) is not int or count < 1 or not _is_number(value) or not 0 <= value <= 1:
+    if type(count) is not int or count < 1 or not is_number(value) or not 0 <= value <= 1:
         return None
     return Share(plain(variant), css, value, *wilson(round(value * count), count), count)
 
@@ -37,7 +38,7 @@ def worst_first(groups: dict[str, list[Share]]) -> Groups:
     return sorted(groups.items(), key=lambda item: min(share.value for share in item[1]))
 
 
-def disturbed(report: Report, caption: str) -> Chart | None:
+def disturbance_chart(report: Report, caption: str) -> Chart | None:
     """Return the drawing of what disturbances cost, None where none were played.
 
     Args:
@@ -77,19 +78,19 @@ def _played(report: Report) -> Iterator[tuple[str, float, Share]]:
     """Yield disturbance, strength and how often a variant succeeds then: the baseline once, then each variant."""
     base = next((row.name for row in report.rows if row.role == "baseline"), "baseline")
     known: set[tuple[str, float]] = set()
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         for record in row.details.get(UNDER, ()):
             kind = plain(record.get("disturbance", ""))
-            place = (kind, _strength(record.get("strength")))
+            condition = (kind, _strength(record.get("strength")))
             count = record.get("episodes")
-            before = None if place in known else share_of(base, "s-base", record.get("baseline"), count)
+            before = None if condition in known else share_of(base, "s-base", record.get("baseline"), count)
             own = share_of(row.name, css, record.get("success"), count)
-            known.add(place)
-            yield from ((*place, share) for share in (before, own) if share)
+            known.add(condition)
+            yield from ((*condition, share) for share in (before, own) if share)
 
 
 def _undisturbed(report: Report) -> Iterator[Share]:
-    for row, css in tinted(report.rows):
+    for row, css in with_colours(report.rows):
         rate = row.get(SUCCESS)
         if rate is not None and (share := share_of(row.name, css, rate.value, rate.samples)):
             yield share
@@ -97,8 +98,4 @@ def _undisturbed(report: Report) -> Iterator[Share]:
 
 def _strength(value: Any) -> float:
     """Return a strength; 1 where a report from elsewhere says something else."""
-    return float(value) if _is_number(value) and 0 <= value <= STRONGEST else 1.0
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float)
+    return float(value) if is_number(value) and 0 <= value <= STRONGEST else 1.0

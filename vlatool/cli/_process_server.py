@@ -8,7 +8,7 @@ from vlatool.user_code import children
 
 GRAPHS = ("numpy.random", "onnx", "onnxruntime", "vlatool.stage._child", "vlatool.quantize.static_int8")
 MODULES = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", "vlatool.stage._child")
-TRAINED = "qat"
+TRAINING_METHOD = "qat"
 
 
 def start_early(words: Sequence[str]) -> None:
@@ -19,7 +19,7 @@ def start_early(words: Sequence[str]) -> None:
     """
     if len(words) < 2 or any(word in ("--help", "-h") for word in words):
         return
-    if words[0] == "quantize" and words[1] != TRAINED:
+    if words[0] == "quantize" and words[1] != TRAINING_METHOD:
         children.prepare(GRAPHS)
     elif words[0] in ("export", "prune", "distill", "verify", "quantize"):
         children.prepare(MODULES)
