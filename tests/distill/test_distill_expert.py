@@ -72,7 +72,7 @@ def test_without_an_expert_the_teacher_has_all_of_it(pruned_once: Bundle, tmp_pa
 
 def test_with_alpha_0_nobody_asks_the_teacher(pruned_once: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Not even when it stops getting better, and nobody plays although episodes have defaults."""
-    for function in ("label", "run_jobs"):
+    for function in ("write_labels", "run_jobs"):
         monkeypatch.setattr(f"vlatool.training.session.{function}", lambda *_: pytest.fail("the teacher was asked"))
     made = distilled(pruned_once, tmp_path / "out", alpha=0, patience=5, episodes=1200, student_episodes=300)
     training = training_of(made)

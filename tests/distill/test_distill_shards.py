@@ -160,7 +160,7 @@ def agent(rank: int, source: Bundle, policy: Path, place: Path) -> subprocess.Po
     ("distill.policy", {"shard": True}, "--shard lets several processes hold a part of the weights each; there is one"),
     ("distill.policy", {"shard": True, "processes": 2, "batch": 7},
      r"a batch of 7 makes no 2 equal parts \(processes 2, accumulate 1\)"),
-    ("prune.gradual", {"shard": True, "processes": 2, "steps": 12, "batch": 6}, "--shard cuts layers into parts"),
+    ("prune.gradual", {"shard": True, "processes": 2, "steps": 12, "batch": 6}, "--shard splits layers into parts"),
 ])  # fmt: skip
 def test_parts_that_cannot_be_are_refused(pruned_deep: Bundle, stage: str, options: dict[str, Any], words: str):
     with pytest.raises(RecipeError, match=words):

@@ -56,7 +56,7 @@ def test_a_path_that_does_not_exist_is_a_fault(check, page, code):
 @pytest.mark.parametrize(
     "code",
     ["vlatool/errors.py", "runtime/engine.py", "tests/plugins/", "vlatool.registry", "vlatool.runtime.ChunkQueue",
-     "_conv1x1", "reports/report.json"],
+     "_journal", "reports/report.json"],
 )  # fmt: skip
 def test_a_path_that_exists_is_none(check, page, code):
     assert not list(check.paths(page(f"See `{code}`.")))

@@ -501,17 +501,17 @@ def test_a_layer_keeps_its_name_when_a_normalisation_is_folded_into_it(normalise
 )
 def test_a_folded_layer_is_met_by_both_of_its_names(normalised, options):
     names = ["cnn.conv1/Conv", "cnn.conv2/Conv", "head/Gemm"]
-    assert StaticInt8(**options).selected(names, normalised) == {"cnn.conv2/Conv", "head/Gemm"}
+    assert StaticInt8(**options).select_nodes(names, normalised) == {"cnn.conv2/Conv", "head/Gemm"}
 
 
 @pytest.mark.parametrize(("part", "layer"), [("first", "cnn.conv1/Conv"), ("second", "cnn.conv2/Conv")])
 def test_a_part_may_name_either_of_them(normalised, part, layer):
-    assert StaticInt8(parts=(part,)).selected(["cnn.conv1/Conv", "cnn.conv2/Conv"], normalised) == {layer}
+    assert StaticInt8(parts=(part,)).select_nodes(["cnn.conv1/Conv", "cnn.conv2/Conv"], normalised) == {layer}
 
 
 def test_a_pattern_that_meets_neither_is_refused_with_the_near_names(normalised):
     with pytest.raises(RecipeError, match=r"No node matches 'cnn.conf1'; did you mean 'cnn.conv1/Conv'\?"):
-        StaticInt8(exclude=("cnn.conf1",)).selected(["cnn.conv1/Conv", "head/Gemm"], normalised)
+        StaticInt8(exclude=("cnn.conf1",)).select_nodes(["cnn.conv1/Conv", "head/Gemm"], normalised)
 
 
 @pytest.mark.parametrize("body", ["x / (x - x)", "torch.log(-x.abs() - 1)", "x * float('nan')", "x.exp() * 1e39"])

@@ -45,7 +45,7 @@ def test_a_description_beside_an_onnx_file_is_a_policy(policy_dir: Path):
 
 
 def test_describing_lets_no_code_run_and_opening_does(policy_dir: Path):
-    with trust.nothing_named():
+    with trust.forget_named():
         describe(policy_dir)
         assert not trust.is_named(policy_dir)
         open_source(str(policy_dir))

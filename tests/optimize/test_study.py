@@ -79,7 +79,7 @@ def test_two_machines_share_trials(url: str, monkeypatch: pytest.MonkeyPatch) ->
     assert asked[1] not in shapes
     assert there.under_way() == 1
     assert all(tried.elsewhere for tried in here.tried())
-    here.progress(asked[0], Tried(asked[1], 2.0, 0.0))
+    here.tell(asked[0], Tried(asked[1], 2.0, 0.0))
     assert len(there.tried()) == 5
 
 
@@ -262,7 +262,7 @@ def test_what_a_study_says_is_nobodys_measurement(url: str) -> None:
     """Whoever reaches a study can write into it: another speed-up, and the name of this process as the worker."""
     here = opened(url)
     (number, shape), (forged, other) = here.ask(9), here.ask(9)
-    here.progress(number, Tried(shape, 2.0, 0.01, note=""))
+    here.tell(number, Tried(shape, 2.0, 0.01, note=""))
     opened(url).tell(forged, Tried(other, 99.0, 0.0))
     assert {tried.speedup: tried.elsewhere for tried in here.tried()} == {2.0: False, 99.0: True}
     assert all(tried.elsewhere for tried in opened(url).tried()), "another run of the same command made none of them"
