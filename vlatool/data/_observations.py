@@ -10,8 +10,8 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.data._drawn import sentence, words_of
 from vlatool.data._not_finite import with_not_finite
+from vlatool.data._random_observations import sentence, words_of
 from vlatool.data._recording import Moment, Recording
 from vlatool.data._selections import calibration_recording
 from vlatool.errors import DataError

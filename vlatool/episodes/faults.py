@@ -17,7 +17,7 @@ def under_way(task: str, seed: int) -> str:
 
 
 @contextlib.contextmanager
-def named(task: str, seed: int | None = None, under: tuple[str, float] | None = None) -> Iterator[None]:
+def error_context(task: str, seed: int | None = None, under: tuple[str, float] | None = None) -> Iterator[None]:
     """Turn whatever is raised in this block into an error that names task, seed and remedy.
 
     Args:

@@ -9,7 +9,7 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.environment import World
-from vlatool.episodes.faults import named
+from vlatool.episodes.faults import error_context
 from vlatool.episodes.film import Camera, images_of
 from vlatool.episodes.play import STEP_LIMIT, EpisodesJob, Request
 from vlatool.files.messages import from_json, to_json
@@ -48,7 +48,7 @@ def probe(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]
     job, spec = asked.job, Bundle.open(Path(asked.bundle)).manifest.spec
     environment = call_factory(job.environment, Path(job.folder), {"task": job.task})
     try:
-        with named(job.task, job.seeds[0]):
+        with error_context(job.task, job.seeds[0]):
             observation, _ = World(environment, job.task, spec).reset(job.seeds[0])
             Camera(environment, job.task, spec)(observation)
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vlatool.accuracy.paired import Outcome
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import EpisodesJob

@@ -13,7 +13,7 @@ from vlatool.errors import PluginError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.gate.inputs import Inputs
 from vlatool.gate.plan import Need, Plan
-from vlatool.gate.timed import Timed
+from vlatool.gate.timing_processes import Timed
 from vlatool.measurement.agreement import Agreement
 from vlatool.report import Row
 from vlatool.stage.base import Context

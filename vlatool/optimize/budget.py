@@ -41,7 +41,7 @@ class Budget:
             return max(alike, key=lambda m: m.value, default=None)
         return row.get(quantity_of(self.name)) or row.get(ERROR_BASELINE_OF.quantity(self.name))
 
-    def required(self, row: Row) -> Measurement:
+    def require(self, row: Row) -> Measurement:
         """Return the measurement of a row that the budget is about.
 
         Raises:

@@ -43,7 +43,7 @@ def choose_apart(
         best = min(contest, key=lambda item: times[item.row.name])
         how = _by_prediction(times, engines)
     else:
-        rank = {engine: place for place, engine in enumerate(board)}
+        rank = {engine: index for index, engine in enumerate(board)}
         best = firsts[min(firsts, key=lambda engine: rank.get(engine, len(rank)))]
         how = "Its engine is the one that the board's profile names first: between the engines nothing was measured."
     if best is not base:

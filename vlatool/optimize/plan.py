@@ -12,8 +12,8 @@ from vlatool.files.printable import mask_passwords
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import fingerprint, matches
 from vlatool.machine.instruction_sets import BoardSet, board_set
-from vlatool.optimize.place import check_place
 from vlatool.optimize.recipe import Limits, Pruning, Recipe, StageList, stage_entries
+from vlatool.optimize.study_storage import check_storage
 from vlatool.sources import Source, source_stage
 from vlatool.stage.base import Stage, Transform
 from vlatool.stage.build import build_stage
@@ -126,7 +126,7 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
     if recipe.pruning.trials:
         _check_pruning(recipe.pruning, stage)
         if recipe.pruning.study:
-            check_place(recipe.pruning.study)
+            check_storage(recipe.pruning.study)
     elif study := recipe.pruning.study:
         raise RecipeError(f"The study {mask_passwords(study)} keeps trials; none are asked for.", "add --trials 8")
     plan = Plan(stage, export, candidates, recipe, profile, cache, fresh, source)

@@ -57,7 +57,7 @@ class Timing:
         own = {name: bundle for name, bundle in bundles.items() if name != base and engine_of(bundle) == ENGINE}
         rows, warnings = self._timed({name: bundle for name, bundle in bundles.items() if name not in own})
         theirs, more = self._timed({base: baseline, **own}, engine=ENGINE) if own else ({}, ())
-        return joined(rows, theirs, list(bundles), self.where), tuple(dict.fromkeys((*warnings, *more)))
+        return join_rows(rows, theirs, list(bundles), self.where), tuple(dict.fromkeys((*warnings, *more)))
 
     def _timed(self, bundles: Mapping[str, Bundle], torch: Sequence[Bundle] = (), engine: str = "") -> Timed:
         """Time bundles in one run, eager torch last; all in one engine where it is named."""
@@ -65,7 +65,7 @@ class Timing:
         against = tuple(bundle.path for bundle in [*(bundles[name] for name in others), *torch])
         effort = {"iterations": self.effort.iterations, "threads": self.effort.threads, "engine": engine}
         stage = Latency(against=against, duration=0, phase=False, **effort)
-        begun = now()
+        begun = utc_now()
         report = cached_measure(stage, bundles[base], self.cache, self.context, fresh=self.fresh)
         kept = (f"the latencies were measured before, at {report.created}; --fresh measures again",)
         rows = dict(zip(bundles, report.rows, strict=False))
@@ -82,7 +82,9 @@ class Timing:
         return named, (*report.warnings, *seen, *(kept if report.created < begun else ()))
 
 
-def joined(ours: Mapping[str, Row], theirs: Mapping[str, Row], order: Sequence[str], where: BoardSet) -> dict[str, Row]:
+def join_rows(
+    ours: Mapping[str, Row], theirs: Mapping[str, Row], order: Sequence[str], where: BoardSet
+) -> dict[str, Row]:
     """Return the rows of two runs, one for each engine, in an order.
 
     Args:
@@ -110,16 +112,16 @@ def _noted(row: Row, what: str) -> tuple[Measurement, ...]:
     return tuple(replace(number, note=note) if number.name == SPEEDUP.name else number for number in row.measurements)
 
 
-def placed(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> dict[str, Row]:
+def relabel_where(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> dict[str, Row]:
     """Return the rows with OpenVINO's measurements placed where they were taken, if that is a host that is confined."""
     if not where.confined:
         return dict(rows)
 
-    def moved(number: Measurement) -> Measurement:
+    def relabel(number: Measurement) -> Measurement:
         return replace(number, where=where.where) if number.origin == "measured" else number
 
     return {
-        name: replace(row, measurements=tuple(map(moved, row.measurements))) if engines.get(name) == ENGINE else row
+        name: replace(row, measurements=tuple(map(relabel, row.measurements))) if engines.get(name) == ENGINE else row
         for name, row in rows.items()
     }  # fmt: skip
 
@@ -146,6 +148,6 @@ def engine_of(bundle: Bundle) -> str:
     return bundle.manifest.engine or DEFAULT_ENGINE
 
 
-def now() -> str:
+def utc_now() -> str:
     """Return the time in UTC, ISO 8601, to the second."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")

@@ -172,7 +172,7 @@ class Engine:
         return {}
 
     @classmethod
-    def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
+    def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
         """Open a graph so that the time of its nodes is noted.
 
         Raises:

@@ -77,12 +77,12 @@ class Program:
         return bool(self._kept)
 
     @property
-    def kept(self) -> dict[str, Array]:
+    def kept_values(self) -> dict[str, Array]:
         """What the next inference is given of those before, value name -> array."""
         return dict(self._kept)
 
-    @kept.setter
-    def kept(self, values: Mapping[str, Array]) -> None:
+    @kept_values.setter
+    def kept_values(self, values: Mapping[str, Array]) -> None:
         self._kept = dict(values)
 
     def run(

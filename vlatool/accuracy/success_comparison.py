@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from vlatool.accuracy.doubt import Cause, Doubt
-from vlatool.accuracy.moved import compare_motion
+from vlatool.accuracy.motion_comparison import compare_motion
 from vlatool.errors import DataError
 from vlatool.measures import series, tables
 from vlatool.measures.motion import mean_of
@@ -146,7 +146,7 @@ def _refused(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
 
 def _places(table: list[dict[str, Any]], column: str, values: Sequence[str]) -> list[float]:
     """Return the place of each value in a table."""
-    places = {record[column]: float(place) for place, record in enumerate(table)}
+    places = {record[column]: float(index) for index, record in enumerate(table)}
     return [places[value] for value in values]
 
 
