@@ -81,8 +81,6 @@ def ort_product(ort: Any, precise: bool = False, written: bool = False) -> float
     """Return the smallest element of the product in ONNX Runtime, NaN when it fails; asked once in each process.
 
     Args:
-        ort: The module.
-        precise: With the option that makes it exact.
         written: Of the integer operator, in a session that rewrites as little of a graph as it can.
     """
     try:
@@ -118,8 +116,6 @@ def as_written(ort: Any, options: Any, precise: bool) -> None:
     """Set the options of a session that is to compute the operators of a graph as they are written.
 
     Args:
-        ort: The module.
-        options: ``SessionOptions``, which are changed.
         precise: Rewrite weights, so that integer products are exact: that takes the second level of rewriting, whose
             other parts merge float operators. The one that would make integer products of pairs stays off.
     """

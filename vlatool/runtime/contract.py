@@ -122,7 +122,6 @@ def check_graphs(manifest: Manifest, sessions: Mapping[str, Any], limit_mb: floa
     """Check what the open graphs declare against the spec, and against each other along the program.
 
     Args:
-        manifest: With spec and program.
         sessions: Graph name -> session; one without ``takes`` and ``gives`` is believed.
         limit_mb: Of what one graph takes and gives together, in 10^6 bytes.
 
@@ -225,7 +224,6 @@ class Outputs:
     """Checks the values of an inference against the outputs that a spec declares: shape, dtype, finite numbers.
 
     Args:
-        outputs: What is declared.
         action: Whether the first is checked for finite numbers, too; a policy does that in physical units.
         certain: Names of outputs whose shape and dtype need no check.
     """
@@ -272,7 +270,6 @@ def off_the_robot(where: str, fix: str) -> Iterator[None]:
 
     Args:
         where: Which observation it answers, the end of a sentence: ``observation 3``.
-        fix: What helps there.
     """
     try:
         yield

@@ -102,7 +102,6 @@ def messages(model: bytes | OpenFile, may_hold: MayHold) -> Iterator[tuple[str, 
     """Yield what every message in a serialized ``ModelProto`` is, where it starts and where it ends (``MESSAGES``).
 
     Args:
-        model: The bytes.
         may_hold: Of the bytes and the place of a message, whether to go into it.
 
     Raises:

@@ -27,9 +27,7 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
 
     Args:
         bundle: Where it is; its files are verified here.
-        graph: Which one.
         engine: A class of ``vlatool/runtime/engines``.
-        threads: Threads of the engine.
 
     Raises:
         BundleError: when a file is not what the manifest says or is changed meanwhile, or the graph keeps weights in a

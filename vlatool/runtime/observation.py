@@ -33,7 +33,6 @@ class ObservationEncoder:
     """Checks an observation against the spec, normalises it and turns text into ids.
 
     Args:
-        spec: The policy's spec.
         assets: Directory of statistics and tokenizers, or the bundle that has them.
 
     Raises:

@@ -34,8 +34,6 @@ class Program:
     """Runs the steps of a program over open sessions.
 
     Args:
-        steps: As in the manifest.
-        sessions: Graph name -> open session.
         seed: Seed of the noise; fresh entropy when None.
     """
 
@@ -96,9 +94,7 @@ class Program:
         When anything raises, ``finish`` included, the kept values and the noise generator are as they were before.
 
         Args:
-            values: Value name -> array.
             noise: Value name -> floating array, instead of what the program would draw.
-            finish: Makes the result from all values.
 
         Raises:
             DataError: when the noise does not fit.

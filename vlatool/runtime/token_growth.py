@@ -31,7 +31,6 @@ def growth(data: Mapping[str, Any], where: str) -> int:
     """Return how many times as long as a text its tokens, or what they are made of, can be.
 
     Args:
-        data: The content of a ``tokenizer.json``.
         where: What it is, as the start of a sentence.
 
     Raises:
