@@ -40,8 +40,6 @@ def time_limit(
     """Let whoever watches this process end it where a call of an environment, the block, takes too long.
 
     Args:
-        call: Its name: ``reset()``.
-        task: Of the environment.
         seed: Of the episode; None before there is one.
         timeout_s: Seconds that it may take; the limit ``environment_seconds`` when 0.
         when: How the call is related to the seed: ``at`` or ``after``.
@@ -63,9 +61,6 @@ class World:
     """Resets and steps an environment, and gives observations as the policy takes them.
 
     Args:
-        environment: What ``make(task=...)`` returned.
-        task: Of the environment, for messages.
-        spec: Of the policy.
         timeout_s: Seconds that a call may take; see ``time_limit``.
 
     Raises:

@@ -79,8 +79,6 @@ class Camera:
 
     Args:
         environment: Of ``render_mode`` ``rgb_array``, or any other.
-        task: For messages.
-        spec: Of the policy.
     """
 
     def __init__(self, environment: Any, task: str, spec: PolicySpec) -> None:
@@ -181,7 +179,6 @@ class Film:
     """The pictures of an episode, read some at a time, as often as wanted.
 
     Args:
-        files: In order.
         count: Pictures in all.
         size: Height and width of each.
     """

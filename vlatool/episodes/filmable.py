@@ -23,11 +23,6 @@ def check_filmable(bundles: Sequence[Bundle], job: EpisodesJob, context: Context
 
     A policy that takes images can be filmed without asking; otherwise the environment is made and reset once.
 
-    Args:
-        bundles: That will play.
-        job: With at least one seed.
-        context: For progress.
-
     Raises:
         DataError: when the environment renders nothing and a policy takes no image, or the environment fails.
         SourceError: when it ends the process that it runs in.

@@ -37,8 +37,6 @@ def run_jobs(
     """Play all episodes and return their outcomes in the order of the jobs, whoever plays them.
 
     Args:
-        bundle: Who acts.
-        jobs: What is played.
         engine: Of the runtime; the bundle's own when empty.
         context: Progress, workers, and what is kept of an interrupted run.
         tally: Counts successes for the progress; one of these jobs alone when None.
@@ -115,10 +113,7 @@ def check_opens(bundles: Sequence[Bundle], job: EpisodesJob, engine: str, contex
     """Refuse, before episodes are played, a bundle that cannot be: each is opened once, golden action and all.
 
     Args:
-        bundles: That will play.
-        job: Of any episodes.
         engine: Of the runtime; the bundle's own when empty.
-        context: Progress and workers.
 
     Raises:
         BundleError, GraphError: when a bundle was changed, or its engine computes something else here.

@@ -59,10 +59,6 @@ class EpisodesJob:
 
     Args:
         environment: ``path.py:make`` or ``package.module:make``.
-        folder: Where its file lies.
-        task: Of the environment.
-        seeds: One for each episode.
-        instruction: ``right`` or ``wrong``.
         control: Actions that do not look, in the place of the policy's; none when empty.
         noise: What is added to actions, so that a policy that is trained on the episodes has seen mistakes: the share
             of each action's standard deviation; for discrete actions, how often a random one is taken.
@@ -116,7 +112,6 @@ def jobs_for(job: EpisodesJob, tasks: Sequence[str], episodes: int, first_seed: 
 
     Args:
         job: What all of them have in common; task and seeds are of no account.
-        tasks: Of the environment.
         episodes: Rounded up to a multiple of the tasks.
         first_seed: Of each task.
     """
