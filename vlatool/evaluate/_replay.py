@@ -33,8 +33,6 @@ class Again:
 
     Args:
         outcomes: With their steps, the baseline's first; empty where it could not be played, or is shown by no report.
-        sentences: What the video shows.
-        warnings: Why there is no video.
     """
 
     outcomes: tuple[Outcome, ...] = ()
@@ -70,10 +68,7 @@ def played_again(
     All that is measured was measured before, so that nothing here fails: what cannot be shown is left out.
 
     Args:
-        job: Of any episodes.
         played: Outcomes of all episodes, the baseline's first, when there is one.
-        plays: Play jobs, one for each.
-        bundles: The variants.
         context: Says where the video is to be written.
     """
     paired = len(played) > 1

@@ -26,7 +26,6 @@ def played_until(
         jobs: Of ``jobs_for``: so many episodes at most.
         limit: The largest drop that passes, a share.
         baseline, variant: Play jobs with a bundle.
-        context: For progress.
 
     Returns:
         Both lists of outcomes, task by task in the order of their seeds, and the decision.
@@ -80,7 +79,6 @@ def sentence(decision: Decision, starts: int | None = None) -> str:
     """Return what was decided, and after how many pairs.
 
     Args:
-        decision: Of the pairs.
         starts: How many distinct ones there are; not told when None.
     """
     allowed = f"{100 * decision.limit:.3g} points"
