@@ -80,8 +80,6 @@ class Credibility:
 
     Args:
         verdict: credible, fails, or unknown.
-        ground: what decides.
-        name: name of the reference in sentences.
         own: number that decides; None where there is none.
         chance: what it is compared with, for success rates.
         table: what was compared with which floor.
@@ -135,7 +133,6 @@ def credibility(row: Row, name: str = "the reference") -> Credibility:
     Args:
         row: With ``success`` and ``success_chance`` (the better control on some of the same seeds), or ``skill_expert``
             and ``variation``, as the stages of ``vlatool.evaluate`` measure them.
-        name: What the sentences call it.
     """
     recorded, played = (replace(judged, name=name) for judged in (_recorded(row), _played(row)))
     table = (*recorded.table, *played.table)

@@ -61,7 +61,6 @@ def without_effect(name: str, played: Mapping[Disturbance, Played], undisturbed:
     """Yield a warning for each disturbance that changed nothing, so that what is kept under it shows nothing.
 
     Args:
-        name: Of the variant.
         played: Disturbance -> its episodes, of one seed after the other.
         undisturbed: Those of the same seeds without any.
     """
@@ -79,11 +78,7 @@ def _course(outcome: Outcome) -> tuple[Any, ...]:
 
 
 def worst_record(row: Row) -> tuple[Mapping[str, Any], str] | None:
-    """Return the line of the table under which most is lost, and its disturbance in words; None without a table.
-
-    Args:
-        row: Of ``with_disturbed``.
-    """
+    """Return the line of the table under which most is lost, and its disturbance in words; None without a table."""
     table = row.details.get(tables.UNDER)
     if not table:
         return None

@@ -28,7 +28,6 @@ class Doubt:
     """Why episodes decide nothing.
 
     Args:
-        cause: kind of the doubt.
         count: number of what there is too little of.
         of: number that it is compared with.
     """

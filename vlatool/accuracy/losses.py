@@ -79,7 +79,6 @@ def drop(
         episodes: (N,) episode of each sample; each sample is its own when None.
         confidence: Of the two-sided interval.
         answers: Whether losses are shares of wrong answers.
-        seed: Of the draws.
 
     Returns:
         (drop, low, high); positive is worse.
