@@ -24,10 +24,6 @@ class Evidence:
     """Both bundles, and what is measured of them, most of it when a claim first asks for it.
 
     Args:
-        candidate, baseline: bundles.
-        plan: what is measured, and how.
-        context: progress and workers.
-        inputs: observations for fresh processes.
         timed: processes that time both bundles, measured one by one (needs ``Need.TIMES``).
         answers: what both answer to observations drawn afresh; read it as ``agreement``.
     """

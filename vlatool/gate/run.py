@@ -38,8 +38,6 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
 
     Args:
         candidate, baseline: Bundles with graphs, of one spec.
-        gate: What is claimed.
-        context: Progress and workers.
         seed: Of everything that is drawn: observations, noise, the order in which bundles are loaded and called. Fresh
             entropy when None, so that nobody can know it before; the report says it.
 
