@@ -21,12 +21,7 @@ MAX_WORDS = 8
 
 
 class Observations(Sequence[dict[str, Any]]):
-    """Samples of a recording, each read when it is asked for.
-
-    Args:
-        recording: Where they are.
-        numbers: Which ones.
-    """
+    """Samples of a recording, each read when it is asked for."""
 
     def __init__(self, recording: Recording, numbers: Sequence[int]) -> None:
         self._recording = recording

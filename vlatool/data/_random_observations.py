@@ -52,7 +52,6 @@ class Drawer:
 
     Args:
         bundle: Whose spec, vocabulary and statistics say what an observation may hold.
-        recordings: Of that spec.
 
     Raises:
         SpecError: when statistics are missing or do not fit.
@@ -193,9 +192,6 @@ class Structures:
 
     Which one an input begins with is drawn. Extremes come in pairs of opposite signs, so that of eight observations one
     has each element at its highest, and one at its lowest: left to chance, some gates would see neither.
-
-    Args:
-        random: Of all values.
     """
 
     def __init__(self, random: np.random.Generator) -> None:
