@@ -27,7 +27,6 @@ def choose(
     of equally accurate ones the first, so that a repeated run chooses the same.
 
     Args:
-        judged: The baseline first.
         small: Whether memory was asked for: float32 is then no answer while a smaller plan keeps to the limits.
         engine: The engine of the board. When it is not the one that was measured here, predictions for the board rank
             the candidates, where every candidate has one.
@@ -143,8 +142,6 @@ def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
     """Return ``1.32x as fast as float32 (...)``, or that it is not faster, with the numbers for it.
 
     Args:
-        row: A variant.
-        base: What it is held against.
         elsewhere: The board that it is for, when it is not this host: only the ratio is told, as the table has it.
     """
     speedup = row.get(SPEEDUP)

@@ -24,8 +24,6 @@ def choose_apart(
     """Mark one row as chosen: the best of each engine by its own float32, and of those the one that is predicted best.
 
     Args:
-        judged: The baseline first.
-        engines: Name -> engine of each candidate.
         board: The board's engines, the preferred one first: they decide where predictions are missing.
         where: The set that OpenVINO is confined to.
         small: Whether memory was asked for, as for ``choose``.

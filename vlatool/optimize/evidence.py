@@ -39,11 +39,8 @@ def with_accuracy(
     """Return the rows with what recordings and episodes say of them.
 
     Args:
-        rows: Name -> row, of each bundle.
         bundles: Name -> bundle; the first is the float32 baseline, which the others are held against.
         loop: The episodes; None for recordings alone.
-        cache: Where measurements are kept.
-        context: Progress and workers.
         enough: Ends the episodes: candidates play in the order in which they would be chosen. All play when None.
 
     Raises:

@@ -30,12 +30,7 @@ class Miss(NamedTuple):
 
 @dataclass(frozen=True)
 class Held:
-    """What limits say of a row.
-
-    Args:
-        missed: limits that it does not keep.
-        warnings: what cannot be excluded.
-    """
+    """What limits say of a row."""
 
     missed: tuple[Miss, ...] = ()
     warnings: tuple[str, ...] = ()

@@ -59,14 +59,7 @@ class OptimizeJob:
     """A run in a process of its own.
 
     Args:
-        source: As the user named it.
-        profile, recipe: As JSON values.
-        cache: Where finished stages are kept.
-        draft: Where the bundle is written.
         fresh: Measure again, even what was measured before.
-        workers: Processes for episodes.
-        command: The command line.
-        launcher: Who starts these processes.
     """
 
     source: str
@@ -250,7 +243,6 @@ def judged_rows(
     """Hold every row against the limits of the plan, choose one, and say whether float32 does its task.
 
     Args:
-        plan: With limits and board.
         rows: Name -> row with everything that was measured and predicted, float32 first.
         engines: Name -> engine of each candidate; needed where the engines cannot be compared.
     """

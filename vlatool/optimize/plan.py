@@ -26,12 +26,9 @@ class Plan:
     """Stages, candidates and limits of one run.
 
     Args:
-        source: Of the policy.
         export: Stages from the policy to the float32 bundle; none where the source has graphs.
         candidates: Name -> stages from there, or from the policy for those that change its modules.
-        recipe: What was asked for.
         profile: The board; None for this host.
-        cache: Where finished stages are kept.
         fresh: Measure again, even what was measured before.
         typed: The source as the user named it.
     """
@@ -99,10 +96,7 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
     """Build and check every stage; nothing has run when this returns.
 
     Args:
-        source: See ``source_stage``.
         profile: The board; None for this host.
-        recipe: Candidates, limits and effort.
-        cache: Where finished stages are kept.
         fresh: Measure again, even what was measured before.
 
     Raises:

@@ -51,9 +51,7 @@ class PrunedSearch:
 
     Args:
         plan: With the recipe; its candidates are how a pruned policy may be quantized.
-        source: Of the policy.
         baseline: The whole policy in float32.
-        context: For progress.
     """
 
     plan: Plan
@@ -210,7 +208,6 @@ def with_measured(table: list[dict[str, Any]], rows: Mapping[str, Row]) -> list[
     """Return the trials with the speed-up and the drop of those that were measured in this run after all.
 
     Args:
-        table: Of ``PrunedSearch.run``.
         rows: Name -> row of each candidate, as it was measured.
     """
     lines = []

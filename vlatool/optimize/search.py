@@ -72,13 +72,10 @@ class Trial:
     """What a variant did when it was tried.
 
     Args:
-        name: Name of the candidate that it may become.
-        stages: What makes it.
         speedup: Against float32 in ONNX Runtime, or in ``engine`` where that is named, from a few inferences; 0 when it
             could not be made.
         error: Error on calibration observations, in the measure of the budget (or the nearest that needs no episodes).
         within: Whether ``error`` keeps to the budget.
-        note: Why it could not be made.
         engine: What its speed is compared within; empty where all plans are compared with each other.
         fastest: What its speed may be, as far as those few inferences say: the upper end of the interval.
     """
@@ -98,12 +95,7 @@ class Search:
     """One run of the search.
 
     Args:
-        baseline: The float32 bundle.
-        limits: The budget.
         profile: The board; None for this host.
-        cache: Where trials are kept.
-        context: For progress.
-        threads: Intra-op threads.
     """
 
     baseline: Bundle
@@ -322,7 +314,6 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
 
     Args:
         profile: The board; None for this host.
-        calibrated: Whether there is calibration data.
     """
     known = engine_names()
     board = known if profile is None else [name for name in known if name in profile.engines]

@@ -33,7 +33,6 @@ class Shape:
         width: Share of the multiply-accumulates that stays when units go.
         blocks: Blocks that stay of the longest stack; the others lose the same share.
         steps: Denoising steps that stay.
-        quantized: Name of the quantization that follows.
     """
 
     width: float
@@ -118,11 +117,7 @@ def space_of(
     """Find out what of a policy may be pruned, by trying.
 
     Args:
-        source: Of the policy.
-        pruning: What the recipe says.
         quantized: How a pruned policy may be quantized: name -> stages.
-        cache: Where what is tried is kept.
-        context: For progress.
 
     Raises:
         RecipeError: when nothing can be pruned; says why.

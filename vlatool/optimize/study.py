@@ -35,11 +35,9 @@ class Tried:
     """What a trial found.
 
     Args:
-        shape: What was tried.
         speedup: Against the whole policy in float32; 0 when it could not be made.
         drop: Accuracy lost, a share of episodes or in the measure of the budget; infinite when not known.
         training_s: Seconds that its training took, wherever that was; 0 for none.
-        note: Why it could not be made.
         elsewhere: Whether another machine or process tried it, so that all of this is what the study says.
         refused: Why it moves worse than the limits allow, or loses more on one task; empty when it does not.
         miss: By how much, as a multiple of the limits.
@@ -62,7 +60,6 @@ class Study:
         url: ``sqlite:///FILE``, ``mysql://``, ``postgresql://``, or a file for a journal.
         name: Of the study; trials of other policies or limits have another.
         allowed: Drop that a shape may have.
-        seed: Of what is tried next.
 
     Raises:
         UsageError: when it cannot be opened.
@@ -86,9 +83,6 @@ class Study:
 
     def agree_on(self, quantized: Mapping[str, StageList]) -> dict[str, StageList]:
         """Return how all who share the study quantize: what the first of them found.
-
-        Args:
-            quantized: What was found here.
 
         Raises:
             DataError: when the study holds something else.

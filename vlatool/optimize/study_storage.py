@@ -157,9 +157,6 @@ class FileLock:
 
     ``flock`` on a file beside it, which also holds between machines that share an NFS. Optuna's own lock is a link that
     a killed process leaves.
-
-    Args:
-        path: The file.
     """
 
     def __init__(self, path: Path) -> None:

@@ -32,14 +32,8 @@ def report_of(
     """Return the report.
 
     Args:
-        plan: With the limits and the board.
-        baseline: The float32 bundle.
         bundles: Name -> bundle of each candidate.
         judged: The rows, float32 first, one of them chosen.
-        failures: Rows of candidates that could not be made.
-        notes: What a reader should know of the measurements.
-        trust: Whether float32 does its task.
-        command: The command line.
     """
     chosen, where = chosen_of(judged), plan.board_set
     engine = engine_of(bundles.get(chosen.row.name, baseline))

@@ -30,10 +30,7 @@ class Timing:
     """How bundles are timed.
 
     Args:
-        effort: Inferences and threads.
         where: The set that OpenVINO is confined to, if it is.
-        cache: Where measurements are kept.
-        context: For progress.
         fresh: Measure again, even what was measured before.
     """
 
@@ -90,7 +87,6 @@ def join_rows(
     Args:
         ours: ONNX Runtime's plans by name, the baseline first.
         theirs: OpenVINO's plans by name, after the baseline as OpenVINO runs it.
-        order: The names, the baseline first.
         where: The set that OpenVINO is confined to.
     """
     base = order[0]
@@ -132,7 +128,6 @@ def foretold_by_engine(
     """Return what is predicted for each bundle on a board; where OpenVINO is confined, float32 in it as well.
 
     Args:
-        profile: The board.
         bundles: Name -> bundle, float32 first.
         where: The set that OpenVINO is confined to, if it is.
     """
