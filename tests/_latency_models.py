@@ -28,7 +28,7 @@ def points(points_template: Path) -> list[Point]:
 @pytest.fixture(scope="session")
 def sample(points: list[Point]) -> Sample:
     """The figures of processors and GPUs."""
-    return Sample.of([point for point in points if point.kind != "npu"])
+    return Sample.from_points([point for point in points if point.kind != "npu"])
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +36,7 @@ def model(points: list[Point]) -> LatencyModel:
     """A latency model that knows the made-up figures."""
     parts, bounds = {}, {}
     for part in ("processors", "npu"):
-        mine = Sample.of([point for point in points if (point.kind == "npu") == (part == "npu")])
+        mine = Sample.from_points([point for point in points if (point.kind == "npu") == (part == "npu")])
         parts[part] = TrainingData(rows_of(mine.questions, Shares()), mine.logs, Scales())
         bounds[part] = conformal(mine, Scales(), Shares())
     return LatencyModel(parts, dict.fromkeys(parts, Shares()), bounds, {"figures": len(points)})

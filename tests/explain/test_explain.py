@@ -246,7 +246,7 @@ def test_where_openvino_is_confined_float32_is_compared_in_it_too(fragile, made,
             opened.clear()
             found = _Findings(bundle, fragile, origin(bundle), observations_of(bundle, fragile, None, 2))
             _times(found, Options(runs=2), Context())
-            measure(bundle, fragile, [], found.seen.values, Path(), 1, Context())
+            measure(bundle, fragile, [], found.observations.values, Path(), 1, Context())
             assert (set(opened), len(opened)) == (engines, 2)
 
 

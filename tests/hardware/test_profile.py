@@ -384,8 +384,8 @@ def test_profiles_are_frozen() -> None:
 
 def test_listing_and_reading_load_no_inference_library() -> None:
     code = (
-        "import sys; from vlatool.hardware.profile import names, load_profile; "
-        "[load_profile(name) for name in names()]; "
+        "import sys; from vlatool.hardware.profile import load_profile, profile_names; "
+        "[load_profile(name) for name in profile_names()]; "
         "print(sorted({'torch', 'onnx', 'onnxruntime'} & {*sys.modules}))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

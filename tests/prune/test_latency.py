@@ -273,7 +273,7 @@ def test_an_empty_choice_is_refused(deep: Bundle):
     lambda: LatencyPruning(target_ms=1, threads=2).on(load_profile("pi5")),
 ])  # fmt: skip
 def test_threads_are_not_predicted(make: Callable[[], LatencyPruning]):
-    says = "--threads 2 is of measurements on this machine; .*5 is predicted as a whole"
+    says = "--threads 2 applies to measurements on this machine; .*5 is predicted as a whole"
     with pytest.raises(RecipeError, match=says) as caught:
         make()
     assert caught.value.fix.startswith("omit --threads")
