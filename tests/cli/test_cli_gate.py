@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 from vlatool.cli._console import MISSED_FIX
-from vlatool.gate import run, timed
+from vlatool.gate import run, timing_processes
 from vlatool.measurement.agreement import run_agreement
 from vlatool.measurement.pairs import Pairs
 
@@ -23,7 +23,7 @@ def slowdown(monkeypatch: pytest.MonkeyPatch):
 
     def make(share: float) -> None:
         monkeypatch.setattr(
-            timed,
+            timing_processes,
             "measure_pairs",
             lambda job, timeout: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * (job.seed % 10),) * 50),
         )

@@ -9,7 +9,7 @@ from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import npz, observations_for, read_recording, recorded_observations, synthetic_observations
-from vlatool.data._drawn import words_of
+from vlatool.data._random_observations import words_of
 from vlatool.errors import DataError
 
 COUNT = 6

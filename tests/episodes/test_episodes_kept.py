@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests._reach import GOOD, TREMBLES, bundle_of
-from vlatool.accuracy.paired import Outcome
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.jobs import outcomes_of
 from vlatool.episodes.play import STEP_LIMIT, EpisodesJob, Played

@@ -10,7 +10,7 @@ import pytest
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.episodes import film
-from vlatool.episodes.film import Camera, Film, Filmed, beside, fitted, images_of, world_of
+from vlatool.episodes.film import Camera, Film, Filmed, fit_picture, images_of, side_by_side, world_of
 from vlatool.errors import DataError
 
 CAMERA = TensorSpec("front", (1, 6, 8, 3), "uint8")
@@ -150,15 +150,15 @@ def test_a_picture_is_the_environments_own_no_longer(tmp_path: Path):
 
 def test_large_pictures_are_made_smaller_by_whole_factors():
     picture = np.random.default_rng(0).integers(0, 256, (1000, 961, 3), np.uint8)
-    small = fitted(picture)
+    small = fit_picture(picture)
     assert small.shape == (333, 320, 3)
     assert small[1, 2].tolist() == np.rint(picture[3:6, 6:9].reshape(-1, 3).mean(0)).tolist()
-    assert fitted(picture[:480, :480]).shape == (480, 480, 3)
-    assert fitted(np.ones((2, 2000, 3), np.uint8)).shape == (1, 400, 3)
+    assert fit_picture(picture[:480, :480]).shape == (480, 480, 3)
+    assert fit_picture(np.ones((2, 2000, 3), np.uint8)).shape == (1, 400, 3)
 
 
 def test_lower_pictures_have_black_below():
-    both = beside([np.full((2, 2, 3), 9, np.uint8), np.full((3, 1, 3), 7, np.uint8)])
+    both = side_by_side([np.full((2, 2, 3), 9, np.uint8), np.full((3, 1, 3), 7, np.uint8)])
     assert both[..., 0].tolist() == [[9, 9, 7], [9, 9, 7], [0, 0, 7]]
 
 

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.episodes.environment import limited, timeout_of
+from vlatool.episodes.environment import time_limit, timeout_of
 from vlatool.episodes.jobs import disturbances_of, run_jobs
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, SourceError
@@ -241,5 +241,5 @@ def test_a_page_is_read_by_another_process_and_nothing_else_is_believed():
 
 
 def test_a_process_that_nobody_looks_at_calls_as_ever():
-    with limited("reset()", "reach", 1, 0.01), watched_call("a", "b", "c", "d", 0.01):
+    with time_limit("reset()", "reach", 1, 0.01), watched_call("a", "b", "c", "d", 0.01):
         time.sleep(0.02)

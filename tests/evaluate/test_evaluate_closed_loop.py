@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.accuracy.success_comparison import Outcome, compare_success, success_row
 from vlatool.data import observations_for
 from vlatool.episodes import play
 from vlatool.episodes.jobs import run_jobs

@@ -15,7 +15,7 @@ from vlatool.episodes.play import EpisodesJob
 from vlatool.episodes.progress import Tally
 from vlatool.errors import DataError, RecipeError, UsageError
 from vlatool.evaluate import _player
-from vlatool.evaluate._told import told
+from vlatool.evaluate._sentences import sentences
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import load_profile
@@ -254,11 +254,11 @@ def test_a_ratio_that_would_be_printed_as_one_is_worth_no_sentence():
     row = Row(
         "int8", measurements=(ratio("path_length_ratio", 1.003), ratio("jerk_ratio", 1.04), ratio("steps_ratio", 1.004))
     )
-    assert list(told([row], "")) == ["Where both succeed, more than the baseline's: jerk 1.04x."]
+    assert list(sentences([row], "")) == ["Where both succeed, more than the baseline's: jerk 1.04x."]
 
 
 def under(*records: dict[str, object]) -> str:
-    return " ".join(told([Row("int8", details={"under disturbances": list(records)})], ""))
+    return " ".join(sentences([Row("int8", details={"under disturbances": list(records)})], ""))
 
 
 def test_it_succeeds_least_only_where_it_loses():

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from tests._reach import EAGER, bundle_of
-from vlatool.accuracy.paired import Outcome
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.episodes.play import EpisodesJob, jobs_for
 from vlatool.errors import UsageError
-from vlatool.evaluate._seen import seen_in_training
 from vlatool.evaluate._sequential import played_until, sentence
+from vlatool.evaluate._training_overlap import seen_in_training
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.stage.base import Context
 

@@ -17,7 +17,7 @@ from tests._reach import GOOD, TREMBLES, bundle_of, folder_of
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
 from vlatool.errors import DataError, OutputError, SourceError
-from vlatool.evaluate import _shown
+from vlatool.evaluate import _replay
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.render.filmstrip import BAR, EDGE, GAP, LINE
 from vlatool.report import Report
@@ -191,25 +191,25 @@ def test_a_disk_that_fills_up_costs_the_video_alone(reach: dict[str, Bundle], tm
     def full(*_: Any, **__: Any) -> str:
         raise OutputError("Cannot write a.gif: the disk is full.", "free some space")
 
-    monkeypatch.setattr(_shown, "write_video", full)
+    monkeypatch.setattr(_replay, "write_video", full)
     policy = world(tmp_path / "policy", DRAWN)
     report = evaluated(reach["trembles"], policy, tmp_path / "a.gif", baseline=reach["good"].path, episodes=2)
     assert report.warnings == ("a.gif was not written: Cannot write a.gif: the disk is full. (free some space)",)
-    monkeypatch.setattr(_shown, "SCRATCH", 1 << 62)
+    monkeypatch.setattr(_replay, "SCRATCH", 1 << 62)
     with pytest.raises(OutputError, match=r"A video needs some room in .*, and the disk is full"):
         evaluated(reach["trembles"], policy, tmp_path / "a.gif", baseline=reach["good"].path, episodes=2)
 
 
 def test_a_replay_that_goes_another_way_is_said(int8_bundle: Bundle, policy_template: Path, tmp_path: Path,
                                                 monkeypatch: pytest.MonkeyPatch):  # fmt: skip
-    real = _shown.stands_out
+    real = _replay.stands_out
 
     def other(outcomes: list[Any]) -> int:
         place = real(outcomes)
         outcomes[place] = replace(outcomes[place], success=True, steps=9)
         return place
 
-    monkeypatch.setattr(_shown, "stands_out", other)
+    monkeypatch.setattr(_replay, "stands_out", other)
     report = evaluated(int8_bundle, policy_template, tmp_path / "a.gif")
     assert "played again, tiny went another way than when it was measured (success at step 9)" in report.summary[-1]
 

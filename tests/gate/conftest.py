@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from vlatool.gate import timed as timed_module
-from vlatool.gate.timed import Timed
+from vlatool.gate import timing_processes as timed_module
+from vlatool.gate.timing_processes import Timed
 from vlatool.measurement.pairs import PairJob, Pairs
 from vlatool.stage.base import Context
 

@@ -10,7 +10,7 @@ import pytest
 from vlatool.bundle.bundle import DIGEST, Bundle, digest_of
 from vlatool.errors import BundleError, DataError, GraphError
 from vlatool.gate import run as run_gate_module
-from vlatool.gate import timed
+from vlatool.gate import timing_processes
 from vlatool.gate.claims.deadline import Deadline
 from vlatool.gate.claims.latency import Latency
 from vlatool.gate.claims.memory import Memory
@@ -38,7 +38,7 @@ def as_fast(monkeypatch: pytest.MonkeyPatch):
             shift = math.exp(0.001 * (job.seed % 5 - 2))
             return Pairs((2.0,) * 80, (2.0 * (1 + slowdown) * shift,) * 80)
 
-        monkeypatch.setattr(timed, "measure_pairs", measured)
+        monkeypatch.setattr(timing_processes, "measure_pairs", measured)
         monkeypatch.setattr(run_gate_module, "measure_agreement", lambda job, timeout: run_agreement(job))
         return jobs
 

@@ -11,7 +11,7 @@ from vlatool.measures.latency import OPENVINO_FLOAT32_P50
 from vlatool.optimize.choice_apart import choose_apart, on_board
 from vlatool.optimize.judge import Judged
 from vlatool.optimize.summary import about_int8, in_int8
-from vlatool.optimize.timings import IN_OPENVINO, joined, placed
+from vlatool.optimize.timings import IN_OPENVINO, join_rows, relabel_where
 from vlatool.report import Measurement, Row
 
 SET = compare_sets("old", ("avx2",), ("avx2", "avx512f", "avx512_vnni"), "AVX2")
@@ -105,7 +105,7 @@ def test_a_plan_on_the_board_takes_its_float32_by_its_own_speedup():
 def test_rows_of_two_runs_are_joined_and_say_what_their_ratios_are():
     ours = {"float32": Row("float32"), "ort": judged("ort", 5.0, 10.0, None).row}
     theirs = {"float32": judged("float32", 40.0, 40.0, None).row, "fast": judged("fast", 20.0, 40.0, None).row}
-    found = joined(ours, theirs, ["float32", "fast", "ort"], SET)
+    found = join_rows(ours, theirs, ["float32", "fast", "ort"], SET)
     assert list(found) == ["float32", "fast", "ort"]
     assert found["float32"].role == "baseline"
     reference = found["float32"].get(OPENVINO_FLOAT32_P50)
@@ -120,7 +120,7 @@ def test_rows_of_two_runs_are_joined_and_say_what_their_ratios_are():
 
 def test_what_was_measured_confined_is_placed_there_and_predictions_are_not():
     rows = {"fast": judged("fast", 20.0, 40.0, 30.0).row, "ort": judged("ort", 5.0, 10.0, 15.0).row}
-    found = placed(rows, ENGINES, SET)
+    found = relabel_where(rows, ENGINES, SET)
     assert {each.where for each in found["fast"].measurements} == {"this host, OpenVINO confined to AVX2", "old"}
     assert {each.where for each in found["ort"].measurements} == {"this host", "old"}
 

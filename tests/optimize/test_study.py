@@ -45,8 +45,8 @@ def test_first_come_the_shapes_of_the_space_then_others_none_of_them_twice(url: 
     shapes = drained(study, 8)
     assert shapes[:4] == list(SPACE.first())
     assert len(set(shapes)) == len(shapes) == 8
-    assert [tried.shape for tried in study.tried()] == shapes
-    assert all(tried.training_s == 60 and not tried.elsewhere for tried in study.tried())
+    assert [tried.shape for tried in study.ended_trials()] == shapes
+    assert all(tried.training_s == 60 and not tried.elsewhere for tried in study.ended_trials())
 
 
 def test_trials_end_when_the_whole_space_was_tried(tmp_path: Path) -> None:
@@ -78,9 +78,9 @@ def test_two_machines_share_trials(url: str, monkeypatch: pytest.MonkeyPatch) ->
     assert len(shapes) == 4, "one of five is under way here"
     assert asked[1] not in shapes
     assert there.under_way() == 1
-    assert all(tried.elsewhere for tried in here.tried())
+    assert all(tried.elsewhere for tried in here.ended_trials())
     here.tell(asked[0], Tried(asked[1], 2.0, 0.0))
-    assert len(there.tried()) == 5
+    assert len(there.ended_trials()) == 5
 
 
 @pytest.mark.parametrize("gone_process", [2**22 + 1, 0], ids=["no process", "another process has its number"])
@@ -113,7 +113,7 @@ def test_what_moves_worse_than_allowed_is_kept_with_the_reason(url: str) -> None
     number, shape = study.ask(9) or pytest.fail("no trial")
     study.tell(number, Tried(shape, 3.0, 0.0, refused="it needs 1.11x the steps", miss=0.05))
     drained(study, 9)
-    assert [each.refused for each in study.tried()] == ["it needs 1.11x the steps", *8 * [""]]
+    assert [each.refused for each in study.ended_trials()] == ["it needs 1.11x the steps", *8 * [""]]
     constraints = [trial.constraints["moves"] for trial in study._trials() if "moves" in trial.constraints]
     assert constraints == [0.05, *8 * [0.0]]
 
@@ -123,17 +123,17 @@ def test_what_could_not_be_made_says_why(url: str) -> None:
     for note, drop in (("no room", math.inf), ("", math.nan), ("", math.inf)):
         number, shape = study.ask(9) or pytest.fail("no trial")
         study.tell(number, Tried(shape, 1.0, drop, note=note))
-    assert [(tried.note, tried.speedup) for tried in study.tried()] == [
+    assert [(tried.note, tried.speedup) for tried in study.ended_trials()] == [
         ("no room", 0), *2 * [("its accuracy could not be measured", 0)]
     ]  # fmt: skip
     assert len(drained(study, 5)) == 2, "they count"
 
 
 def test_all_quantize_as_the_first_one_found(url: str) -> None:
-    assert Study(url, "tiny-1", 0.01, 0).agreed({"static_int8": INT8}) == {"static_int8": INT8, FLOAT32: ()}
+    assert Study(url, "tiny-1", 0.01, 0).agree_on({"static_int8": INT8}) == {"static_int8": INT8, FLOAT32: ()}
     other: Any = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
-    assert Study(url, "tiny-1", 0.01, 0).agreed(other) == {"static_int8": INT8, FLOAT32: ()}
-    assert Study(url, "tiny-2", 0.01, 0).agreed(other) == {**other, FLOAT32: ()}
+    assert Study(url, "tiny-1", 0.01, 0).agree_on(other) == {"static_int8": INT8, FLOAT32: ()}
+    assert Study(url, "tiny-2", 0.01, 0).agree_on(other) == {**other, FLOAT32: ()}
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_a_study_that_says_something_else_of_quantization_is_refused(tmp_path: P
     study = Study(str(tmp_path / "trials"), "tiny-1", 0.01, 0)
     study._study.set_user_attr("quantized", held)
     with pytest.raises(DataError, match="quanti"):
-        study.agreed({"static_int8": INT8})
+        study.agree_on({"static_int8": INT8})
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_trials_that_are_not_of_the_policy_are_refused(tmp_path: Path, params: A
     )
     study._study.add_trial(trial)
     with pytest.raises(DataError, match="Trial 4 of the study"):
-        study.tried()
+        study.ended_trials()
 
 
 def test_a_database_that_is_damaged_meanwhile_is_named(tmp_path: Path) -> None:
@@ -264,5 +264,7 @@ def test_what_a_study_says_is_nobodys_measurement(url: str) -> None:
     (number, shape), (forged, other) = here.ask(9), here.ask(9)
     here.tell(number, Tried(shape, 2.0, 0.01, note=""))
     opened(url).tell(forged, Tried(other, 99.0, 0.0))
-    assert {tried.speedup: tried.elsewhere for tried in here.tried()} == {2.0: False, 99.0: True}
-    assert all(tried.elsewhere for tried in opened(url).tried()), "another run of the same command made none of them"
+    assert {tried.speedup: tried.elsewhere for tried in here.ended_trials()} == {2.0: False, 99.0: True}
+    assert all(tried.elsewhere for tried in opened(url).ended_trials()), (
+        "another run of the same command made none of them"
+    )

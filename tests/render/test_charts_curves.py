@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from vlatool.accuracy.disturbed import drops_by_disturbance, with_disturbed, worst_record
-from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.accuracy.disturbance_drops import drops_by_disturbance, with_disturbed, worst_record
+from vlatool.accuracy.success_comparison import Outcome, compare_success, success_row
 from vlatool.render.formats.html import HtmlRenderer
 from vlatool.render.formats.markdown import MarkdownRenderer
 from vlatool.report import Report, Row

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from vlatool.accuracy.disturbed import with_disturbed
-from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.accuracy.disturbance_drops import with_disturbed
+from vlatool.accuracy.success_comparison import Outcome, compare_success, success_row
 from vlatool.render._format import label
 from vlatool.render.formats.html import HtmlRenderer
 from vlatool.render.formats.markdown import MarkdownRenderer

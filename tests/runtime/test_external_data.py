@@ -9,7 +9,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.errors import GraphError
-from vlatool.runtime.external_data import SMALL, OpenFile, external_files
+from vlatool.runtime.external_data import SEARCH_BYTES, OpenFile, external_files
 
 
 def external(name: str, location: str) -> onnx.TensorProto:
@@ -74,7 +74,7 @@ def test_every_place_where_a_model_may_keep_weights_is_found():
 def large() -> onnx.ModelProto:
     """The same model with much between its weights, some of which read like the key."""
     model = everywhere()
-    values = np.frombuffer(b"location" * SMALL, np.float32)
+    values = np.frombuffer(b"location" * SEARCH_BYTES, np.float32)
     for number in range(8):
         model.graph.initializer.insert(0, numpy_helper.from_array(values, f"large_{number}"))
         value = numpy_helper.from_array(values, f"constant_{number}")

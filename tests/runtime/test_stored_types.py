@@ -6,7 +6,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.errors import GraphError
-from vlatool.runtime.external_data import SMALL
+from vlatool.runtime.external_data import SEARCH_BYTES
 from vlatool.runtime.stored_types import FLOAT8, has_float8, lacks_zero_point
 
 
@@ -40,9 +40,9 @@ def nested(levels: int) -> bytes:
 
 
 @pytest.mark.parametrize("dtype", FLOAT8)
-@pytest.mark.parametrize("size", [1, 3 * SMALL])
+@pytest.mark.parametrize("size", [1, 3 * SEARCH_BYTES])
 def test_a_float8_initialiser_is_found_in_bytes_and_in_a_file(tmp_path: Path, dtype: int, size: int) -> None:
-    many = [numpy_helper.from_array(np.zeros(SMALL, np.float32), f"w{number}") for number in range(3)]
+    many = [numpy_helper.from_array(np.zeros(SEARCH_BYTES, np.float32), f"w{number}") for number in range(3)]
     model = model_of(graph_of(initializer=(*many, tensor(dtype, size))))
     (tmp_path / "model.onnx").write_bytes(model)
     assert has_float8(model)
@@ -56,7 +56,7 @@ def test_a_float8_constant_within_branches_is_found() -> None:
 
 @pytest.mark.parametrize("dtype", [TensorProto.INT8, TensorProto.UINT8])
 def test_bytes_of_other_tensors_that_look_like_the_type_are_none(tmp_path: Path, dtype: int) -> None:
-    content = bytes([16, 17, 16, 18]) * SMALL
+    content = bytes([16, 17, 16, 18]) * SEARCH_BYTES
     other = helper.make_tensor("\x10\x11", dtype, [len(content)], content, raw=True)
     model = model_of(graph_of(helper.make_node("Add", ["\x10\x11", "\x10\x11"], ["y"]), initializer=(other,)))
     (tmp_path / "model.onnx").write_bytes(model)
@@ -83,7 +83,9 @@ def test_what_is_no_graph_or_too_deep_is_refused(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_node_without_a_zero_point_is_found(tmp_path: Path, kind: str, inputs: list[str], lacks: bool) -> None:
-    many = [numpy_helper.from_array(np.zeros(SMALL, np.float32), f"MatMulInteger{number}") for number in range(3)]
+    many = [
+        numpy_helper.from_array(np.zeros(SEARCH_BYTES, np.float32), f"MatMulInteger{number}") for number in range(3)
+    ]
     model = model_of(graph_of(helper.make_node(kind, inputs, ["y"]), initializer=(*many,)))
     (tmp_path / "model.onnx").write_bytes(model)
     assert lacks_zero_point(model) is lacks

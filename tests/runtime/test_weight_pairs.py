@@ -9,7 +9,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError
-from vlatool.runtime.external_data import SMALL
+from vlatool.runtime.external_data import SEARCH_BYTES
 from vlatool.runtime.weight_pairs import weights_fit
 
 FITS, SATURATES = np.full((4, 2), 60, np.int8), np.full((4, 2), 100, np.int8)
@@ -100,7 +100,10 @@ def test_weights_that_are_not_in_the_file_may_saturate() -> None:
 
 
 def test_a_large_file_is_read_like_its_bytes(tmp_path: Path) -> None:
-    for values, right in ((np.full((SMALL, 3), 60, np.int8), True), (np.full((SMALL, 3), -100, np.int8), False)):
+    for values, right in (
+        (np.full((SEARCH_BYTES, 3), 60, np.int8), True),
+        (np.full((SEARCH_BYTES, 3), -100, np.int8), False),
+    ):
         content = model_of(product("MatMul"), w=values)
         (tmp_path / "model.onnx").write_bytes(content)
         assert weights_fit(content) is right

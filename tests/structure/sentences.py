@@ -24,7 +24,10 @@ METHODS = {"startswith", "endswith", "partition", "rpartition", "split", "find",
 PATTERNS = {"match", "search", "fullmatch", "findall"}
 COMPARISONS = (ast.Eq, ast.NotEq, ast.In, ast.NotIn)
 NOT_VERDICTS = {
-    ("accuracy/moved.py", "drop.note.partition(NAMED)"): "reads the name of a task where the same file writes it",
+    (
+        "accuracy/motion_comparison.py",
+        "drop.note.partition(WORST_TASK_PREFIX)",
+    ): "reads the name of a task where the same file writes it",
     (
         "cli/_failure.py",
         "error.fix.startswith(ON_A_ROBOT)",
@@ -33,7 +36,7 @@ NOT_VERDICTS = {
     ("cli/_side_by_side.py", "item.where == HERE"): "the name of a machine",
     ("render/_view.py", "where == 'this host'"): "the name of a machine",
     ("optimize/timings.py", "what != OWN_SET"): "the name of an instruction set",
-    ("optimize/trained.py", "name.endswith(TEACHER)"): "the name of a table",
+    ("optimize/training_records.py", "name.endswith(TEACHER)"): "the name of a table",
     ("render/sections/details.py", "title not in (UNDER, SHOWN)"): "the name of a table",
     ("render/sections/details.py", "title.startswith(AGAINST_BASELINE)"): "the name of a table",
     ("render/_format.py", "part.startswith(NO_INTERVAL)"): "shows the part of a note that the report's format marks",

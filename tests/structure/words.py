@@ -34,8 +34,10 @@ IRREGULAR, NO_PARTICIPLES, ADVERBS, NO_ADVERBS, PRONOUNS, ADJECTIVES = (
 )  # fmt: skip
 ALLOWED = {
     "chunked": "controller: the term of the field for executing a whole chunk of actions",
+    "disturbed": "claim `disturbed` of a gate: its module is found by this name",
     "interleaved": "kind of measurement: variants in turns",
     "paced": "kind of measurement: at a fixed rate",
+    "recorded": "command `evaluate recorded`: its module is found by this name",
     "sorted": "as in the standard library",
     "structured": "command `prune structured`",
 }

@@ -14,7 +14,7 @@ import pytest
 
 from tests._processes import below
 from tests._reach import GOOD, bundle_of
-from vlatool.accuracy.paired import Outcome
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.jobs import disturbances_of, run_jobs
 from vlatool.episodes.play import EpisodesJob

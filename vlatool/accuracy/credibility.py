@@ -16,7 +16,7 @@ DECIDE = (SUCCESS.name, SUCCESS_CHANCE.name, actions.SKILL_EXPERT.name, actions.
 """The measurements that the credibility rests on."""
 SKILL = 0.1
 """Share of the best constant action's error that a credible policy does not make, at least."""
-FEW = 100
+MIN_EPISODES = 100
 """Episodes below which a failure may be one of numbers alone."""
 VARIATION = 0.1
 """Least standard deviation of a credible policy's actions, by that of the expert's."""
@@ -80,8 +80,6 @@ class Credibility:
 
     Args:
         verdict: credible, fails, or unknown.
-        ground: what decides.
-        name: name of the reference in sentences.
         own: number that decides; None where there is none.
         chance: what it is compared with, for success rates.
         table: what was compared with which floor.
@@ -106,7 +104,7 @@ class Credibility:
         """What was found and what to look at, when it fails."""
         if not self.fails:
             return ()
-        few = self.own and self.chance and max(self.own.samples, self.chance.samples) < FEW
+        few = self.own and self.chance and max(self.own.samples, self.chance.samples) < MIN_EPISODES
         look_at = LOOK_AT_WORLD if self.ground in IN_EPISODES else LOOK_AT
         return (f"The reference fails, so that nothing can be held against it: {self._words}.",
                 f"{look_at} More --episodes would narrow that." if few else look_at)  # fmt: skip
@@ -135,7 +133,6 @@ def credibility(row: Row, name: str = "the reference") -> Credibility:
     Args:
         row: With ``success`` and ``success_chance`` (the better control on some of the same seeds), or ``skill_expert``
             and ``variation``, as the stages of ``vlatool.evaluate`` measure them.
-        name: What the sentences call it.
     """
     recorded, played = (replace(judged, name=name) for judged in (_recorded(row), _played(row)))
     table = (*recorded.table, *played.table)

@@ -8,14 +8,14 @@ from enum import Enum
 from vlatool.motion.measure import MIN_PAIRS
 from vlatool.stats.starts import MIN_DISTINCT_STARTS
 
-KNOWN = 0.9
+MIN_KNOWN_SHARE = 0.9
 """Share of the episodes in which both succeed that must tell a metric of both, or nothing is claimed of it."""
 
 
 class Cause(Enum):
     """What makes episodes decide nothing; the value is the text about it."""
 
-    RARELY_KNOWN = f"known of both in {{count}} of {{of}} common successes, and it takes {KNOWN:.0%}"
+    RARELY_KNOWN = f"known of both in {{count}} of {{of}} common successes, and it takes {MIN_KNOWN_SHARE:.0%}"
     MISSING_MORE_OFTEN = "missing in {count} common successes where the baseline has it, the other way round in {of}"
     FEW_STARTS = f"{{count}} distinct starts, and it takes {MIN_PAIRS}"
     REPEATED_STARTS = f"{{of}} episodes of {{count}} distinct starts decide nothing (from {MIN_DISTINCT_STARTS})"
@@ -28,7 +28,6 @@ class Doubt:
     """Why episodes decide nothing.
 
     Args:
-        cause: kind of the doubt.
         count: number of what there is too little of.
         of: number that it is compared with.
     """

@@ -16,7 +16,7 @@ ROUNDING = 1e-6
 """Share of the largest value below which a standard deviation is that of rounding."""
 LEAST_SCALE = 0.1
 """Share of the largest standard deviation that every element is taken to vary by at least."""
-STILL = 1e-3
+CONSTANT_SHARE = 1e-3
 """Share of the largest standard deviation below which all elements of a unit hold still."""
 
 
@@ -38,13 +38,14 @@ def scale_of(action: TensorSpec, wanted: Array) -> Array:
     """Return by what the difference of each element is divided, (A,); zeros where nothing wanted ever changes.
 
     It is the element's standard deviation, but no less than ``LEAST_SCALE`` of the largest among the elements of its
-    unit, or among all elements where what that unit does is less than ``STILL`` of it. An element that is meant to hold
-    still would else count for nothing, however far off it is, and one that jitters by a nanometre for everything.
+    unit, or among all elements where what that unit does is less than ``CONSTANT_SHARE`` of it. An element that is
+    meant to hold still would else count for nothing, however far off it is, and one that jitters by a nanometre for
+    everything.
     """
     spread = spread_of(wanted)
     units = action.units() if len(action.units()) == len(spread) else ("",) * len(spread)
     largest = {unit: max(value for value, own in zip(spread, units, strict=True) if own == unit) for unit in units}
-    moving = {unit: value if value > STILL * spread.max() else spread.max() for unit, value in largest.items()}
+    moving = {unit: value if value > CONSTANT_SHARE * spread.max() else spread.max() for unit, value in largest.items()}
     floors = np.asarray([LEAST_SCALE * moving[unit] for unit in units])
     return np.asarray(np.maximum(spread, floors), np.float64)
 
@@ -78,15 +79,14 @@ def drop(
         episodes: (N,) episode of each sample; each sample is its own when None.
         confidence: Of the two-sided interval.
         answers: Whether losses are shares of wrong answers.
-        seed: Of the draws.
 
     Returns:
         (drop, low, high); positive is worse.
     """
     difference = np.asarray(candidate, np.float64) - np.asarray(baseline, np.float64)
     groups = np.arange(len(difference)) if episodes is None else np.asarray(episodes)
-    _, place = np.unique(groups, return_inverse=True)
-    sums, counts = np.bincount(place, difference), np.bincount(place)
+    _, index = np.unique(groups, return_inverse=True)
+    sums, counts = np.bincount(index, difference), np.bincount(index)
     value = float(difference.mean())
     if not difference.any() and not answers:
         return value, 0.0, 0.0

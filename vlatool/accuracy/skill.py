@@ -30,7 +30,6 @@ def skill(action: TensorSpec, got: Array, expert: Array, episodes: Array | None 
     """Return the share of the best constant action's error that the policy does not make, with its interval.
 
     Args:
-        action: The action of the spec.
         got, expert: (N, T, A) in physical units, or (N, T) indices.
         episodes: (N,) episode of each sample.
     """

@@ -18,7 +18,7 @@ from vlatool.errors import BundleError, GraphError
 from vlatool.files.printable import printable
 from vlatool.files.verified_read import open_inside
 from vlatool.runtime.external_data import OpenFile, external_files
-from vlatool.runtime.graph_files import recorded
+from vlatool.runtime.graph_files import recorded_files
 from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
 from vlatool.stage.controls import controls
@@ -95,7 +95,7 @@ def describe(bundle: Bundle) -> list[str]:
 def _beside(bundle: Bundle, file: str) -> list[str]:
     """Return the files of a bundle in which a graph keeps weights; graphs may share one. None of a broken graph."""
     with contextlib.suppress(BundleError, GraphError), open_inside(bundle.path, file) as handle:
-        return recorded(bundle, file, external_files(OpenFile(handle)))
+        return recorded_files(bundle, file, external_files(OpenFile(handle)))
     return []
 
 

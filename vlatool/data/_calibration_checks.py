@@ -29,9 +29,7 @@ def calibration_checks(
     """Return a sentence for each thing that makes ranges of activations unreliable.
 
     Args:
-        recording: Checked against the spec.
         numbers: The samples that are used.
-        spec: Of the policy.
         assets: Directory of its statistics.
         wanted: Samples that were asked for; 0 when nobody did.
     """

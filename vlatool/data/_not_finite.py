@@ -30,9 +30,7 @@ def with_not_finite(
     Which values, follows from the number of the observation alone: twice is as once.
 
     Args:
-        spec: Of the policy.
         observations: Without the batch axis; they stay as they are.
-        first: Number of the first one.
     """
     tensors = takes_not_finite(spec)
     return [

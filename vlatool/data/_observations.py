@@ -10,8 +10,8 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.data._drawn import sentence, words_of
 from vlatool.data._not_finite import with_not_finite
+from vlatool.data._random_observations import sentence, words_of
 from vlatool.data._recording import Moment, Recording
 from vlatool.data._selections import calibration_recording
 from vlatool.errors import DataError
@@ -21,12 +21,7 @@ MAX_WORDS = 8
 
 
 class Observations(Sequence[dict[str, Any]]):
-    """Samples of a recording, each read when it is asked for.
-
-    Args:
-        recording: Where they are.
-        numbers: Which ones.
-    """
+    """Samples of a recording, each read when it is asked for."""
 
     def __init__(self, recording: Recording, numbers: Sequence[int]) -> None:
         self._recording = recording

@@ -62,8 +62,6 @@ def read_recording(path: Path, spec: PolicySpec, names: Mapping[str, str] | None
     """Read a recording with the reader that claims it.
 
     Args:
-        path: A file or a directory.
-        spec: What the policy takes and gives.
         names: Name in the spec -> name in the recording, where they differ.
 
     Raises:

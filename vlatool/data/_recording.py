@@ -30,7 +30,6 @@ class Moment:
 
     Args:
         observation: Without the batch axis.
-        number: In the recording.
         begins: Whether an episode begins with it.
         counts: Whether it was asked for; what comes before such a one is there for the values that a policy keeps.
     """
@@ -46,7 +45,6 @@ class Recording:
     """Observations with, where they were recorded, the expert's actions.
 
     Args:
-        path: Where it was read from.
         inputs: Input name -> array with a leading sample axis, physical values, text as a unicode array. Large ones
             are rows that stay on the disk.
         actions: (N, T, A) in physical units, or (N, T) indices for discrete actions; T is the policy's chunk, or fewer
@@ -84,11 +82,7 @@ class Recording:
         }
 
     def subset(self, chosen: NDArray[np.bool_]) -> Recording:
-        """Return some observations, in their order.
-
-        Args:
-            chosen: (N,) whether each observation is one of them.
-        """
+        """Return some observations, in their order."""
         inputs = {
             name: values.select(chosen) if isinstance(values, Rows) else values[chosen]
             for name, values in self.inputs.items()
@@ -145,9 +139,7 @@ def build_recording(
     """Build a recording from arrays, each checked against the spec.
 
     Args:
-        path: Where they were read from.
         arrays: Name -> array with a leading sample axis; actions as ``action`` or under their name, and ``episode``.
-        spec: What the policy takes and gives.
         names: Name in the spec -> name among the arrays, where they differ.
         times: (N,) float64 time stamps in seconds; None where the format has none.
 

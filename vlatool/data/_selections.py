@@ -28,7 +28,6 @@ class Selection:
     """Observations that serve one purpose.
 
     Args:
-        path: Recording that they are of.
         half: Index of a half, as ``halves`` gives them; None for the whole recording.
     """
 
@@ -56,7 +55,6 @@ class Recordings:
         """Return the observations for one of ``PURPOSES``, None where there are none.
 
         Args:
-            purpose: What they are for.
             named: Recording to use in the place of the bundle's own.
         """
         if whole := named or (self.evaluation if purpose == EVALUATION else None):
@@ -93,10 +91,7 @@ def carry_recording(path: Path, purpose: str, spec: PolicySpec, out: Path) -> No
     """Put a recording into a new bundle, once it was found to fit, while it has the name that the user knows.
 
     Args:
-        path: A file or a directory.
         purpose: One of ``PURPOSES``.
-        spec: What the policy takes and gives.
-        out: Directory of the bundle.
 
     Raises:
         DataError: when it cannot be read, or does not fit the spec.

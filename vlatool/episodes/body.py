@@ -138,7 +138,6 @@ def series_of(track: Track, action: TensorSpec) -> dict[str, tuple[float, ...]]:
     """Return what a drawing of an episode needs: ``position.x``, ``action.NAME`` and ``fresh``, of its first steps.
 
     Args:
-        track: Of the episode.
         action: Of the spec; a discrete one gives ``action``, its index.
     """
     series = {"fresh": track.fresh.astype(float)}

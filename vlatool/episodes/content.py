@@ -31,13 +31,7 @@ MOST_FILES = 20_000
 
 
 def circumstances(bundle: Bundle, engine: str, job: EpisodesJob) -> dict[str, Any]:
-    """Return what decides the outcomes of all jobs of a bundle in one environment, as JSON values.
-
-    Args:
-        bundle: Who acts.
-        engine: That was named; empty for the bundle's own.
-        job: Any of the jobs: its environment counts.
-    """
+    """Return what decides the outcomes of all jobs of a bundle in one environment, as JSON values."""
     built = identities().get(engine or bundle.manifest.engine)
     return {
         "bundle": bundle.hash,

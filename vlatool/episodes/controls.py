@@ -29,7 +29,6 @@ class Blind:
     Args:
         control: ``random``: actions drawn from those that the policy gives (discrete: from all labels);
             ``constant``: always the mean of them (discrete: the most frequent one).
-        action: The action of the spec.
         answers: Actions that the policy gives, (M, A) or (M,).
     """
 

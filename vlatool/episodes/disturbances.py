@@ -27,8 +27,6 @@ class DisturbedController:
     with a probability, so that the last one that came is seen again.
 
     Args:
-        controller: The controller that acts.
-        spec: Names the inputs and the control rate.
         kind: ``delay``, ``dropped_frames``, or another, which changes nothing here.
         strength: 1 is 50 ms, or a tenth of the observations; 0 nothing.
     """

@@ -23,7 +23,7 @@ def timeout_of(environment: Mapping[str, Any]) -> float:
     """Return how long a call may take, in seconds, as a declaration of an environment says it; 0 where it does not.
 
     Raises:
-        DataError: when it is no number above 0.
+        DataError: when it is not a number above 0.
     """
     value = environment.get("timeout", 0.0)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e9:
@@ -34,14 +34,12 @@ def timeout_of(environment: Mapping[str, Any]) -> float:
     return float(value)
 
 
-def limited(
+def time_limit(
     call: str, task: str, seed: int | None = None, timeout_s: float = 0.0, when: str = "at"
 ) -> contextlib.AbstractContextManager[None]:
     """Let whoever watches this process end it where a call of an environment, the block, takes too long.
 
     Args:
-        call: Its name: ``reset()``.
-        task: Of the environment.
         seed: Of the episode; None before there is one.
         timeout_s: Seconds that it may take; the limit ``environment_seconds`` when 0.
         when: How the call is related to the seed: ``at`` or ``after``.
@@ -63,10 +61,7 @@ class World:
     """Resets and steps an environment, and gives observations as the policy takes them.
 
     Args:
-        environment: What ``make(task=...)`` returned.
-        task: Of the environment, for messages.
-        spec: Of the policy.
-        timeout_s: Seconds that a call may take; see ``limited``.
+        timeout_s: Seconds that a call may take; see ``time_limit``.
 
     Raises:
         DataError: when it has no ``reset`` and ``step``, or ``reset`` takes no ``seed``.
@@ -81,7 +76,7 @@ class World:
         lacking = [name for name in ("reset", "step") if not callable(getattr(environment, name, None))]
         if lacking:
             raise DataError(
-                f"What makes {self._name} gives {_told(environment)}, which has no {' and no '.join(lacking)}.",
+                f"What makes {self._name} gives {_describe(environment)}, which has no {' and no '.join(lacking)}.",
                 "return an environment with gymnasium's interface",
             )
         if not _takes_seed(environment.reset):
@@ -101,7 +96,7 @@ class World:
             answer = self._environment.reset(seed=seed)
         if not (isinstance(answer, tuple) and len(answer) == 2):
             raise DataError(
-                f"reset() of {self._name} gives {_told(answer)}; it must give (observation, info).",
+                f"reset() of {self._name} gives {_describe(answer)}; it must give (observation, info).",
                 f"return observation, {{}}: that is gymnasium's interface, and no longer gym's; {GUIDE}",
             )
         return self._observation(answer[0]), answer[1]
@@ -118,7 +113,7 @@ class World:
             answer = self._environment.step(action.copy() if isinstance(action, np.ndarray) else action)
         if not (isinstance(answer, tuple | list) and len(answer) == 5):
             raise DataError(
-                f"step() of {self._name} gives {_told(answer)}; it must give five values: observation, reward, "
+                f"step() of {self._name} gives {_describe(answer)}; it must give five values: observation, reward, "
                 "terminated, truncated, info.",
                 f"return observation, reward, done, False, info where gym had observation, reward, done, info; {GUIDE}",
             )
@@ -164,7 +159,7 @@ class World:
             self._own("disturb")(kind, strength, seed)
 
     def _limited(self, call: str) -> contextlib.AbstractContextManager[None]:
-        return limited(call, self._task, self._seed, self._timeout_s)
+        return time_limit(call, self._task, self._seed, self._timeout_s)
 
     def _own(self, name: str) -> Any:
         """Return an attribute of the environment, or of what its wrappers wrap."""
@@ -192,8 +187,8 @@ class World:
         if len(self._inputs) == 1:
             return {self._inputs[0]: observation}
         raise DataError(
-            f"{self._name.capitalize()} gives its observation as {_told(observation)}, without names; the policy takes "
-            f"{', '.join(self._inputs)}.",
+            f"{self._name.capitalize()} gives its observation as {_describe(observation)}, without names; the policy "
+            f"takes {', '.join(self._inputs)}.",
             f"wrap it, so that it gives a dict with these names; {GUIDE}",
         )
 
@@ -211,7 +206,7 @@ def _takes_seed(reset: Any) -> bool:
     )
 
 
-def _told(value: Any) -> str:
+def _describe(value: Any) -> str:
     """Return what something is, as a part of a sentence."""
     if isinstance(value, tuple | list):
         return f"{len(value)} values"

@@ -17,11 +17,10 @@ def under_way(task: str, seed: int) -> str:
 
 
 @contextlib.contextmanager
-def named(task: str, seed: int | None = None, under: tuple[str, float] | None = None) -> Iterator[None]:
+def error_context(task: str, seed: int | None = None, under: tuple[str, float] | None = None) -> Iterator[None]:
     """Turn whatever is raised in this block into an error that names task, seed and remedy.
 
     Args:
-        task: Of the environment.
         seed: Of the episode; None before there is one.
         under: Disturbance and strength; None where there is none.
 
@@ -48,8 +47,6 @@ def locate(
     """Add to an error what of task and seed it does not name, and what to do where it does not say it.
 
     Args:
-        error: It is changed.
-        task: Of the environment.
         seed: Of the episode; None where it is not known.
         seeds: Which ones come into question then, a part of a sentence.
         under: Disturbance and strength; None where there is none.

@@ -14,7 +14,7 @@ from vlatool.bundle.spec import PolicySpec
 from vlatool.episodes.environment import GUIDE, World
 from vlatool.errors import DataError
 
-AGAIN = "run the command again for the video; its episodes count as they are"
+RUN_AGAIN = "run the command again for the video; its episodes count as they are"
 
 Picture = NDArray[np.uint8]
 RENDERS = "rgb_array"
@@ -79,8 +79,6 @@ class Camera:
 
     Args:
         environment: Of ``render_mode`` ``rgb_array``, or any other.
-        task: For messages.
-        spec: Of the policy.
     """
 
     def __init__(self, environment: Any, task: str, spec: PolicySpec) -> None:
@@ -101,16 +99,16 @@ class Camera:
             picture = np.asarray(self._environment.render())
             if not is_picture(picture):
                 raise DataError(
-                    f"{self._name} renders {_told(picture)} after it rendered pictures.",
+                    f"{self._name} renders {_describe_array(picture)} after it rendered pictures.",
                     "let render() give pictures of one size and type at each step, or leave --video out",
                 )
-            return fitted(picture)
+            return fit_picture(picture)
         if not self._images:
             raise DataError(
                 f"{self._name} has no picture to film: {self._why}, and the policy takes no image.",
                 f"make it with render_mode='{RENDERS}', so that render() gives uint8 (height, width, 3); {GUIDE}",
             )
-        return fitted(beside([self._image(observation, name) for name in self._images]))
+        return fit_picture(side_by_side([self._image(observation, name) for name in self._images]))
 
     def _can_render(self) -> bool:
         """Say whether the environment renders; when not, note why."""
@@ -123,14 +121,16 @@ class Camera:
         except Exception as error:  # the seam: a user's environment may raise anything
             self._why = f"render() raises {type(error).__name__}"
             return False
-        self._why = f"render() gives {_told(picture)}"
+        self._why = f"render() gives {_describe_array(picture)}"
         return is_picture(picture)
 
     def _image(self, observation: Mapping[str, Any], name: str) -> Picture:
         """Return an image of an observation: the last one of a history."""
         value = np.asarray(observation[name]) if name in observation else np.zeros(0)
         if value.ndim < 3 or not value.size or not is_picture(value.reshape(-1, *value.shape[-3:])[-1]):
-            raise DataError(f"{self._name} gives '{name}' as {_told(value)}; a picture is uint8 (..., H, W, 3).", GUIDE)
+            raise DataError(
+                f"{self._name} gives '{name}' as {_describe_array(value)}; a picture is uint8 (..., H, W, 3).", GUIDE
+            )
         return np.array(value.reshape(-1, *value.shape[-3:])[-1])
 
 
@@ -179,7 +179,6 @@ class Film:
     """The pictures of an episode, read some at a time, as often as wanted.
 
     Args:
-        files: In order.
         count: Pictures in all.
         size: Height and width of each.
     """
@@ -198,7 +197,7 @@ class Film:
         files = tuple(sorted(folder.glob("*.npy")))
         shapes = [_read(file).shape for file in files]
         if not shapes or len({shape[1:] for shape in shapes}) != 1:
-            raise DataError("The process that played the episode has left no pictures of it.", AGAIN)
+            raise DataError("The process that played the episode has left no pictures of it.", RUN_AGAIN)
         return cls(files, sum(shape[0] for shape in shapes), (shapes[0][1], shapes[0][2]))
 
     def __iter__(self) -> Iterator[Picture]:
@@ -211,9 +210,9 @@ def _read(file: Path) -> NDArray[np.uint8]:
     try:
         pictures = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{file.name}, pictures of an episode, cannot be read: {error}.", AGAIN) from error
+        raise DataError(f"{file.name}, pictures of an episode, cannot be read: {error}.", RUN_AGAIN) from error
     if not isinstance(pictures, np.ndarray) or pictures.ndim != 4 or not len(pictures) or not is_picture(pictures[0]):
-        raise DataError(f"{file.name} holds no pictures of an episode.", AGAIN)
+        raise DataError(f"{file.name} holds no pictures of an episode.", RUN_AGAIN)
     return pictures
 
 
@@ -228,7 +227,7 @@ def is_picture(value: NDArray[Any]) -> bool:
     return value.dtype == np.uint8 and value.ndim == 3 and value.shape[-1] == 3 and value.size > 0
 
 
-def fitted(picture: Picture) -> Picture:
+def fit_picture(picture: Picture) -> Picture:
     """Return a picture of at most ``MOST_SIDE`` pixels a side: the means of square blocks of a larger one."""
     factor = -(-max(picture.shape[:2]) // MOST_SIDE)
     if factor < 2:
@@ -239,11 +238,11 @@ def fitted(picture: Picture) -> Picture:
     return np.asarray(np.rint(blocks.mean(axis=(1, 3))), np.uint8)
 
 
-def beside(pictures: list[Picture]) -> Picture:
+def side_by_side(pictures: list[Picture]) -> Picture:
     """Return pictures beside each other, lower ones with black below."""
     height = max(picture.shape[0] for picture in pictures)
     return np.concatenate([np.pad(one, ((0, height - one.shape[0]), (0, 0), (0, 0))) for one in pictures], axis=1)
 
 
-def _told(value: NDArray[Any]) -> str:
+def _describe_array(value: NDArray[Any]) -> str:
     return f"{value.dtype} of the shape {list(value.shape)}"

@@ -9,7 +9,7 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.environment import World
-from vlatool.episodes.faults import named
+from vlatool.episodes.faults import error_context
 from vlatool.episodes.film import Camera, images_of
 from vlatool.episodes.play import STEP_LIMIT, EpisodesJob, Request
 from vlatool.files.messages import from_json, to_json
@@ -22,11 +22,6 @@ def check_filmable(bundles: Sequence[Bundle], job: EpisodesJob, context: Context
     """Refuse to film episodes of which there is no picture.
 
     A policy that takes images can be filmed without asking; otherwise the environment is made and reset once.
-
-    Args:
-        bundles: That will play.
-        job: With at least one seed.
-        context: For progress.
 
     Raises:
         DataError: when the environment renders nothing and a policy takes no image, or the environment fails.
@@ -48,7 +43,7 @@ def probe(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]
     job, spec = asked.job, Bundle.open(Path(asked.bundle)).manifest.spec
     environment = call_factory(job.environment, Path(job.folder), {"task": job.task})
     try:
-        with named(job.task, job.seeds[0]):
+        with error_context(job.task, job.seeds[0]):
             observation, _ = World(environment, job.task, spec).reset(job.seeds[0])
             Camera(environment, job.task, spec)(observation)
     finally:

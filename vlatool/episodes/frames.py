@@ -22,12 +22,7 @@ def file_of(folder: Path, name: str) -> Path:
 
 
 class FrameRecorder:
-    """A policy that records what another one is given, as the graphs take it, when asked.
-
-    Args:
-        policy: The policy that infers.
-        encode: The encoder of its observations.
-    """
+    """A policy that records what another one is given, as the graphs take it, when asked."""
 
     def __init__(self, policy: Policy, encode: ObservationEncoder) -> None:
         self.spec: PolicySpec = policy.spec
@@ -69,8 +64,6 @@ class Noisy:
     """A controller that adds noise to the actions of another one.
 
     Args:
-        controller: The controller that acts.
-        action: The action of the spec.
         noise: Share of the standard deviation of each element of the action that is added, normally distributed; for
             discrete actions the probability of one drawn from all labels.
         answers: Actions that the policy gives, (M, A) or (M,).

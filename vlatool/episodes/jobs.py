@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vlatool.accuracy.paired import Outcome
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
 from vlatool.data import recordings_of
 from vlatool.episodes import play
@@ -27,7 +27,7 @@ from vlatool.workers import PROCESSES, Folder, Work, launcher
 
 OWN_FILES = "let the environment write to its own files alone, and run the command again"
 
-HERE = play.__name__
+PLAY_MODULE = play.__name__
 Outcomes = tuple[Outcome, ...]
 
 
@@ -37,8 +37,6 @@ def run_jobs(
     """Play all episodes and return their outcomes in the order of the jobs, whoever plays them.
 
     Args:
-        bundle: Who acts.
-        jobs: What is played.
         engine: Of the runtime; the bundle's own when empty.
         context: Progress, workers, and what is kept of an interrupted run.
         tally: Counts successes for the progress; one of these jobs alone when None.
@@ -75,7 +73,7 @@ def _played(
     alone = jobs[0].record or not bundle.manifest.graphs  # what is written, or imported, is on this machine
     name, count = (PROCESSES, 1) if alone and context.launcher != PROCESSES else (context.launcher, context.workers)
 
-    def done(at: int, answer: Any) -> None:
+    def keep_answer(at: int, answer: Any) -> None:
         kept.put(numbers[at], kept.whole(numbers[at], outcomes_of(answer, jobs[at])))
 
     begun: set[str] = set()
@@ -83,12 +81,12 @@ def _played(
 
     def tell(what: str, share: float | None) -> None:
         if what.startswith(OUTCOME_PREFIX):
-            kept.one(what.removeprefix(OUTCOME_PREFIX))
+            kept.keep_outcome(what.removeprefix(OUTCOME_PREFIX))
         else:
             begun.add(what) if what in ours else context.progress(what, share)
 
     work = _work("play", bundle, jobs, engine, PRELOAD, "close", away=name != PROCESSES)
-    answers = launcher(name, count).answers(work, tell, done, context.notes.append)
+    answers = launcher(name, count).answers(work, tell, keep_answer, context.notes.append)
     with contextlib.closing(answers):
         for job in jobs:
             with _located(job, begun, away=name != PROCESSES):
@@ -115,10 +113,7 @@ def check_opens(bundles: Sequence[Bundle], job: EpisodesJob, engine: str, contex
     """Refuse, before episodes are played, a bundle that cannot be: each is opened once, golden action and all.
 
     Args:
-        bundles: That will play.
-        job: Of any episodes.
         engine: Of the runtime; the bundle's own when empty.
-        context: Progress and workers.
 
     Raises:
         BundleError, GraphError: when a bundle was changed, or its engine computes something else here.
@@ -163,7 +158,7 @@ def _work(
         folders = (Folder(path, (MANIFEST, DIGEST, *_needed(bundle, jobs))), *_placed(jobs[0])[1])
         jobs = [_placed(job)[0] for job in jobs]
     requests = [to_json(Request(path, engine, play.STEP_LIMIT, job)) for job in jobs]
-    return Work(f"{HERE}:{function}", requests, about, preload, last and f"{HERE}:{last}", folders)
+    return Work(f"{PLAY_MODULE}:{function}", requests, about, preload, last and f"{PLAY_MODULE}:{last}", folders)
 
 
 def _needed(bundle: Bundle, jobs: Sequence[EpisodesJob]) -> list[str]:
@@ -279,7 +274,7 @@ class _Kept:
         own = {outcome.seed: outcome for outcome in played}
         return tuple(own.get(seed) or self._single[job.task, seed] for seed in job.seeds)
 
-    def one(self, text: str) -> None:
+    def keep_outcome(self, text: str) -> None:
         """Keep an episode of a job that is not finished, as a child tells it."""
         if self._store is None:
             return

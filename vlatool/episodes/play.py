@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.accuracy.paired import Outcome
 from vlatool.accuracy.success import Success
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import observations_for
 from vlatool.episodes.body import Body, series_of
 from vlatool.episodes.controls import ANSWERED_OBSERVATIONS, Blind, answers_of
 from vlatool.episodes.disturbances import BUILT_IN_DISTURBANCES, DisturbedController
-from vlatool.episodes.environment import GUIDE, World, limited
-from vlatool.episodes.faults import named, under_way
+from vlatool.episodes.environment import GUIDE, World, time_limit
+from vlatool.episodes.faults import error_context, under_way
 from vlatool.episodes.film import world_of
 from vlatool.episodes.frames import FrameRecorder, Noisy
 from vlatool.errors import DataError, require
@@ -59,10 +59,6 @@ class EpisodesJob:
 
     Args:
         environment: ``path.py:make`` or ``package.module:make``.
-        folder: Where its file lies.
-        task: Of the environment.
-        seeds: One for each episode.
-        instruction: ``right`` or ``wrong``.
         control: Actions that do not look, in the place of the policy's; none when empty.
         noise: What is added to actions, so that a policy that is trained on the episodes has seen mistakes: the share
             of each action's standard deviation; for discrete actions, how often a random one is taken.
@@ -116,7 +112,6 @@ def jobs_for(job: EpisodesJob, tasks: Sequence[str], episodes: int, first_seed: 
 
     Args:
         job: What all of them have in common; task and seeds are of no account.
-        tasks: Of the environment.
         episodes: Rounded up to a multiple of the tasks.
         first_seed: Of each task.
     """
@@ -149,7 +144,7 @@ class Worker:
         if key != self._key:
             self.close()
             arguments = {"task": job.task, **({} if job.instruction == "right" else {"instruction": job.instruction})}
-            with limited("make()", job.task, None, job.timeout_s):
+            with time_limit("make()", job.task, None, job.timeout_s):
                 self._environment = call_factory(job.environment, Path(job.folder), arguments)
             self._key, self._job = key, job
         return self._environment
@@ -239,10 +234,10 @@ def disturbances(request: Mapping[str, Any], _tell: Tell) -> list[str]:
     """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
     asked = from_json(Request, request)
     spec = Bundle.open_lazily(asked.bundle).manifest.spec
-    with limited("make()", asked.job.task, None, asked.job.timeout_s):
+    with time_limit("make()", asked.job.task, None, asked.job.timeout_s):
         environment = call_factory(asked.job.environment, Path(asked.job.folder), {"task": asked.job.task})
     try:
-        with named(asked.job.task):
+        with error_context(asked.job.task):
             return list(World(environment, asked.job.task, spec).disturbances())
     finally:
         _close(environment, asked.job)
@@ -251,7 +246,7 @@ def disturbances(request: Mapping[str, Any], _tell: Tell) -> list[str]:
 def _close(environment: Any, job: EpisodesJob) -> None:
     """Close an environment; one that fails to close has done its work all the same, one that never ends has not."""
     last = job.seeds[-1] if job.seeds else None
-    with contextlib.suppress(Exception), limited("close()", job.task, last, job.timeout_s, "after"):
+    with contextlib.suppress(Exception), time_limit("close()", job.task, last, job.timeout_s, "after"):
         environment.close()
 
 
@@ -267,7 +262,7 @@ def _episode(
     world: World, controller: Controller, spec: PolicySpec, job: EpisodesJob, seed: int, limit: int
 ) -> Outcome:
     task = job.task
-    with named(task, seed, (job.disturb, job.strength) if job.disturb else None):
+    with error_context(task, seed, (job.disturb, job.strength) if job.disturb else None):
         if job.disturb and job.disturb not in BUILT_IN_DISTURBANCES:
             world.disturb(job.disturb, job.strength, seed)
         observation, info = world.reset(seed)

@@ -25,10 +25,8 @@ def loop_latency(bundle: Bundle, board: str, engine: str, context: Context) -> M
     """Return how long an inference takes.
 
     Args:
-        bundle: A bundle with graphs.
         board: Profile that it is predicted for; measured on this machine with one thread when empty.
         engine: Engine of the runtime; the bundle's own when empty.
-        context: Progress, and the results of an interrupted run.
 
     Raises:
         ProfileError: when there is no such board.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vlatool.accuracy.paired import Outcome
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import EpisodesJob
@@ -19,10 +19,8 @@ class Player:
     """Plays jobs with a bundle, and tells how it does beside the one that it is paired with.
 
     Args:
-        bundle: The policy that acts.
         latency: Latency of its actions in the control loop; none when None.
         engine: Engine of the runtime; the bundle's own when empty.
-        context: Progress, which says whose it is, and workers.
         most: Largest number of episodes that it will play.
         baseline: The player of the same episodes before, if there is one.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from vlatool.accuracy.paired import Outcome
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.episodes.play import EpisodesJob, jobs_for
 from vlatool.measures import series
 from vlatool.measures.success import SUCCESS_DROP
@@ -26,7 +26,6 @@ def played_until(
         jobs: Of ``jobs_for``: so many episodes at most.
         limit: The largest drop that passes, a share.
         baseline, variant: Play jobs with a bundle.
-        context: For progress.
 
     Returns:
         Both lists of outcomes, task by task in the order of their seeds, and the decision.
@@ -50,7 +49,7 @@ def played_until(
         decision = comparison.judge(lost, won, after, independent_starts(starts))
         if has_too_few_starts(starts) and decision.verdict in ("pass", "fail"):
             decision = replace(decision, verdict=GO_ON if after < comparison.most else "inconclusive")
-        context.progress(f"{after} pairs: {told(decision)}", after / comparison.most)
+        context.progress(f"{after} pairs: {describe_drop(decision)}", after / comparison.most)
         if decision.over:
             break
     if decision is None:
@@ -62,7 +61,7 @@ def _in_order(outcomes: list[Outcome], tasks: Sequence[str]) -> list[Outcome]:
     return sorted(outcomes, key=lambda outcome: (tasks.index(outcome.task), outcome.seed))
 
 
-def told(decision: Decision) -> str:
+def describe_drop(decision: Decision) -> str:
     """Return the drop with its interval."""
     return f"the drop is {100 * decision.drop:.3g} points ({100 * decision.low:.3g} to {100 * decision.high:.3g})"
 
@@ -80,14 +79,13 @@ def sentence(decision: Decision, starts: int | None = None) -> str:
     """Return what was decided, and after how many pairs.
 
     Args:
-        decision: Of the pairs.
         starts: How many distinct ones there are; not told when None.
     """
     allowed = f"{100 * decision.limit:.3g} points"
     what = {"pass": f"is at most {allowed}", "fail": f"is more than {allowed}"}.get(decision.verdict)
     seen = f"{decision.pairs} of at most {decision.most} paired episodes"
     seen += f" ({starts} distinct starts): " if starts is not None else ": "
-    seen += told(decision)
+    seen += describe_drop(decision)
     if what is None:
         return f"Whether the drop is more than {allowed} is not decided by {seen}."
     return f"The drop {what}, decided by {seen}, with an error of 2.5 % at most."

@@ -12,9 +12,9 @@ from pydantic import Field, field_validator
 from pydantic_core import PydanticCustomError
 
 from vlatool.accuracy.credibility import Credibility, credibility
-from vlatool.accuracy.disturbed import with_disturbed, without_effect
-from vlatool.accuracy.paired import Outcome, compare_success, repeated_starts, success_row, with_chance
-from vlatool.accuracy.shown import with_episode
+from vlatool.accuracy.disturbance_drops import with_disturbed, without_effect
+from vlatool.accuracy.episode_choice import with_episode
+from vlatool.accuracy.success_comparison import Outcome, compare_success, repeated_starts, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.environment import timeout_of
@@ -25,10 +25,10 @@ from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._loop_latency import loop_latency, with_latency
 from vlatool.evaluate._names import BASELINE, names_of
 from vlatool.evaluate._player import Player
-from vlatool.evaluate._seen import FIX, seen_in_training
+from vlatool.evaluate._replay import check_video_of, played_again
+from vlatool.evaluate._sentences import sentences
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
-from vlatool.evaluate._shown import check_video_of, played_again
-from vlatool.evaluate._told import told
+from vlatool.evaluate._training_overlap import FIX, seen_in_training
 from vlatool.files.resumable_work import Store
 from vlatool.machine.host import cache_directory, fingerprint
 from vlatool.measures import series, with_derived
@@ -181,9 +181,9 @@ class ClosedLoop(Measure):
         """
         if context.unfinished is None:
             return self._measured(source, context)
-        place = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
-        context.unfinished.append(place)
-        with Store.open(place) as kept:
+        directory = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
+        context.unfinished.append(directory)
+        with Store.open(directory) as kept:
             report = self._measured(source, replace(context, store=kept))
         taken = f"{kept.taken} of the {kept.asked} episodes are of an interrupted run of the same command."
         notes = [*([taken] if kept.taken else []), *([kept.problem] if kept.problem else [])]
@@ -239,7 +239,7 @@ class ClosedLoop(Measure):
         text = f"{row.value(SUCCESS):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
         decided = (sentence(decision, distinct_starts(row.raw[series.START])),) if decision else ()
-        summary = (*believed.sentences, *decided, text, *told(rows, self.board), *again.sentences)
+        summary = (*believed.sentences, *decided, text, *sentences(rows, self.board), *again.sentences)
         doubts = (*repeated_starts(row), *seen_in_training(bundles, jobs), *found_wrong(source))
         warnings = (*believed.warnings, *doubts, *again.warnings, *dict.fromkeys(context.notes))
         return Report("evaluate", title, verdict, summary, tuple(rows), environment=fingerprint(), warnings=warnings)

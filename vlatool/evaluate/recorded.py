@@ -37,16 +37,16 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 MAKE_OTHERWISE = (
-    "make the bundle otherwise (vlatool explain says where it differs), or remove that sample if it is no observation"
+    "make the bundle otherwise (vlatool explain says where it differs), or remove a sample that is not an observation"
 )
-KEPT = 4
+MAX_REFERENCES = 4
 NEVER_VARIES = {
     EXPERT.name: "the expert's action never varies, so no error relative to its spread",
     BASELINE.name: "the baseline's action never varies, so no error relative to its spread",
 }
 """Why an error against the expert or the baseline is unknown."""
 REFERENCES: dict[tuple[Any, ...], Array] = {}
-"""What baselines gave, of the last ``KEPT``."""
+"""What baselines gave, of the last ``MAX_REFERENCES``."""
 
 
 class Recorded(Measure):
@@ -82,10 +82,10 @@ class Recorded(Measure):
         names = names_of(bundles)
         if self.baseline:
             reference = self._reference(bundles[0], source, recording, indices, context)
-            own = alone(action, reference, expert, episodes)
+            own = single_policy_measurements(action, reference, expert, episodes)
             rows.append(with_derived(Row(names[0], "baseline", measurements=tuple(own))))
         actions = run_recorded(source, recording, indices, self.engine, context)
-        measurements = alone(action, actions, expert, episodes)
+        measurements = single_policy_measurements(action, actions, expert, episodes)
         if reference is not None:
             measurements += compare(action, actions, reference, BASELINE)
         rows.append(with_derived(Row(names[-1], measurements=tuple(measurements))))
@@ -109,7 +109,7 @@ class Recorded(Measure):
         key = (baseline.hash, spec, file, tuple(indices), self.engine)
         if key not in REFERENCES:
             context.progress("running the baseline", None)
-            while len(REFERENCES) >= KEPT:
+            while len(REFERENCES) >= MAX_REFERENCES:
                 REFERENCES.pop(next(iter(REFERENCES)))
             REFERENCES[key] = run_recorded(baseline, recording, indices, self.engine, context)
             REFERENCES[key].setflags(write=False)
@@ -138,7 +138,9 @@ def _worst(row: Row, reference: Reference) -> str:
     return f"{element} is off by {worst.value:.3g}{unit} on average"
 
 
-def alone(action: TensorSpec, got: Array, expert: Array | None, episodes: Array | None) -> list[Measurement]:
+def single_policy_measurements(
+    action: TensorSpec, got: Array, expert: Array | None, episodes: Array | None
+) -> list[Measurement]:
     """Return what the actions of one policy say without another one: against the expert's, and how much they vary."""
     measured = compare(action, got, expert, EXPERT)
     if expert is not None:

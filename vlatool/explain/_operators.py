@@ -88,7 +88,7 @@ def profile(
     library: type[Engine] = engine_class(engine)
     with scratch_directory() as scratch:
         sessions: dict[str, Profiled] = {
-            name: library.profiled(bundle.file(graph.file), threads, graph.compute, scratch / name)
+            name: library.open_profiled(bundle.file(graph.file), threads, graph.compute, scratch / name)
             for name, graph in bundle.manifest.graphs.items()
         }
         policy = Policy(bundle, Program(bundle.manifest.program, sessions, seed=0), engine)

@@ -13,7 +13,7 @@ from vlatool.errors import PluginError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.gate.inputs import Inputs
 from vlatool.gate.plan import Need, Plan
-from vlatool.gate.timed import Timed
+from vlatool.gate.timing_processes import Timed
 from vlatool.measurement.agreement import Agreement
 from vlatool.report import Row
 from vlatool.stage.base import Context
@@ -24,10 +24,6 @@ class Evidence:
     """Both bundles, and what is measured of them, most of it when a claim first asks for it.
 
     Args:
-        candidate, baseline: bundles.
-        plan: what is measured, and how.
-        context: progress and workers.
-        inputs: observations for fresh processes.
         timed: processes that time both bundles, measured one by one (needs ``Need.TIMES``).
         answers: what both answer to observations drawn afresh; read it as ``agreement``.
     """

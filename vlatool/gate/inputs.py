@@ -18,7 +18,7 @@ TIMING, AGREEMENT, MEMORY = range(3)
 """Purposes, each of which draws observations of its own."""
 LARGEST = 128_000_000
 """Bytes of the observations of one process; fewer are drawn where each is large."""
-LEAST = 8
+MIN_OBSERVATIONS = 8
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Inputs:
     def draw(self, count: int, purpose: int, number: int = 0) -> list[Drawn]:
         """Return observations for a process; the same for the same seed, purpose and number."""
         random = np.random.default_rng([self.seed, purpose, number])
-        first = self._drawer.draw(min(count, LEAST), random)
+        first = self._drawer.draw(min(count, MIN_OBSERVATIONS), random)
         size = max(1, *(sum(np.asarray(value).nbytes for value in one.observation.values()) for one in first))
         return first + self._drawer.draw(max(0, min(count, LARGEST // size) - len(first)), random)
 

@@ -24,7 +24,6 @@ class Plan:
     Args:
         needs: evidence that any claim looks at.
         engine: name of the engine; the one that each bundle was made for when empty.
-        threads: number of intra-op threads.
         also_threads: further numbers of threads at which latency is examined.
         warmup, pairs: calls of each bundle in a process that times both, before those that count, and of these.
         seconds: time after which such a process begins no further pair.

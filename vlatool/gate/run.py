@@ -15,7 +15,7 @@ from vlatool.gate.evidence import Evidence
 from vlatool.gate.inputs import AGREEMENT, Inputs
 from vlatool.gate.plan import Need, Plan
 from vlatool.gate.same import check
-from vlatool.gate.timed import Timed
+from vlatool.gate.timing_processes import Timed
 from vlatool.gate.verdict import Outcome, Reason, Verdict, worst
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
@@ -38,8 +38,6 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
 
     Args:
         candidate, baseline: Bundles with graphs, of one spec.
-        gate: What is claimed.
-        context: Progress and workers.
         seed: Of everything that is drawn: observations, noise, the order in which bundles are loaded and called. Fresh
             entropy when None, so that nobody can know it before; the report says it.
 
@@ -147,6 +145,6 @@ def _summary(name: str, results: Sequence[_Result]) -> tuple[str, ...]:
     }[worst(result.verdict.outcome for result in results)]
     no_reference = any(result.verdict.reason is Reason.REFERENCE_FAILS for result in results)
     if no_reference and not named[Outcome.FAIL]:
-        first = f"Nothing is said about {name}, for the baseline is no reference: it does not do its task."
+        first = f"Nothing is said about {name}, for the baseline is not a reference: it does not do its task."
     ordered = sorted(results, key=lambda result: list(Outcome).index(result.verdict.outcome))
     return (first, *(f"{each.title}: {each.verdict.outcome.value}: {each.sentence}." for each in ordered))

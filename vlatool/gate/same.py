@@ -16,7 +16,7 @@ from vlatool.graph.random_ops import random_operators
 
 MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite")
 """What a robot relies on; files of statistics and tokenizers may differ."""
-RATE = ("control_hz", "chunk", "executed")
+RATE = ("control_hz", "chunk", "executed_actions")
 FEWER_STEPS = "prune.steps"
 ACCURACY = "accuracy"
 """The claim that alone says what steps are worth."""
@@ -46,7 +46,7 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
     differs = _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs)
     if differs := differs or (_scene(mine, theirs) if _plays_what_bundles_name(gate) else ""):
         raise BundleError(
-            f"{candidate.path} and {baseline.path} are no versions of one policy: {differs}.",
+            f"{candidate.path} and {baseline.path} are not versions of one policy: {differs}.",
             "name a candidate and a baseline that were made from the same policy",
         )
     _check_golden(candidate, baseline)

@@ -39,10 +39,8 @@ class Judgement:
 
     Args:
         outcome: pass, fail or inconclusive.
-        title: name of the number in sentences.
         measured: number with its interval and count; None where there is none.
         limit: largest value that passes (or least, where more is better).
-        reason: what decides.
         facts: further values that sentences state.
     """
 
@@ -60,10 +58,7 @@ class Verdict:
 
     Args:
         outcome: pass, fail or inconclusive.
-        judgements: what it rests on.
         measurements: numbers for the candidate's row of the report.
-        baseline: numbers for the baseline's row.
-        reason: what decides.
         facts: further values that sentences state.
     """
 
@@ -99,7 +94,6 @@ def judge_interval(measured: Measurement, limit: float, title: str = "", **facts
     Args:
         measured: number with its interval.
         limit: largest value that passes.
-        title: name of the number in sentences.
         facts: further values that sentences state.
     """
     outcome = Outcome.INCONCLUSIVE

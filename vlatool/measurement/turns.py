@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import DRAWN, RECORDED, Drawer, Drawn, read_drawn
+from vlatool.data import RANDOM_KIND, RECORDED_KIND, Drawer, Drawn, read_drawn
 from vlatool.errors import GraphError, VlatoolError
 from vlatool.measurement.answers import Answers, vary_observation
 from vlatool.measurement.child import serve
@@ -269,7 +269,7 @@ def sequence(pool: Sequence[int], order: random.Random) -> list[int]:
 def describe(drawn: Drawn, exact: bool = True) -> str:
     """Return an observation in a few words; one that is not ``exact`` is varied."""
     texts = [f"{name} {value!r}" for name, value in drawn.observation.items() if isinstance(value, str)]
-    kind = {RECORDED: "as recorded", DRAWN: "drawn"}.get(drawn.kind, "recorded otherwise")
+    kind = {RECORDED_KIND: "as recorded", RANDOM_KIND: "drawn"}.get(drawn.kind, "recorded otherwise")
     return ", ".join([kind, *([] if exact else ["slightly varied"]), *texts])
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
 from vlatool.bundle.module_bundle import export_command
 from vlatool.bundle.program import ProgramStep
-from vlatool.data import PLAYED, observations_for
+from vlatool.data import OBSERVATIONS_FILE, observations_for
 from vlatool.errors import BundleError, GraphError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of
 from vlatool.module.description import read_location
@@ -219,9 +219,9 @@ def write_modules(
         (out / TRAINING).write_text(json.dumps(training) + "\n", encoding="utf-8")
     carry_over(source, out)
     if played is not None:
-        (out / PLAYED).parent.mkdir(exist_ok=True)
-        (out / PLAYED).unlink(missing_ok=True)  # carried over, it may be the file of the bundle before
-        save_npz(out / PLAYED, played)
+        (out / OBSERVATIONS_FILE).parent.mkdir(exist_ok=True)
+        (out / OBSERVATIONS_FILE).unlink(missing_ok=True)  # carried over, it may be the file of the bundle before
+        save_npz(out / OBSERVATIONS_FILE, played)
     shutil.copyfile(source.path / LOCATION, out / LOCATION)
     build = (*history(source), {**made_by, "input": source.hash})
     program = source.manifest.program if program is None else program

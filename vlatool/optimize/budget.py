@@ -24,7 +24,6 @@ class Budget:
 
     Args:
         name: The measurement, or ``unit:UNIT`` for the worst action element of that unit.
-        value: The largest allowed.
     """
 
     name: str
@@ -41,7 +40,7 @@ class Budget:
             return max(alike, key=lambda m: m.value, default=None)
         return row.get(quantity_of(self.name)) or row.get(ERROR_BASELINE_OF.quantity(self.name))
 
-    def required(self, row: Row) -> Measurement:
+    def require(self, row: Row) -> Measurement:
         """Return the measurement of a row that the budget is about.
 
         Raises:
@@ -64,8 +63,6 @@ def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:
     """Return the budget on recorded observations.
 
     Args:
-        limits: What was asked for.
-        spec: The policy's.
         proxy: Whether something else decides in the end (episodes, the expert's actions), so that a plan is only worth
             a look when it is near float32.
     """

@@ -13,7 +13,7 @@ from vlatool.optimize.judge import Judged, p50
 from vlatool.report import Row
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
 
-LEAST = 1.005
+MIN_RATIO = 1.005
 """Ratio of the medians from which on two decimals do not say 1.00."""
 
 
@@ -27,7 +27,6 @@ def choose(
     of equally accurate ones the first, so that a repeated run chooses the same.
 
     Args:
-        judged: The baseline first.
         small: Whether memory was asked for: float32 is then no answer while a smaller plan keeps to the limits.
         engine: The engine of the board. When it is not the one that was measured here, predictions for the board rank
             the candidates, where every candidate has one.
@@ -85,11 +84,11 @@ def _best(inside: list[Judged], base: Judged, origin: str, small: bool) -> tuple
     best = _fastest(contest, origin)
     first = min(p50(item.row, origin) for item in contest)
     tied = f"within {TIE - 1:.0%} of the fastest inside the limits and the most accurate of those"
-    place = "the fastest inside the limits" if p50(best.row, origin) == first else tied
+    reason = "the fastest inside the limits" if p50(best.row, origin) == first else tied
     if not is_faster(best.row, base.row, origin):
         why = "memory was asked for" if small and base.within else f"{base.row.name} is outside: {base.row.reason}"
-        place = f"{place}, though not faster than {base.row.name}: {why}"
-    return best, f"{place} ({origin}); {best.row.reason}"
+        reason = f"{reason}, though not faster than {base.row.name}: {why}"
+    return best, f"{reason} ({origin}); {best.row.reason}"
 
 
 def is_faster(row: Row, base: Row, origin: str = "measured") -> bool:
@@ -98,7 +97,7 @@ def is_faster(row: Row, base: Row, origin: str = "measured") -> bool:
     Measured: the interval of the speed-up lies above 1, and the speed-up that is printed does not round to 1.00.
     Predicted: the prediction is; intervals of predictions for one board overlap, since they share their error.
     """
-    if ratio(row, base, origin) < LEAST:
+    if ratio(row, base, origin) < MIN_RATIO:
         return False
     speedup = row.get(SPEEDUP)
     return origin == "predicted" or (speedup is not None and speedup.low is not None and speedup.low > 1.0)
@@ -143,8 +142,6 @@ def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
     """Return ``1.32x as fast as float32 (...)``, or that it is not faster, with the numbers for it.
 
     Args:
-        row: A variant.
-        base: What it is held against.
         elsewhere: The board that it is for, when it is not this host: only the ratio is told, as the table has it.
     """
     speedup = row.get(SPEEDUP)

@@ -24,8 +24,6 @@ def choose_apart(
     """Mark one row as chosen: the best of each engine by its own float32, and of those the one that is predicted best.
 
     Args:
-        judged: The baseline first.
-        engines: Name -> engine of each candidate.
         board: The board's engines, the preferred one first: they decide where predictions are missing.
         where: The set that OpenVINO is confined to.
         small: Whether memory was asked for, as for ``choose``.
@@ -43,7 +41,7 @@ def choose_apart(
         best = min(contest, key=lambda item: times[item.row.name])
         how = _by_prediction(times, engines)
     else:
-        rank = {engine: place for place, engine in enumerate(board)}
+        rank = {engine: index for index, engine in enumerate(board)}
         best = firsts[min(firsts, key=lambda engine: rank.get(engine, len(rank)))]
         how = "Its engine is the one that the board's profile names first: between the engines nothing was measured."
     if best is not base:

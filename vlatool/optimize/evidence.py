@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from vlatool.accuracy.paired import compare_success, with_chance
+from vlatool.accuracy.success_comparison import compare_success, with_chance
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import carries_evaluation, recordings_of
 from vlatool.errors import DataError, SourceError
@@ -39,11 +39,8 @@ def with_accuracy(
     """Return the rows with what recordings and episodes say of them.
 
     Args:
-        rows: Name -> row, of each bundle.
         bundles: Name -> bundle; the first is the float32 baseline, which the others are held against.
         loop: The episodes; None for recordings alone.
-        cache: Where measurements are kept.
-        context: Progress and workers.
         enough: Ends the episodes: candidates play in the order in which they would be chosen. All play when None.
 
     Raises:
@@ -110,7 +107,7 @@ def _recorded(
     return cached_measure(stage, bundle, cache, context).rows[-1].measurements
 
 
-def unjudged(baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Context) -> tuple[str, ...]:
+def unjudged_actions(baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Context) -> tuple[str, ...]:
     """Return what the recordings leave unjudged of the baseline's actions, and so of any candidate's."""
     if not is_recorded(baseline, loop):
         return ()

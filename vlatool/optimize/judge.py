@@ -37,7 +37,6 @@ class Judged:
         drop: Accuracy lost against float32, a share; NaN when it is not known.
         miss: By how much it misses the limits, as a multiple of them (0 when within, infinite when unknown).
         sentences: What to tell a person, when it is the chosen one.
-        warnings: What a person should know before trusting it.
     """
 
     row: Row
@@ -52,9 +51,6 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_b
     """Hold a candidate's row against the limits.
 
     Args:
-        row: The candidate, or the baseline itself.
-        baseline: The float32 row.
-        limits: What was asked for.
         profile: The board; None for this host.
         on_board: Whether this host is that board, so that its own latency decides.
 

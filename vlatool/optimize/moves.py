@@ -6,17 +6,17 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vlatool.accuracy.moved import worst_task
+from vlatool.accuracy.motion_comparison import worst_task
 from vlatool.measures.latency import SPEEDUP
 from vlatool.measures.motion import RATIO, STEPS_RATIO, TASK_SPEEDUP
 from vlatool.measures.success import SUCCESS_DROP, WORST_TASK_DROP
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
-LIMITED = {"task_time": "task time", "path_length": "path", "joint_path": "path of the joints", "jerk": "jerk",
+BODY_METRICS = {"task_time": "task time", "path_length": "path", "joint_path": "path of the joints", "jerk": "jerk",
            "joint_jerk": "jerk of the joints"}  # fmt: skip
 """Metrics that ``max_motion`` is about -> their names in sentences."""
-OF_ACTIONS = {"task_time": "task time", "action_rate": "action rate"}
+ACTION_METRICS = {"task_time": "task time", "action_rate": "action rate"}
 """The same where the environment tells nothing of the robot's body."""
 LEAST_LOSS = 1e-4
 
@@ -30,12 +30,7 @@ class Miss(NamedTuple):
 
 @dataclass(frozen=True)
 class Held:
-    """What limits say of a row.
-
-    Args:
-        missed: limits that it does not keep.
-        warnings: what cannot be excluded.
-    """
+    """What limits say of a row."""
 
     missed: tuple[Miss, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -58,10 +53,10 @@ class Held:
         return sum(miss.by for miss in self.missed)
 
 
-def limited(row: Row) -> dict[str, str]:
+def limited_metrics(row: Row) -> dict[str, str]:
     """Return the metrics that a limit on motion is about, for what is known of a row -> their names in sentences."""
-    of_body = any(row.get(RATIO.quantity(name)) for name in LIMITED if name != "task_time")
-    return LIMITED if of_body else OF_ACTIONS
+    of_body = any(row.get(RATIO.quantity(name)) for name in BODY_METRICS if name != "task_time")
+    return BODY_METRICS if of_body else ACTION_METRICS
 
 
 def judge_moves(row: Row, limits: Limits) -> Held:
@@ -73,7 +68,9 @@ def _motion(row: Row, limits: Limits) -> Iterator[Held]:
     if limits.max_motion is None or row.get(SUCCESS_DROP) is None:
         return
     known = {
-        words: ratio for name, words in limited(row).items() if (ratio := row.get(RATIO.quantity(name))) is not None
+        words: ratio
+        for name, words in limited_metrics(row).items()
+        if (ratio := row.get(RATIO.quantity(name))) is not None
     }
     if not known:
         yield Held.missing(1.0, "its motion is unknown: it shares no success with float32")

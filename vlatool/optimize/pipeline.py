@@ -26,18 +26,18 @@ from vlatool.measures import with_derived
 from vlatool.measures.actions import AGREEMENT_EXPERT, ERROR_EXPERT
 from vlatool.measures.success import SUCCESS, SUCCESS_DROP
 from vlatool.optimize.budget import budget_of
+from vlatool.optimize.build_candidates import candidate, chain
 from vlatool.optimize.choice import choose, chosen_of, is_faster
 from vlatool.optimize.choice_apart import choose_apart
-from vlatool.optimize.evidence import Enough, is_recorded, told_wrong, unjudged, with_accuracy
+from vlatool.optimize.evidence import Enough, is_recorded, told_wrong, unjudged_actions, with_accuracy
 from vlatool.optimize.judge import Judged, judge
-from vlatool.optimize.made import candidate, chain
 from vlatool.optimize.plan import BASELINE, Plan, make_plan, transforms
-from vlatool.optimize.pruned import PrunedSearch, with_measured
+from vlatool.optimize.pruning_search import PrunedSearch, with_measured
 from vlatool.optimize.recipe import Pruning, Recipe, StageList
 from vlatool.optimize.search import Search
 from vlatool.optimize.summary import report_of
-from vlatool.optimize.timings import Timing, engine_of, foretold_by_engine, placed
-from vlatool.optimize.trained import trainings, with_trainings, with_wrong_instruction
+from vlatool.optimize.timings import Timing, engine_of, foretold_by_engine, relabel_where
+from vlatool.optimize.training_records import trainings, with_trainings, with_wrong_instruction
 from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
@@ -59,14 +59,7 @@ class OptimizeJob:
     """A run in a process of its own.
 
     Args:
-        source: As the user named it.
-        profile, recipe: As JSON values.
-        cache: Where finished stages are kept.
-        draft: Where the bundle is written.
         fresh: Measure again, even what was measured before.
-        workers: Processes for episodes.
-        command: The command line.
-        launcher: Who starts these processes.
     """
 
     source: str
@@ -156,7 +149,7 @@ def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:
             "name evaluation.npz in policy.yaml, or give a drop in points such as 1%",
         )
     recorded = Recorded(baseline=baseline.path, samples=1)
-    budget_of(limits, baseline.manifest.spec).required(cached_measure(recorded, baseline, plan.cache, context).rows[-1])
+    budget_of(limits, baseline.manifest.spec).require(cached_measure(recorded, baseline, plan.cache, context).rows[-1])
 
 
 def _searched(plan: Plan, baseline: Bundle, context: Context) -> tuple[Plan, Tables]:
@@ -222,8 +215,8 @@ def _measured(
     rows, warnings = Timing(plan.recipe.effort, where, plan.cache, context, plan.fresh).rows(source, bundles)
     rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context, _enough(plan))
     rows = {name: with_derived(row) for name, row in rows.items()}
-    rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
-    warnings = (*warnings, *unjudged(bundles[BASELINE], plan.closed_loop, plan.cache, context))
+    rows = relabel_where(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
+    warnings = (*warnings, *unjudged_actions(bundles[BASELINE], plan.closed_loop, plan.cache, context))
     warnings = (*warnings, *dict.fromkeys(context.notes))
     if plan.profile:
         predicted = foretold_by_engine(plan.profile, bundles, where)
@@ -237,11 +230,11 @@ def _enough(plan: Plan) -> Enough | None:
     if plan.recipe.effort.every_candidate or plan.board_set.is_confined or board not in engine_names():
         return None
 
-    def enough(row: Row, baseline: Row) -> bool:
+    def is_good_enough(row: Row, baseline: Row) -> bool:
         judged = judge(with_derived(row), baseline, plan.recipe.limits, plan.profile, plan.on_board)
         return judged.within and is_faster(row, baseline)
 
-    return enough
+    return is_good_enough
 
 
 def judged_rows(
@@ -250,7 +243,6 @@ def judged_rows(
     """Hold every row against the limits of the plan, choose one, and say whether float32 does its task.
 
     Args:
-        plan: With limits and board.
         rows: Name -> row with everything that was measured and predicted, float32 first.
         engines: Name -> engine of each candidate; needed where the engines cannot be compared.
     """

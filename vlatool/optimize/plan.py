@@ -12,8 +12,8 @@ from vlatool.files.printable import mask_passwords
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import fingerprint, matches
 from vlatool.machine.instruction_sets import BoardSet, board_set
-from vlatool.optimize.place import check_place
 from vlatool.optimize.recipe import Limits, Pruning, Recipe, StageList, stage_entries
+from vlatool.optimize.study_storage import check_storage
 from vlatool.sources import Source, source_stage
 from vlatool.stage.base import Stage, Transform
 from vlatool.stage.build import build_stage
@@ -26,12 +26,9 @@ class Plan:
     """Stages, candidates and limits of one run.
 
     Args:
-        source: Of the policy.
         export: Stages from the policy to the float32 bundle; none where the source has graphs.
         candidates: Name -> stages from there, or from the policy for those that change its modules.
-        recipe: What was asked for.
         profile: The board; None for this host.
-        cache: Where finished stages are kept.
         fresh: Measure again, even what was measured before.
         typed: The source as the user named it.
     """
@@ -99,10 +96,7 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
     """Build and check every stage; nothing has run when this returns.
 
     Args:
-        source: See ``source_stage``.
         profile: The board; None for this host.
-        recipe: Candidates, limits and effort.
-        cache: Where finished stages are kept.
         fresh: Measure again, even what was measured before.
 
     Raises:
@@ -126,7 +120,7 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
     if recipe.pruning.trials:
         _check_pruning(recipe.pruning, stage)
         if recipe.pruning.study:
-            check_place(recipe.pruning.study)
+            check_storage(recipe.pruning.study)
     elif study := recipe.pruning.study:
         raise RecipeError(f"The study {mask_passwords(study)} keeps trials; none are asked for.", "add --trials 8")
     plan = Plan(stage, export, candidates, recipe, profile, cache, fresh, source)

@@ -117,8 +117,6 @@ def default_recipe(
     """Return the candidates that are tried when the user names none.
 
     Args:
-        limits: What a candidate must keep to.
-        effort: How much is measured.
         calibrated: Whether the policy brings calibration data, without which static quantization is impossible.
         engine: The engine of the board. One that is searched brings its own plans; others get standard QDQ operators
             with symmetric int8, as does one that vlatool does not run.

@@ -46,24 +46,24 @@ if TYPE_CHECKING:
     from vlatool.sensitivity.layers import LayerError
 
 FINALISTS = 3
-FINE = 0.9
+SELECTION_SHARE = 0.9
 """Share of the budget that a plan may use on calibration observations: those that it is judged on are others."""
-NEAR = 1.05
+NEAR_BUDGET = 1.05
 """Share of the budget up to which a fast plan is evaluated in full, though it misses the budget on calibration
 observations."""
 SLOWER = 0.97
 """Share of a plan's speed that an option must keep, as far as a few inferences can say, to be combined with others."""
-COMBINED = 3
+MAX_COMBINATIONS = 3
 """Combinations of options that are tried for one plan, at most."""
 ROUNDS = 5
 """Plans that are tried for one variant, at most."""
 SECONDS = 120.0
 """What the sensitivity of all layers may take; fewer samples are used for slow policies."""
-RECORDED = 256
+MAX_OBSERVATIONS = 256
 """Observations that errors of plans are taken on, at most."""
 SAMPLES = 8
 """Observations on which it is measured, at most."""
-TIMED = 20
+TIMED_RUNS = 20
 QUICK: dict[str, Any] = {"duration": 0, "cold": False, "phase": False, "answers": False, "reach": False}
 
 
@@ -72,13 +72,10 @@ class Trial:
     """What a variant did when it was tried.
 
     Args:
-        name: Name of the candidate that it may become.
-        stages: What makes it.
         speedup: Against float32 in ONNX Runtime, or in ``engine`` where that is named, from a few inferences; 0 when it
             could not be made.
         error: Error on calibration observations, in the measure of the budget (or the nearest that needs no episodes).
         within: Whether ``error`` keeps to the budget.
-        note: Why it could not be made.
         engine: What its speed is compared within; empty where all plans are compared with each other.
         fastest: What its speed may be, as far as those few inferences say: the upper end of the interval.
     """
@@ -98,12 +95,7 @@ class Search:
     """One run of the search.
 
     Args:
-        baseline: The float32 bundle.
-        limits: The budget.
         profile: The board; None for this host.
-        cache: Where trials are kept.
-        context: For progress.
-        threads: Intra-op threads.
     """
 
     baseline: Bundle
@@ -120,7 +112,7 @@ class Search:
         self._apart = board_set(self.profile).is_confined
         self._planned = 1
         self._layers: list[LayerError] | None = None
-        self._observations = recorded_observations(self.baseline, RECORDED)
+        self._observations = recorded_observations(self.baseline, MAX_OBSERVATIONS)
         self.budget = budget_of(self.limits, self.baseline.manifest.spec)
 
     def run(self, candidates: Mapping[str, StageList]) -> dict[str, StageList]:
@@ -175,11 +167,15 @@ class Search:
             if twin != name:  # no product has enough rows to become a convolution, say
                 raise GraphError(f"It has the graphs of {twin}.", f"look at {twin} in its place")
             engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self._apart else ""
-            timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, engine=engine, **QUICK)
+            timing = Latency(
+                against=(bundle.path,), iterations=TIMED_RUNS, threads=self.threads, engine=engine, **QUICK
+            )
             timed = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].get(SPEEDUP)
             speedup, fastest = (timed.value, timed.high or timed.value) if timed else (math.nan, math.nan)
             error = self._error(bundle, quiet)
-            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine, fastest)
+            trial = Trial(
+                name, stages, speedup, error, error <= SELECTION_SHARE * self.budget.value, "", engine, fastest
+            )
         except VlatoolError as failure:
             if failure.exit_code not in NOT_POSSIBLE:
                 raise
@@ -199,14 +195,14 @@ class Search:
         """Try the options that gain something over a plan together, then without those that cost most accuracy."""
         useful = {trial.name: (trial, extra) for trial, extra in self._extended(base) if _useful(base, trial, extra)}
         chosen = sorted(useful.values(), key=lambda one: one[0].error)
-        for _ in range(COMBINED):
+        for _ in range(MAX_COMBINATIONS):
             if len(chosen) < 2:
                 return
             ((name, options),) = base.stages[-1].items()
             together = {**options, **{key: value for _, extra in chosen for key, value in extra.items()}}
             endings = sorted(trial.name.removeprefix(base.name) for trial, _ in chosen)
             made = self._try(f"{base.name}{''.join(endings)}", (*base.stages[:-1], {name: together}))
-            if made.error <= NEAR * self.budget.value:
+            if made.error <= NEAR_BUDGET * self.budget.value:
                 return
             costly = [one for one in chosen if one[0].error > base.error]
             if not costly:
@@ -261,7 +257,7 @@ class Search:
     def _estimate(self, ranked: list[LayerError], error: float) -> int:
         """Return how many layers must go, were errors independent: their squares add up."""
         total = sum(layer.error**2 for layer in ranked) or 1.0
-        allowed = (FINE * self.budget.value / error) ** 2 if error else 1.0
+        allowed = (SELECTION_SHARE * self.budget.value / error) ** 2 if error else 1.0
         kept = 1.0
         for count, layer in enumerate(ranked, 1):
             kept -= layer.error**2 / total
@@ -275,7 +271,9 @@ class Search:
         if self._layers is None:
             stage = stage.model_copy(update={"attention": False, "elementwise": False})
             try:
-                self._layers = sensitivities_in_child(self.baseline, stage, RECORDED, SAMPLES, self.context, SECONDS)
+                self._layers = sensitivities_in_child(
+                    self.baseline, stage, MAX_OBSERVATIONS, SAMPLES, self.context, SECONDS
+                )
             except GraphError as error:  # the plans that were tried stand
                 self.context.progress(f"search: the layers could not be measured: {error.message}", None)
                 self._layers = []
@@ -290,7 +288,7 @@ class Search:
     def _finalists_of(self, timed: list[Trial]) -> list[Trial]:
         """Return the fastest plans inside the budget, or the nearest to it when none is inside."""
         fastest = sorted(timed, key=lambda trial: -trial.speedup)
-        near = [trial for trial in fastest if trial.error <= NEAR * self.budget.value]
+        near = [trial for trial in fastest if trial.error <= NEAR_BUDGET * self.budget.value]
         if not near:
             return sorted(timed, key=lambda trial: trial.error)[:1]
         fast = [trial for trial in near if trial.speedup >= 0.8 * near[0].speedup][:FINALISTS]
@@ -316,7 +314,6 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
 
     Args:
         profile: The board; None for this host.
-        calibrated: Whether there is calibration data.
     """
     known = engine_names()
     board = known if profile is None else [name for name in known if name in profile.engines]

@@ -20,7 +20,7 @@ from vlatool.stage.run import cached_transform
 
 WIDTHS = 6
 """Widths that are told apart, from all of the work to the least share that stays."""
-HALF = 0.5
+HALF_WIDTH = 0.5
 FLOAT32 = "float32"
 """The name of what is not quantized."""
 
@@ -33,7 +33,6 @@ class Shape:
         width: Share of the multiply-accumulates that stays when units go.
         blocks: Blocks that stay of the longest stack; the others lose the same share.
         steps: Denoising steps that stay.
-        quantized: Name of the quantization that follows.
     """
 
     width: float
@@ -97,7 +96,7 @@ class Space:
     def first(self) -> Iterator[Shape]:
         """Yield what is tried first: nothing pruned, each way alone, then all of them."""
         fast = next(iter(self.quantized))
-        half = min(self.widths, key=lambda width: abs(width - HALF))
+        half = min(self.widths, key=lambda width: abs(width - HALF_WIDTH))
         yield (whole := Shape(1.0, self.blocks, self.steps, fast))
         ways = {"steps": 1, "width": half, "blocks": (self.blocks + 1) // 2}
         changed = {name: value for name, value in ways.items() if value != getattr(whole, name)}
@@ -118,18 +117,14 @@ def space_of(
     """Find out what of a policy may be pruned, by trying.
 
     Args:
-        source: Of the policy.
-        pruning: What the recipe says.
         quantized: How a pruned policy may be quantized: name -> stages.
-        cache: Where what is tried is kept.
-        context: For progress.
 
     Raises:
         RecipeError: when nothing can be pruned; says why.
     """
     refused: list[str] = []
 
-    def tried(name: str, **options: Any) -> Bundle | None:
+    def attempt(name: str, **options: Any) -> Bundle | None:
         (stage,) = transforms(({name: options},))
         try:
             stage.check(source, None)
@@ -142,19 +137,19 @@ def space_of(
 
     step = (1 - pruning.least) / (WIDTHS - 1)
     widths = tuple(round(1 - step * number, 4) for number in range(WIDTHS))
-    half = min(widths, key=lambda width: abs(width - HALF))
+    half = min(widths, key=lambda width: abs(width - HALF_WIDTH))
     narrow = [width for width in reversed(widths) if half <= width < 1]
 
-    def reached(width: float) -> bool:
+    def can_reach(width: float) -> bool:
         """Say whether so much can go; a result that falls a little short would be the same at all smaller widths."""
-        made = tried("prune.structured", ratio=(ratio := round(1 - width, 4)))
+        made = attempt("prune.structured", ratio=(ratio := round(1 - width, 4)))
         return made is not None and made.manifest.made_by[PRUNED_KEY]["reached"] >= ratio
 
-    works = next((width for width in narrow if reached(width)), 1.0)
+    works = next((width for width in narrow if can_reach(width)), 1.0)
     widths = widths if works == half else tuple(width for width in widths if width >= works)
-    ends = tried("prune.depth", blocks=2, rank="even") or tried("prune.depth", blocks=1, rank="even")
+    ends = attempt("prune.depth", blocks=2, rank="even") or attempt("prune.depth", blocks=1, rank="even")
     steps = max(step.repeat for step in source.manifest.program)
-    fewer = tried("prune.steps", to=1) if steps > 1 else None
+    fewer = attempt("prune.steps", to=1) if steps > 1 else None
     space = Space(widths, _longest(ends) if ends else 1, steps if fewer else 1, quantized, pruning.recover)
     if space.is_empty:
         raise RecipeError(f"Nothing of {source.manifest.name} can be pruned. {' '.join(refused)}", "leave out --trials")
@@ -162,7 +157,7 @@ def space_of(
 
 
 def _upwards(share: float) -> float:
-    """Return a share with four decimals that is no smaller, so that as many blocks go."""
+    """Return a share with four decimals that is not smaller, so that as many blocks go."""
     return math.ceil(share * 1e4 - 1e-6) / 1e4
 
 
@@ -175,7 +170,7 @@ def _longest(ends: Bundle) -> int:
 def quantizations(candidates: Mapping[str, StageList]) -> dict[str, StageList]:
     """Return the candidates that say how a pruned policy may be quantized.
 
-    Plans that change modules are no quantization, and those that name layers are of the whole policy.
+    Plans that change modules are not quantizations, and those that name layers are of the whole policy.
     """
     return {
         name: stages

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING
 import psutil
 
 from vlatool.errors import DataError, VlatoolError, require
-from vlatool.optimize.place import storage_of, used
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.space import FLOAT32, Shape, Space, quantizations
+from vlatool.optimize.study_storage import storage_errors, storage_of
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial, Trial
 
 STARTUP = 6
 """Trials after which what was found says what is tried next; before, the first shapes, then random ones."""
-QUANTIZED = "quantized"
-NOTE, AGAIN, WORKER, TRAINING, REFUSED = "note", "again", "worker", "training_s", "refused"
+QUANTIZED_KEY = "quantized"
+NOTE_KEY, AGAIN_KEY, WORKER_KEY, TRAINING_KEY, REFUSED_KEY = "note", "again", "worker", "training_s", "refused"
 REPEATS = 10
 """Shapes that are drawn in the hope of one that was not tried yet; after that, the first such one is taken."""
 LONGEST = 400
@@ -35,11 +35,9 @@ class Tried:
     """What a trial found.
 
     Args:
-        shape: What was tried.
         speedup: Against the whole policy in float32; 0 when it could not be made.
         drop: Accuracy lost, a share of episodes or in the measure of the budget; infinite when not known.
         training_s: Seconds that its training took, wherever that was; 0 for none.
-        note: Why it could not be made.
         elsewhere: Whether another machine or process tried it, so that all of this is what the study says.
         refused: Why it moves worse than the limits allow, or loses more on one task; empty when it does not.
         miss: By how much, as a multiple of the limits.
@@ -62,7 +60,6 @@ class Study:
         url: ``sqlite:///FILE``, ``mysql://``, ``postgresql://``, or a file for a journal.
         name: Of the study; trials of other policies or limits have another.
         allowed: Drop that a shape may have.
-        seed: Of what is tried next.
 
     Raises:
         UsageError: when it cannot be opened.
@@ -78,25 +75,22 @@ class Study:
         self._told: dict[int, Tried] = {}
         self._space = Space((1.0,), 1, 1, {}, ())
         self._url = url
-        with used(url):
+        with storage_errors(url):
             storage = storage_of(url)
             self._study = self._optuna.create_study(
                 storage=storage, study_name=name, directions=["maximize", "minimize"], load_if_exists=True
             )
 
-    def agreed(self, quantized: Mapping[str, StageList]) -> dict[str, StageList]:
+    def agree_on(self, quantized: Mapping[str, StageList]) -> dict[str, StageList]:
         """Return how all who share the study quantize: what the first of them found.
-
-        Args:
-            quantized: What was found here.
 
         Raises:
             DataError: when the study holds something else.
         """
-        with used(self._url):
-            if QUANTIZED not in self._study.user_attrs:
-                self._study.set_user_attr(QUANTIZED, [[name, list(stages)] for name, stages in quantized.items()])
-            held = self._study.user_attrs[QUANTIZED]
+        with storage_errors(self._url):
+            if QUANTIZED_KEY not in self._study.user_attrs:
+                self._study.set_user_attr(QUANTIZED_KEY, [[name, list(stages)] for name, stages in quantized.items()])
+            held = self._study.user_attrs[QUANTIZED_KEY]
         try:
             agreed = {str(name): tuple(stages) for name, stages in held}
             known = quantizations(agreed)
@@ -112,7 +106,7 @@ class Study:
     def begin(self, space: Space) -> None:
         """Say what may be chosen, and take up what a process of this machine left when it was killed."""
         self._space = space
-        with used(self._url):
+        with storage_errors(self._url):
             for shape in space.first():
                 self._study.enqueue_trial(asdict(shape), skip_if_exists=True)
             self._left = self._dead()
@@ -124,7 +118,7 @@ class Study:
             DataError: when the study is of another space.
             UsageError: when it cannot be read or written any more.
         """
-        with used(self._url):
+        with storage_errors(self._url):
             return self._next(trials)
 
     def _next(self, trials: int) -> tuple[int, Shape] | None:
@@ -151,7 +145,7 @@ class Study:
             n_startup_trials=STARTUP, seed=self._seed + len(self._trials()), multivariate=True
         )
         trial, space = self._study.ask(), self._space
-        trial.set_user_attr(WORKER, self._worker)
+        trial.set_user_attr(WORKER_KEY, self._worker)
         try:
             shape = Shape(
                 trial.suggest_categorical("width", space.widths),
@@ -165,7 +159,7 @@ class Study:
 
     def _drop(self, number: int) -> None:
         """End a trial that does not count."""
-        self._trial(number).set_user_attr(AGAIN, True)
+        self._trial(number).set_user_attr(AGAIN_KEY, True)
         self._study.tell(number, state=self._optuna.trial.TrialState.FAIL, skip_if_finished=True)
 
     def tell(self, number: int, tried: Tried) -> None:
@@ -178,32 +172,32 @@ class Study:
             note = tried.note[:LONGEST] or "its accuracy could not be measured"
             tried = Tried(tried.shape, training_s=tried.training_s, note=note)
         tried = self._told[number] = replace(tried, refused=tried.refused[:LONGEST])
-        with used(self._url):
+        with storage_errors(self._url):
             trial = self._trial(number)
-            trial.set_user_attr(TRAINING, tried.training_s)
+            trial.set_user_attr(TRAINING_KEY, tried.training_s)
             if tried.note:
-                trial.set_user_attr(NOTE, tried.note)
+                trial.set_user_attr(NOTE_KEY, tried.note)
                 self._study.tell(number, state=self._optuna.trial.TrialState.FAIL)
             else:
-                trial.set_user_attr(REFUSED, tried.refused)
+                trial.set_user_attr(REFUSED_KEY, tried.refused)
                 trial.set_constraint("drop", tried.drop - self._allowed)
                 trial.set_constraint("moves", tried.miss)
                 self._study.tell(number, [tried.speedup, tried.drop])
 
-    def tried(self) -> list[Tried]:
+    def ended_trials(self) -> list[Tried]:
         """Return what is known of all trials that ended: what this object was told, and what the study says of others.
 
         Raises:
             DataError: when what the study holds is not what a trial finds.
         """
-        with used(self._url):
+        with storage_errors(self._url):
             ended = [trial for trial in self._trials() if trial.state.is_finished() and self._counts(trial)]
             return [self._told.get(trial.number) or self._read(trial) for trial in ended]
 
     def under_way(self) -> int:
         """Return how many trials other processes have under way."""
         running = self._optuna.trial.TrialState.RUNNING
-        with used(self._url):
+        with storage_errors(self._url):
             return sum(trial.state == running for trial in self._trials())
 
     def _trials(self) -> list[FrozenTrial]:
@@ -211,7 +205,7 @@ class Study:
         return trials
 
     def _counts(self, trial: FrozenTrial) -> bool:
-        return trial.state != self._optuna.trial.TrialState.WAITING and not trial.user_attrs.get(AGAIN)
+        return trial.state != self._optuna.trial.TrialState.WAITING and not trial.user_attrs.get(AGAIN_KEY)
 
     def _trial(self, number: int) -> Trial:
         """Return a trial that may be written to."""
@@ -224,7 +218,7 @@ class Study:
 
     def _is_left(self, trial: FrozenTrial) -> bool:
         running = trial.state == self._optuna.trial.TrialState.RUNNING
-        return running and _is_dead(str(trial.user_attrs.get(WORKER, "")))
+        return running and _is_dead(str(trial.user_attrs.get(WORKER_KEY, "")))
 
     def _taken_up(self, number: int, trials: int) -> tuple[int, Shape] | None:
         """Go on with a trial that was left, before any other; None where it is not wanted, or taken."""
@@ -242,18 +236,18 @@ class Study:
         shape = Shape(**trial.params)
         if not self._space.holds(shape):
             raise DataError(f"The study's trials are of another space: {trial.params}.", "name another study")
-        self._trial(number).set_user_attr(WORKER, self._worker)
+        self._trial(number).set_user_attr(WORKER_KEY, self._worker)
         return number, shape
 
     def _read(self, trial: FrozenTrial) -> Tried:
         try:
             shape = Shape(**trial.params)
             speedup, drop = trial.values or (0.0, math.inf)
-            seconds = float(trial.user_attrs.get(TRAINING, 0.0))
-            note, refused = (str(trial.user_attrs.get(name, ""))[:LONGEST] for name in (NOTE, REFUSED))
+            seconds = float(trial.user_attrs.get(TRAINING_KEY, 0.0))
+            note, refused = (str(trial.user_attrs.get(name, ""))[:LONGEST] for name in (NOTE_KEY, REFUSED_KEY))
         except (TypeError, ValueError) as error:
             raise DataError(
-                f"Trial {trial.number} of the study is no trial of vlatool: {error}.",
+                f"Trial {trial.number} of the study is not a trial of vlatool: {error}.",
                 "take a study that vlatool made, or a new one: another --study",
             ) from error
         if not self._space.holds(shape) or not speedup >= 0 or math.isnan(drop):

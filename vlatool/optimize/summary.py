@@ -14,7 +14,7 @@ from vlatool.optimize.choice import chosen_of
 from vlatool.optimize.judge import Judged
 from vlatool.optimize.moves import slower_task
 from vlatool.optimize.plan import Plan
-from vlatool.optimize.timings import IN_OPENVINO, engine_of, now
+from vlatool.optimize.timings import IN_OPENVINO, engine_of, utc_now
 from vlatool.report import ON_BOARD, Report, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 
@@ -32,14 +32,8 @@ def report_of(
     """Return the report.
 
     Args:
-        plan: With the limits and the board.
-        baseline: The float32 bundle.
         bundles: Name -> bundle of each candidate.
         judged: The rows, float32 first, one of them chosen.
-        failures: Rows of candidates that could not be made.
-        notes: What a reader should know of the measurements.
-        trust: Whether float32 does its task.
-        command: The command line.
     """
     chosen, where = chosen_of(judged), plan.board_set
     engine = engine_of(bundles.get(chosen.row.name, baseline))
@@ -57,7 +51,7 @@ def report_of(
         rows=(*rows.values(), *failures),
         limits=_limits(plan),
         command=command,
-        created=now(),
+        created=utc_now(),
         environment={**fingerprint(), **({ON_BOARD: plan.board} if plan.profile and plan.on_board else {})},
         warnings=tuple(dict.fromkeys(warnings)),
     )  # fmt: skip

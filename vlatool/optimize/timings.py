@@ -30,10 +30,7 @@ class Timing:
     """How bundles are timed.
 
     Args:
-        effort: Inferences and threads.
         where: The set that OpenVINO is confined to, if it is.
-        cache: Where measurements are kept.
-        context: For progress.
         fresh: Measure again, even what was measured before.
     """
 
@@ -57,7 +54,7 @@ class Timing:
         own = {name: bundle for name, bundle in bundles.items() if name != base and engine_of(bundle) == ENGINE}
         rows, warnings = self._timed({name: bundle for name, bundle in bundles.items() if name not in own})
         theirs, more = self._timed({base: baseline, **own}, engine=ENGINE) if own else ({}, ())
-        return joined(rows, theirs, list(bundles), self.where), tuple(dict.fromkeys((*warnings, *more)))
+        return join_rows(rows, theirs, list(bundles), self.where), tuple(dict.fromkeys((*warnings, *more)))
 
     def _timed(self, bundles: Mapping[str, Bundle], torch: Sequence[Bundle] = (), engine: str = "") -> Timed:
         """Time bundles in one run, eager torch last; all in one engine where it is named."""
@@ -65,7 +62,7 @@ class Timing:
         against = tuple(bundle.path for bundle in [*(bundles[name] for name in others), *torch])
         effort = {"iterations": self.effort.iterations, "threads": self.effort.threads, "engine": engine}
         stage = Latency(against=against, duration=0, phase=False, **effort)
-        begun = now()
+        begun = utc_now()
         report = cached_measure(stage, bundles[base], self.cache, self.context, fresh=self.fresh)
         kept = (f"the latencies were measured before, at {report.created}; --fresh measures again",)
         rows = dict(zip(bundles, report.rows, strict=False))
@@ -82,13 +79,14 @@ class Timing:
         return named, (*report.warnings, *seen, *(kept if report.created < begun else ()))
 
 
-def joined(ours: Mapping[str, Row], theirs: Mapping[str, Row], order: Sequence[str], where: BoardSet) -> dict[str, Row]:
+def join_rows(
+    ours: Mapping[str, Row], theirs: Mapping[str, Row], order: Sequence[str], where: BoardSet
+) -> dict[str, Row]:
     """Return the rows of two runs, one for each engine, in an order.
 
     Args:
         ours: ONNX Runtime's plans by name, the baseline first.
         theirs: OpenVINO's plans by name, after the baseline as OpenVINO runs it.
-        order: The names, the baseline first.
         where: The set that OpenVINO is confined to.
     """
     base = order[0]
@@ -110,16 +108,16 @@ def _noted(row: Row, what: str) -> tuple[Measurement, ...]:
     return tuple(replace(number, note=note) if number.name == SPEEDUP.name else number for number in row.measurements)
 
 
-def placed(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> dict[str, Row]:
+def relabel_where(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> dict[str, Row]:
     """Return the rows with OpenVINO's measurements placed where they were taken, if that is a host that is confined."""
     if not where.is_confined:
         return dict(rows)
 
-    def moved(number: Measurement) -> Measurement:
+    def relabel(number: Measurement) -> Measurement:
         return replace(number, where=where.where) if number.origin == "measured" else number
 
     return {
-        name: replace(row, measurements=tuple(map(moved, row.measurements))) if engines.get(name) == ENGINE else row
+        name: replace(row, measurements=tuple(map(relabel, row.measurements))) if engines.get(name) == ENGINE else row
         for name, row in rows.items()
     }  # fmt: skip
 
@@ -130,7 +128,6 @@ def foretold_by_engine(
     """Return what is predicted for each bundle on a board; where OpenVINO is confined, float32 in it as well.
 
     Args:
-        profile: The board.
         bundles: Name -> bundle, float32 first.
         where: The set that OpenVINO is confined to, if it is.
     """
@@ -146,6 +143,6 @@ def engine_of(bundle: Bundle) -> str:
     return bundle.manifest.engine or DEFAULT_ENGINE
 
 
-def now() -> str:
+def utc_now() -> str:
     """Return the time in UTC, ISO 8601, to the second."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")

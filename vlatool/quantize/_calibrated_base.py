@@ -12,7 +12,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import (
-    PLAYED,
+    OBSERVATIONS_FILE,
     Moment,
     Recording,
     calibration_checks,
@@ -50,7 +50,7 @@ class CalibratedQuantization(Quantization):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is calibration data."""
         super().check(source, profile)
-        if source is None or (PLAYED in source.manifest.files and not self.calibration):
+        if source is None or (OBSERVATIONS_FILE in source.manifest.files and not self.calibration):
             return
         if calibration_recording(source, self.calibration) is None:
             raise self._no_calibration_data(source)
@@ -80,7 +80,7 @@ class CalibratedQuantization(Quantization):
             bundle, values, context, exempt: As for ``calibrate``.
             samples: Collector of the hash of each sample.
         """
-        uses_played = not self.calibration and PLAYED in bundle.manifest.files
+        uses_played = not self.calibration and OBSERVATIONS_FILE in bundle.manifest.files
         if uses_played and calibration_recording(bundle) is None:
             return calibrate(bundle, values, played_moments(bundle, samples), context, exempt=exempt)
         recording, numbers = self.calibration_samples(bundle)

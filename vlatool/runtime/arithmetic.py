@@ -29,41 +29,43 @@ MODEL = (
 )
 """An ONNX model, compressed: float32 ``x`` (16, 64), quantized to uint8 in steps of 1, times int8 weights (64, 16) that
 are all 127, as ``y``."""
-WRITTEN = (
+INTEGER_MODEL = (
     "eNrtlD0OgkAUhBkk8fH8yboWWhgLSo5gI8FKooWtHSQbs4nBCEsQGjmAh/Acns6tvYJ8ySSTb/ohf/PxecV4MEpGK3EPpqcqzY1u1UHnKi14zbgz"
     "arsyMgkdTI6pOVbXfW7URRW8YGiJJvB2aWlCn11zW+INVw7rQhuj8vBFFJEQgxh10tGzp6fnbwlHAjHKxHOcbhuScGO0CRzb7EFktp3n9o/klMcE"
     "SeySsIkyK5sfKWKPHTH7AsvUIAM="
 )
-"""The same product, written as an integer operator (MatMulInteger), not as pairs around a float one. In both,
-the weights have a zero point, without which ONNX Runtime up to 1.29 aborts with ``PRECISE`` (``breaks_precise``)."""
+"""The same product, written as an integer operator (MatMulInteger), not as pairs around a float one. In both, the
+weights have a zero point, without which ONNX Runtime up to 1.29 aborts with ``PRECISE_OPTION`` (``breaks_precise``)."""
 SHAPE = (16, 64)
-WANTED = 255.0 * 127 * SHAPE[1]
-PRECISE = ("session.x64quantprecision", "1")
+EXACT_SUM = 255.0 * 127 * SHAPE[1]
+PRECISE_OPTION = ("session.x64quantprecision", "1")
 """The option of ONNX Runtime (``onnxruntime_session_options_config_keys.h``)."""
-SIGNED = ("session.qdqisint8allowed", "1")
+SIGNED_OPTION = ("session.qdqisint8allowed", "1")
 """The option of ONNX Runtime that leaves int8 activations of quantize/dequantize pairs int8: on x86 it rewrites them to
 uint8 otherwise, with which convolutions saturate where those of int8 are exact."""
-UNFUSED = ("session.disable_quant_qdq", "1")
+UNFUSED_OPTION = ("session.disable_quant_qdq", "1")
 """The option of ONNX Runtime that leaves quantize/dequantize pairs what they say: float products of rounded values."""
 SETS_ZERO_POINTS = (1, 30)
-"""Release of ONNX Runtime from which on ``PRECISE`` adds a zero point where a node has none."""
+"""Release of ONNX Runtime from which on ``PRECISE_OPTION`` adds a zero point where a node has none."""
 EXACT = "exact"
-EXACT_BY_OPTION = f"exact with {PRECISE[0]}={PRECISE[1]}, which is set; slower than on a processor with VNNI"
+EXACT_BY_OPTION = (
+    f"exact with {PRECISE_OPTION[0]}={PRECISE_OPTION[1]}, which is set; slower than on a processor with VNNI"
+)
 SATURATING = "saturating: they are added in pairs of 16 bits"
 
 
 def model(written: bool = False) -> bytes:
     """Return the product, or the one that is written as an integer operator, as a serialized ``ModelProto``."""
-    return zlib.decompress(base64.b64decode(WRITTEN if written else MODEL))
+    return zlib.decompress(base64.b64decode(INTEGER_MODEL if written else MODEL))
 
 
 def operand() -> Any:
-    """Return the value of its input, with which every element of the product is ``WANTED``."""
+    """Return the value of its input, with which every element of the product is ``EXACT_SUM``."""
     return np.full(SHAPE, 255, np.float32)
 
 
 def breaks_precise(ort: Any, model: Path | bytes) -> bool:
-    """Return whether ONNX Runtime would end the process where it opens a graph with the option ``PRECISE``.
+    """Return whether ONNX Runtime would end the process where it opens a graph with the option ``PRECISE_OPTION``.
 
     Up to 1.29 that rewriting writes a zero point behind the end of a node's inputs where int8 weights have none: the
     library stops with an assertion of ``vector::operator[]``.
@@ -79,8 +81,6 @@ def ort_product(ort: Any, precise: bool = False, written: bool = False) -> float
     """Return the smallest element of the product in ONNX Runtime, NaN when it fails; asked once in each process.
 
     Args:
-        ort: The module.
-        precise: With the option that makes it exact.
         written: Of the integer operator, in a session that rewrites as little of a graph as it can.
     """
     try:
@@ -90,7 +90,7 @@ def ort_product(ort: Any, precise: bool = False, written: bool = False) -> float
         if written:
             as_written(ort, options, precise)
         elif precise:
-            options.add_session_config_entry(*PRECISE)
+            options.add_session_config_entry(*PRECISE_OPTION)
         session = ort.InferenceSession(model(written), options, providers=["CPUExecutionProvider"])
         return float(session.run(None, {"x": operand()})[0].min())
     except Exception:  # the seam: a build without these operators still runs float32
@@ -102,28 +102,26 @@ def ort_exactness(ort: Any, written: bool = False) -> str:
     plain = exactness(ort_product(ort, written=written))
     if plain != SATURATING:
         return plain
-    return EXACT_BY_OPTION if ort_product(ort, precise=True, written=written) == WANTED else plain
+    return EXACT_BY_OPTION if ort_product(ort, precise=True, written=written) == EXACT_SUM else plain
 
 
 def exactness(product: float) -> str:
     """Return what a smallest element of the product means."""
     if math.isnan(product):
         return UNKNOWN
-    return EXACT if product == WANTED else SATURATING
+    return EXACT if product == EXACT_SUM else SATURATING
 
 
 def as_written(ort: Any, options: Any, precise: bool) -> None:
     """Set the options of a session that is to compute the operators of a graph as they are written.
 
     Args:
-        ort: The module.
-        options: ``SessionOptions``, which are changed.
         precise: Rewrite weights, so that integer products are exact: that takes the second level of rewriting, whose
             other parts merge float operators. The one that would make integer products of pairs stays off.
     """
     levels = ort.GraphOptimizationLevel
     options.graph_optimization_level = levels.ORT_ENABLE_EXTENDED if precise else levels.ORT_DISABLE_ALL
-    for entry in (PRECISE, UNFUSED) if precise else ():
+    for entry in (PRECISE_OPTION, UNFUSED_OPTION) if precise else ():
         options.add_session_config_entry(*entry)
 
 

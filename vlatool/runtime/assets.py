@@ -18,11 +18,6 @@ Assets = Path | Bundle
 def read_asset(assets: Assets, name: str, allowed: str) -> bytes:
     """Return the content of an asset.
 
-    Args:
-        assets: Where it is.
-        name: Relative path.
-        allowed: Name of the limit on its size.
-
     Raises:
         BundleError: when a bundle does not record it, or it is not what the manifest says.
         SpecError: when it is not inside the folder, or larger than the limit.

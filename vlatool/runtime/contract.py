@@ -30,7 +30,7 @@ OF_NOT_FINITE = (
 OF_THE_GRAPHS = (
     "leave layers out with --exclude, or use another method or --opset: what it was made from answers finite values"
 )
-AGAIN = "declare in the spec what the policy gives, or fix the policy, and export it again"
+EXPORT_AGAIN = "declare in the spec what the policy gives, or fix the policy, and export it again"
 BASE_MB = 2000.0
 TIMES_GRAPHS = 8.0
 """A policy may take ``BASE_MB`` and this many times the size of its graphs: an engine unpacks them."""
@@ -122,7 +122,6 @@ def check_graphs(manifest: Manifest, sessions: Mapping[str, Any], limit_mb: floa
     """Check what the open graphs declare against the spec, and against each other along the program.
 
     Args:
-        manifest: With spec and program.
         sessions: Graph name -> session; one without ``takes`` and ``gives`` is believed.
         limit_mb: Of what one graph takes and gives together, in 10^6 bytes.
 
@@ -171,7 +170,7 @@ def _check_feed(
     if not actual.fits(expected):
         when = " in the next repeat" if turn else ""
         raise GraphError(
-            f"The graph '{graph}' takes '{name}' as {expected}, but {origin} '{value}' as {actual}{when}.", AGAIN
+            f"The graph '{graph}' takes '{name}' as {expected}, but {origin} '{value}' as {actual}{when}.", EXPORT_AGAIN
         )
 
 
@@ -179,10 +178,10 @@ def _check_names(step: ProgramStep, takes: Mapping[str, Port], gives: Mapping[st
     for words, named, known in (("takes", step.feeds, takes), ("gives", step.gives, gives)):
         for name in named:
             if name not in known:
-                raise GraphError(f"The graph '{step.graph}' {words} no '{name}'; {suggest(name, known)}.", AGAIN)
+                raise GraphError(f"The graph '{step.graph}' {words} no '{name}'; {suggest(name, known)}.", EXPORT_AGAIN)
     for name in takes:
         if name not in step.feeds:
-            raise GraphError(f"The graph '{step.graph}' takes '{name}', which the program does not feed.", AGAIN)
+            raise GraphError(f"The graph '{step.graph}' takes '{name}', which the program does not feed.", EXPORT_AGAIN)
 
 
 def sources_of(step: ProgramStep) -> dict[str, Port]:
@@ -225,7 +224,6 @@ class Outputs:
     """Checks the values of an inference against the outputs that a spec declares: shape, dtype, finite numbers.
 
     Args:
-        outputs: What is declared.
         action: Whether the first is checked for finite numbers, too; a policy does that in physical units.
         certain: Names of outputs whose shape and dtype need no check.
     """
@@ -272,7 +270,6 @@ def off_the_robot(where: str, fix: str) -> Iterator[None]:
 
     Args:
         where: Which observation it answers, the end of a sentence: ``observation 3``.
-        fix: What helps there.
     """
     try:
         yield
@@ -296,7 +293,7 @@ def _misfit(array: Array, tensor: TensorSpec, who: str) -> GraphError:
 
 def _remedy(got: str, declared: str) -> str:
     if got == declared:
-        return AGAIN
+        return EXPORT_AGAIN
     return f"cast it to {declared} in forward(), or declare another dtype in the spec, and export the policy again"
 
 

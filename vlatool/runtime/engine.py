@@ -167,12 +167,11 @@ class Engine:
 
         Args:
             target: The board, or this host.
-            calibrated: Whether there is calibration data.
         """
         return {}
 
     @classmethod
-    def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
+    def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
         """Open a graph so that the time of its nodes is noted.
 
         Raises:
@@ -192,8 +191,6 @@ class Engine:
         """Return why an int8 node of a profile is not the fast kernel; nothing where it is.
 
         Args:
-            node: Of the profile.
-            computed: Its precision.
             product: Whether it is a matrix product or a convolution.
             zero_points: How many activations of its graph have a zero point other than 0.
         """

@@ -12,7 +12,7 @@ from pathlib import Path
 from vlatool.errors import GraphError
 from vlatool.files.limits import check_limit, limit
 
-DAMAGED = "copy the graph again from where it was made, or make it again"
+COPY_AGAIN = "copy the graph again from where it was made, or make it again"
 
 LOCATION = b"location"
 VARINT, FIXED64, LENGTH, FIXED32 = 0, 1, 2, 5
@@ -35,7 +35,7 @@ MESSAGES: dict[str, dict[int, str]] = {
 """Message -> number of a field -> message in it, as far as they lead to a tensor (onnx.proto)."""
 
 
-SMALL = 16 * 1024
+SEARCH_BYTES = 16 * 1024
 """Bytes of a message up to which it is searched for the key as a whole before it is walked, and of one read."""
 
 
@@ -57,7 +57,7 @@ class OpenFile:
     def __getitem__(self, where: slice) -> bytes:
         start, end, _ = where.indices(self._size)
         if not self._at <= start <= end <= self._at + len(self._part):
-            self._at, self._part = start, os.pread(self._handle, max(SMALL, end - start), start)
+            self._at, self._part = start, os.pread(self._handle, max(SEARCH_BYTES, end - start), start)
         return self._part[start - self._at : end - self._at]
 
 
@@ -94,7 +94,7 @@ def external_files(model: bytes | OpenFile) -> set[str]:
         >>> external_files(b"")
         set()
     """
-    entries = (place for message, *place in messages(model, _may_name) if message == STRING_ENTRY)
+    entries = (span for message, *span in messages(model, _may_name) if message == STRING_ENTRY)
     return {name for start, end in entries for name in _location(model, start, end)}
 
 
@@ -102,7 +102,6 @@ def messages(model: bytes | OpenFile, may_hold: MayHold) -> Iterator[tuple[str, 
     """Yield what every message in a serialized ``ModelProto`` is, where it starts and where it ends (``MESSAGES``).
 
     Args:
-        model: The bytes.
         may_hold: Of the bytes and the place of a message, whether to go into it.
 
     Raises:
@@ -128,18 +127,18 @@ def messages(model: bytes | OpenFile, may_hold: MayHold) -> Iterator[tuple[str, 
 
 def _may_name(model: bytes | OpenFile, start: int, end: int) -> bool:
     """Return whether a message may hold the key, which stands in every such entry as it is: a large one may."""
-    return end - start > SMALL or LOCATION in model[start:end]
+    return end - start > SEARCH_BYTES or LOCATION in model[start:end]
 
 
 def _location(model: bytes | OpenFile, start: int, end: int) -> set[str]:
     """Return every value of a key-value pair one of whose keys is ``location``: the last of several would win."""
-    pairs = [(field, model[at : min(to, at + SMALL)]) for field, at, to in parts(model, start, end)]
+    pairs = [(field, model[at : min(to, at + SEARCH_BYTES)]) for field, at, to in parts(model, start, end)]
     if not any(field == 1 and key == LOCATION for field, key in pairs):
         return set()
     try:
         return {value.decode("utf-8") for field, value in pairs if field == 2} or {""}
     except UnicodeDecodeError:
-        raise GraphError("The graph names external data by bytes that are not UTF-8.", DAMAGED) from None
+        raise GraphError("The graph names external data by bytes that are not UTF-8.", COPY_AGAIN) from None
 
 
 def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int]]:
@@ -158,12 +157,12 @@ def fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, in
         tag, used = varint(head, 0, 5)
         field, kind = tag >> 3, tag & 7
         if not field or kind not in (VARINT, FIXED32, FIXED64, LENGTH) or tag >> 32:
-            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.", DAMAGED)
+            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.", COPY_AGAIN)
         if kind == LENGTH:
             size, used = varint(head, used, 10)
             at += used
             if size > end - at:
-                raise GraphError("The graph is not an ONNX model: a part of it is longer than the whole.", DAMAGED)
+                raise GraphError("The graph is not an ONNX model: a part of it is longer than the whole.", COPY_AGAIN)
             yield field, at, at + size, -1
             at += size
         elif kind == VARINT:
@@ -173,7 +172,7 @@ def fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, in
         else:
             at += used + (4 if kind == FIXED32 else 8)
         if at > end:
-            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.", DAMAGED)
+            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.", COPY_AGAIN)
 
 
 def varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
@@ -181,10 +180,10 @@ def varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
     value = 0
     for number in range(longest):
         if at >= len(head):
-            raise GraphError("The graph is not an ONNX model: it ends within a number.", DAMAGED)
+            raise GraphError("The graph is not an ONNX model: it ends within a number.", COPY_AGAIN)
         byte = head[at]
         at += 1
         value |= (byte & 0x7F) << (7 * number)
         if byte < 0x80:
             return value, at
-    raise GraphError("The graph is not an ONNX model: a number in it is too long.", DAMAGED)
+    raise GraphError("The graph is not an ONNX model: a number in it is too long.", COPY_AGAIN)

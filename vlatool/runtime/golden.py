@@ -13,7 +13,7 @@ from vlatool.errors import DataError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.npz import open_npz
 
-AGAIN = "copy the bundle again from where it was made, or make it again"
+COPY_AGAIN = "copy the bundle again from where it was made, or make it again"
 
 GOLDEN_STEPS = 2
 """Golden observations in a row that a program with kept values needs: the first alone does not show what was kept."""
@@ -47,7 +47,7 @@ def golden_arrays(bundle: Bundle) -> Mapping[str, Array]:
     if not name:
         return {}
     return open_npz(
-        bundle.read(name, "golden_bytes"), "golden_bytes", where=f"The golden file {bundle.path / name}", fix=AGAIN
+        bundle.read(name, "golden_bytes"), "golden_bytes", where=f"The golden file {bundle.path / name}", fix=COPY_AGAIN
     )
 
 
@@ -66,13 +66,13 @@ def golden_steps(bundle: Bundle, stored: Mapping[str, Array]) -> list[Golden]:
     needed = [*(f"in.{tensor.name}" for tensor in spec.inputs), *noise, action]
     for key in needed:
         if key not in stored:
-            raise DataError(f"{where} cannot be read: it has no '{key}'; {suggest(key, stored)}.", AGAIN)
+            raise DataError(f"{where} cannot be read: it has no '{key}'; {suggest(key, stored)}.", COPY_AGAIN)
         numbers = stored[key].dtype.kind in "fiu" or (key not in noise and key != action)
         if not stored[key].ndim or not len(stored[key]) or not numbers:
-            raise DataError(f"{where} cannot be read: '{key}' has no steps, or no numbers.", AGAIN)
+            raise DataError(f"{where} cannot be read: '{key}' has no steps, or no numbers.", COPY_AGAIN)
     counts = {len(stored[key]) for key in needed}
     if len(counts) > 1:
-        raise DataError(f"{where} cannot be read: its arrays have {sorted(counts)} steps.", AGAIN)
+        raise DataError(f"{where} cannot be read: its arrays have {sorted(counts)} steps.", COPY_AGAIN)
     check_limit("golden_steps", max(counts), where, DataError)
     return [
         (

@@ -27,9 +27,7 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
 
     Args:
         bundle: Where it is; its files are verified here.
-        graph: Which one.
         engine: A class of ``vlatool/runtime/engines``.
-        threads: Threads of the engine.
 
     Raises:
         BundleError: when a file is not what the manifest says or is changed meanwhile, or the graph keeps weights in a
@@ -50,15 +48,15 @@ def _opened(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: i
             return engine(path, threads, graph.compute, content)
         del content
     with contextlib.ExitStack() as stack:
-        place = stack.enter_context(bundle.verified_folder(folder, [graph.file]))
-        with open_inside(place, name) as handle:
+        own = stack.enter_context(bundle.verified_folder(folder, [graph.file]))
+        with open_inside(own, name) as handle:
             locations = external_files(OpenFile(handle))
-        if beside := recorded(bundle, graph.file, locations):
+        if beside := recorded_files(bundle, graph.file, locations):
             stack.enter_context(bundle.verified_folder(folder, beside))
-        return engine(path, threads, graph.compute, place / name)
+        return engine(path, threads, graph.compute, own / name)
 
 
-def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
+def recorded_files(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
     """Return the files of a bundle that a graph's locations mean.
 
     Raises:

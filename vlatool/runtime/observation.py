@@ -15,7 +15,7 @@ from vlatool.runtime.assets import Assets, asset_path, read_asset
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer
 
-FEW = 256
+MAX_SMALL_VALUES = 256
 NOT_FINITE = (
     "check where it comes from: a sensor, a recording, an environment; a policy that handles such values is exported "
     "with finite: false in its spec"
@@ -33,7 +33,6 @@ class ObservationEncoder:
     """Checks an observation against the spec, normalises it and turns text into ids.
 
     Args:
-        spec: The policy's spec.
         assets: Directory of statistics and tokenizers, or the bundle that has them.
 
     Raises:
@@ -105,7 +104,12 @@ def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
     normaliser = load_normaliser(tensor, assets)
     checked = dtype.kind == "f" and tensor.finite
     batched, single = tensor.shape, tensor.shape[1:]
-    vector = normaliser is not None and len(single) == 1 and tensor.width in range(1, FEW) and dtype == np.float32
+    vector = (
+        normaliser is not None
+        and len(single) == 1
+        and tensor.width in range(1, MAX_SMALL_VALUES)
+        and dtype == np.float32
+    )
 
     def encode(value: Any) -> Array:
         try:
@@ -190,7 +194,7 @@ def all_finite(array: Array) -> bool:
     Few elements are summed without numpy: right after an inference, whose weights have filled the processor's caches,
     that takes half as long as a numpy reduction (``vlatool benchmark overhead``).
     """
-    if array.size <= FEW and math.isfinite(sum(array.ravel().tolist())):  # that of float64 can overflow
+    if array.size <= MAX_SMALL_VALUES and math.isfinite(sum(array.ravel().tolist())):  # that of float64 can overflow
         return True
     return bool(np.isfinite(array).all())
 

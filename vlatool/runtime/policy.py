@@ -154,7 +154,7 @@ class BundlePolicy:
             seed: Of the noise of this episode; that of the policy when None, so that all episodes draw the same.
 
         Raises:
-            UsageError: when the seed is no whole number from 0, or this thread's own inference is under way.
+            UsageError: when the seed is not a whole number from 0, or this thread's own inference is under way.
         """
         check_whole("seed", seed, 0, optional=True)
         with self._turn:

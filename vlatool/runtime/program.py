@@ -34,8 +34,6 @@ class Program:
     """Runs the steps of a program over open sessions.
 
     Args:
-        steps: As in the manifest.
-        sessions: Graph name -> open session.
         seed: Seed of the noise; fresh entropy when None.
     """
 
@@ -77,12 +75,12 @@ class Program:
         return bool(self._kept)
 
     @property
-    def kept(self) -> dict[str, Array]:
+    def kept_values(self) -> dict[str, Array]:
         """What the next inference is given of those before, value name -> array."""
         return dict(self._kept)
 
-    @kept.setter
-    def kept(self, values: Mapping[str, Array]) -> None:
+    @kept_values.setter
+    def kept_values(self, values: Mapping[str, Array]) -> None:
         self._kept = dict(values)
 
     def run(
@@ -96,9 +94,7 @@ class Program:
         When anything raises, ``finish`` included, the kept values and the noise generator are as they were before.
 
         Args:
-            values: Value name -> array.
             noise: Value name -> floating array, instead of what the program would draw.
-            finish: Makes the result from all values.
 
         Raises:
             DataError: when the noise does not fit.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vlatool.runtime.external_data import LENGTH, SMALL, VARINT, OpenFile, asked_of, messages, parts, varint
+from vlatool.runtime.external_data import LENGTH, SEARCH_BYTES, VARINT, OpenFile, asked_of, messages, parts, varint
 
 FLOAT8 = (17, 18, 19, 20)
 """``TensorProto.DataType``: E4M3FN, E4M3FNUZ, E5M2, E5M2FNUZ."""
@@ -55,13 +55,13 @@ def lacks_zero_point(model: Path | bytes) -> bool:
 
 
 def _lacks(model: bytes | OpenFile) -> bool:
-    nodes = (place for message, *place in messages(model, _may_compute) if message == "NodeProto")
+    nodes = (span for message, *span in messages(model, _may_compute) if message == "NodeProto")
     return any(_short(model, start, end) for start, end in nodes)
 
 
 def _may_compute(model: bytes | OpenFile, start: int, end: int) -> bool:
     """Return whether a message may have such a node in it: a large one may."""
-    return end - start > SMALL or any(name in model[start:end] for name in WITH_ZERO_POINT)
+    return end - start > SEARCH_BYTES or any(name in model[start:end] for name in WITH_ZERO_POINT)
 
 
 def _short(model: bytes | OpenFile, start: int, end: int) -> bool:
@@ -69,18 +69,18 @@ def _short(model: bytes | OpenFile, start: int, end: int) -> bool:
     for field, at, to in parts(model, start, end):
         inputs += field == NODE_INPUT and to > at
         if field == NODE_TYPE:
-            kind = model[at : min(to, at + SMALL)]
+            kind = model[at : min(to, at + SEARCH_BYTES)]
     return inputs < WITH_ZERO_POINT.get(kind, 0)
 
 
 def _holds(model: bytes | OpenFile) -> bool:
-    tensors = (place for message, *place in messages(model, _may_hold) if message == "TensorProto")
-    return any(_data_type(model[start : min(end, start + SMALL)]) in FLOAT8 for start, end in tensors)
+    tensors = (span for message, *span in messages(model, _may_hold) if message == "TensorProto")
+    return any(_data_type(model[start : min(end, start + SEARCH_BYTES)]) in FLOAT8 for start, end in tensors)
 
 
 def _may_hold(model: bytes | OpenFile, start: int, end: int) -> bool:
     """Return whether a message may have such a tensor in it: a large one may."""
-    return end - start > SMALL or any(mark in model[start:end] for mark in MARKS)
+    return end - start > SEARCH_BYTES or any(mark in model[start:end] for mark in MARKS)
 
 
 def _data_type(tensor: bytes) -> int:

@@ -21,7 +21,7 @@ STEPS = {
 }  # fmt: skip
 """Type of a normalizer or pre-tokenizer -> characters that it makes of one at most; 0 where that depends on its fields.
 ``ByteLevel`` writes a character for each byte of UTF-8."""
-ADDED = {"ByteLevel": 0, "BertProcessing": 2, "RobertaProcessing": 2}
+ADDED_TOKENS = {"ByteLevel": 0, "BertProcessing": 2, "RobertaProcessing": 2}
 """Type of a post-processor -> tokens that it adds."""
 INNER = ("normalizers", "pretokenizers", "processors")
 BYTES_OF_A_CHARACTER = 4
@@ -31,7 +31,6 @@ def growth(data: Mapping[str, Any], where: str) -> int:
     """Return how many times as long as a text its tokens, or what they are made of, can be.
 
     Args:
-        data: The content of a ``tokenizer.json``.
         where: What it is, as the start of a sentence.
 
     Raises:
@@ -128,8 +127,8 @@ def _of_model(model: Any) -> int:
 def _processed(step: Mapping[str, Any], where: str) -> tuple[int, int]:
     """Return how often a post-processor gives the tokens, and how many it adds."""
     kind = step.get("type")
-    if isinstance(kind, str) and kind in ADDED:
-        return 1, ADDED[kind]
+    if isinstance(kind, str) and kind in ADDED_TOKENS:
+        return 1, ADDED_TOKENS[kind]
     if kind != "TemplateProcessing":
         raise _unknown(kind, where)
     special = step.get("special_tokens")
@@ -167,5 +166,5 @@ def _length(text: Any) -> int:
 def _unknown(kind: Any, where: str) -> SpecError:
     return SpecError(
         f"{where} has a step of the type {str(kind)[:40]!r}, whose effect on the length of a text is not known.",
-        f"use other steps; known: {', '.join(sorted({*STEPS, *ADDED, 'TemplateProcessing'}))}",
+        f"use other steps; known: {', '.join(sorted({*STEPS, *ADDED_TOKENS, 'TemplateProcessing'}))}",
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from vlatool.errors import GraphError
-from vlatool.runtime.external_data import DAMAGED, OpenFile, asked_of, fields, messages, varint
+from vlatool.runtime.external_data import COPY_AGAIN, OpenFile, asked_of, fields, messages, varint
 from vlatool.weights import pairs
 
 UINT8, INT8 = 2, 3
@@ -32,7 +32,7 @@ WEIGHT_INPUT = {
 """Operator -> which input its weight is."""
 INTEGER_ONLY = tuple(each for each in WEIGHT_INPUT if each not in ("MatMul", "Gemm", "Conv"))
 """Those of them whose operands are integers; the others have them behind a ``DequantizeLinear``."""
-BOUND = 64
+MAX_WEIGHT = 64
 """Largest magnitude of two int8 numbers whose products with 255 add up within 16 bits: 255 x 2 x 64 = 32,640."""
 MOST_AXES = 16
 """Of a weight; no operator here reads one of more."""
@@ -55,7 +55,7 @@ class _Node:
     transposed: bool
 
     @property
-    def moved(self) -> tuple[str, ...]:
+    def passed_inputs(self) -> tuple[str, ...]:
         """What it hands on: shapes and indices are its other inputs."""
         return self.inputs if self.operator == "Concat" else self.inputs[:1]
 
@@ -114,7 +114,7 @@ def _fit(model: bytes | OpenFile) -> bool:
         bool(matrices)
         and not vectors & multiplied
         and all(_met(model, name, weight, nodes) for name, weight in matrices.items())
-        and _Operands(nodes, frozenset(matrices), types, bounds).known()
+        and _Operands(nodes, frozenset(matrices), types, bounds).is_known()
     )
 
 
@@ -139,7 +139,7 @@ class _Operands:
                 self._unique = self._unique and name not in self._makers and name not in weights
                 self._makers[name] = node
 
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """Return whether each is a stored weight, in float32, or an integer with which no pair saturates."""
         products = [node for node in self._nodes if node.operator in WEIGHT_INPUT]
         open_ = [(name, node.operator in INTEGER_ONLY)
@@ -166,14 +166,14 @@ class _Operands:
         if maker.operator == "Clip" and integer and self._bounds(maker):
             return []
         if maker.operator in (*MOVES, "Clip"):
-            return [(each, integer) for each in maker.moved]
+            return [(each, integer) for each in maker.passed_inputs]
         return [] if not integer or self._makes_uint8(maker) else None
 
     def _bounds(self, clip: _Node) -> bool:
         """Return whether a ``Clip`` keeps an int8 within what no pair saturates with."""
         given = clip.inputs[1:3]
         return len(given) == 2 and all(
-            self._scalars.get(name, 128) <= BOUND and name not in self._makers for name in given
+            self._scalars.get(name, 128) <= MAX_WEIGHT and name not in self._makers for name in given
         )
 
     def _makes_uint8(self, maker: _Node) -> bool:
@@ -247,7 +247,7 @@ def _transposes(model: bytes | OpenFile, start: int, end: int) -> bool:
 def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, int, _Weight | None]:
     """Return the name and type of a tensor, and where its data are if it is int8."""
     shape: list[int] = []
-    name, dtype, place = "", 0, (0, 0)
+    name, dtype, span = "", 0, (0, 0)
     for field, at, to, number in fields(model, start, end):
         if field == DIMS:
             shape += [number] if number >= 0 else list(_packed(model, at, to))
@@ -256,8 +256,8 @@ def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, int, _W
         elif field == TENSOR_NAME:
             name = _text(model, at, to)
         elif field == RAW_DATA:
-            place = at, to
-    return name, dtype, _Weight(tuple(shape), *place) if dtype == INT8 else None
+            span = at, to
+    return name, dtype, _Weight(tuple(shape), *span) if dtype == INT8 else None
 
 
 def _packed(model: bytes | OpenFile, start: int, end: int) -> Iterator[int]:
@@ -271,4 +271,4 @@ def _text(model: bytes | OpenFile, start: int, end: int) -> str:
     try:
         return model[start:end].decode("utf-8")
     except UnicodeDecodeError:
-        raise GraphError("The graph is not an ONNX model: a name in it is not UTF-8.", DAMAGED) from None
+        raise GraphError("The graph is not an ONNX model: a name in it is not UTF-8.", COPY_AGAIN) from None

@@ -206,7 +206,7 @@ class Switchboard:
         self._tape.start(recording=recording)
         self.policy.reset()
         if self._state:
-            self.policy.program.kept = dict(self._state)
+            self.policy.program.kept_values = dict(self._state)
         return self.policy.infer(observation)
 
     def _with_state(self, observations: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
@@ -219,7 +219,7 @@ class Switchboard:
             if moment.counts:
                 yield moment.observation
             self.reference(moment.observation)
-            self._state = self.policy.program.kept
+            self._state = self.policy.program.kept_values
         self._state = {}
 
     def errors(

@@ -20,11 +20,9 @@ def fix_axes(model: Any, shapes: Shapes, described: bool, file: str = "FILE.onnx
     these has that length too. What depends on them is inferred again.
 
     Args:
-        model: A ``ModelProto``.
         shapes: Input -> axes: lengths, and names of axes that stay free.
         described: Whether they are those of a description, which knows all inputs; where it has none, they are those
             that a person gave beside the file.
-        file: What messages call it.
 
     Raises:
         SourceError: where a shape that was given does not fit the file, or an axis other than the first is free and

@@ -19,7 +19,6 @@ def add_batch_axes(model: Any, opset: int) -> list[str]:
 
     Args:
         model: A ``ModelProto`` whose free first axes were fixed.
-        opset: Its opset.
 
     Returns:
         Names of the inputs and outputs that have a further axis.

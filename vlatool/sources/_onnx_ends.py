@@ -58,8 +58,6 @@ def complete_outputs(model: Any, path: Path, inputs: Sequence[TensorSpec]) -> No
 
     Args:
         model: A ``ModelProto``; its inputs have shapes.
-        path: Where it is written for that.
-        inputs: What it takes.
 
     Raises:
         GraphError: when ONNX Runtime refuses it, or fails.

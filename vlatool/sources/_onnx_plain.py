@@ -14,7 +14,7 @@ from vlatool.graph.nodes import name_nodes, read_names, reads
 
 MOVERS = ("Identity", "Cast", "Transpose", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Split")
 """Operators through which exporters let a weight go on its way to a layer."""
-TIED = 1 << 20
+MIN_TIED_BYTES = 1 << 20
 """Bytes of a weight above which it stays one where it is read in two ways, as a tied embedding is."""
 LATER_IR = 4
 """Version of the file format from which initializers need not be inputs."""
@@ -43,7 +43,9 @@ def plain(model: Any) -> Any:
     readers = Counter(name for node in graph.node for name in set(reads(node)))
     nodes = []
     for node in graph.node:
-        tied = any(readers[name] > 1 and stored[name].ByteSize() > TIED for name in node.input if name in stored)
+        tied = any(
+            readers[name] > 1 and stored[name].ByteSize() > MIN_TIED_BYTES for name in node.input if name in stored
+        )
         made = {} if tied or given.intersection(node.output) else _made(model, node, stored)
         for name, tensor in made.items():
             graph.initializer.append(tensor)

@@ -17,7 +17,7 @@ from vlatool.graph.precision import shares_and_unknown
 from vlatool.graph.run_shapes import RunShapes, read_run_shapes, write_run_shapes
 from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.engine import engine_class
-from vlatool.runtime.engines import traced
+from vlatool.runtime.engines import open_traced
 from vlatool.stage.base import Context
 
 MAX_NAMES = 4
@@ -57,7 +57,7 @@ def _run(path: Path) -> dict[str, RunShapes]:
     with scratch_directory() as scratch, contextlib.suppress(VlatoolError):
         copy = write_linked(model, path, scratch / path.name)
         with engine_call(engine_class(), f"ran {path.name} to see its shapes"):
-            session = traced(copy, scratch / "trace")
+            session = open_traced(copy, scratch / "trace")
             try:
                 session.run(_draw_inputs([value for value in model.graph.input if value.name not in stored]))
             except Exception:  # the seam: what ONNX Runtime refuses, and types that numpy lacks, is not counted

@@ -10,7 +10,7 @@ import pytest
 from _examined import found as examined
 from _examined import of_bundles
 
-from vlatool.accuracy.paired import Outcome, success_row
+from vlatool.accuracy.success_comparison import Outcome, success_row
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError
 from vlatool.gate.claims import accuracy

@@ -7,7 +7,7 @@ import pytest
 from _examined import all_found
 from _examined import found as examined
 
-from vlatool.gate import timed as timed_module
+from vlatool.gate import timing_processes as timed_module
 from vlatool.gate.claims.latency import Latency, change, decision_words, slower
 from vlatool.measurement.pairs import Pairs
 from vlatool.stats.sequential import Decision

@@ -15,8 +15,8 @@ from _full import small_or_full
 from pydantic import ValidationError
 
 from tests._reach import EAGER, TREMBLES, bundle_of
-from vlatool.accuracy.disturbed import with_disturbed
-from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.accuracy.disturbance_drops import with_disturbed
+from vlatool.accuracy.success_comparison import Outcome, compare_success, success_row
 from vlatool.gate.claims.disturbed import Disturbed
 from vlatool.gate.claims.motion import Motion
 from vlatool.gate.claims.task_time import TaskTime

@@ -8,7 +8,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.quantize.int8.integer_matmul import use_integer_matmul
-from vlatool.runtime.arithmetic import PRECISE
+from vlatool.runtime.arithmetic import PRECISE_OPTION
 
 RANDOM = np.random.default_rng(0)
 WEIGHT = RANDOM.integers(-127, 128, (4, 3)).astype(np.int8)
@@ -127,7 +127,7 @@ def test_two_products_of_one_weight_have_one_each_and_are_exact_where_products_s
     for got, value in zip(run(made), wanted, strict=True):
         np.testing.assert_allclose(got, value, atol=1e-6)
     options = onnxruntime.SessionOptions()
-    options.add_session_config_entry(*PRECISE)
+    options.add_session_config_entry(*PRECISE_OPTION)
     onnxruntime.InferenceSession(made.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 

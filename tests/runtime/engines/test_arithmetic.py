@@ -15,12 +15,12 @@ from vlatool.runtime import arithmetic
 from vlatool.runtime.arithmetic import (
     EXACT,
     EXACT_BY_OPTION,
-    PRECISE,
+    EXACT_SUM,
+    PRECISE_OPTION,
     SATURATING,
     SHAPE,
-    SIGNED,
+    SIGNED_OPTION,
     UNKNOWN,
-    WANTED,
     model,
     operand,
     ort_product,
@@ -48,7 +48,7 @@ def integer_product(path: Path, kind: int) -> Path:
     return path
 
 
-def option(session: OrtCpuSession, name: str = PRECISE[0]) -> str:
+def option(session: OrtCpuSession, name: str = PRECISE_OPTION[0]) -> str:
     return session._session.get_session_options().get_session_config_entry(name)
 
 
@@ -59,15 +59,15 @@ def test_the_probe_is_the_product_that_it_says():
     assert weights.dtype == np.int8
     assert (weights == 127).all()
     got = ReferenceEvaluator(found).run(None, {"x": operand()})[0]
-    assert (got == WANTED).all()
+    assert (got == EXACT_SUM).all()
 
 
 def test_the_written_probe_is_the_same_product_as_an_integer_operator():
     found = onnx.ModelProto.FromString(model(written=True))
     onnx.checker.check_model(found, full_check=True)
     assert "MatMulInteger" in {node.op_type for node in found.graph.node}
-    assert (ReferenceEvaluator(found).run(None, {"x": operand()})[0] == WANTED).all()
-    assert ort_product(onnxruntime, precise=True, written=True) == WANTED
+    assert (ReferenceEvaluator(found).run(None, {"x": operand()})[0] == EXACT_SUM).all()
+    assert ort_product(onnxruntime, precise=True, written=True) == EXACT_SUM
     assert ort_product(onnxruntime, written=True) == ort_product(onnxruntime)
 
 
@@ -83,22 +83,22 @@ def test_the_probe_has_the_zero_points_without_which_older_releases_abort(writte
 def test_older_releases_do_not_get_the_option_that_ends_them(tmp_path, monkeypatch, engine, release, breaks):
     """ONNX Runtime 1.23 to 1.29 abort where a product without a zero point of its weights gets the option."""
     path = integer_product(tmp_path / "uint8.onnx", TensorProto.UINT8)
-    monkeypatch.setattr(arithmetic, "ort_product", lambda *_, **given: WANTED if given.get("precise") else SATURATED)
+    monkeypatch.setattr(arithmetic, "ort_product", lambda *_, **given: EXACT_SUM if given.get("precise") else SATURATED)
     entries = []
     options = SimpleNamespace(add_session_config_entry=lambda *entry: entries.append(entry))
     for module in (ort_cpu, _reference):
         monkeypatch.setattr(module, "session_options", lambda *_: options)
     library = SimpleNamespace(__version__=release, GraphOptimizationLevel=onnxruntime.GraphOptimizationLevel)
     engine._option_sets(library, path, 1)
-    assert (PRECISE in entries) is not breaks
+    assert (PRECISE_OPTION in entries) is not breaks
 
 
 def test_with_the_option_products_are_exact_on_every_processor():
-    assert ort_product(onnxruntime, precise=True) == WANTED
+    assert ort_product(onnxruntime, precise=True) == EXACT_SUM
 
 
 def test_what_a_processor_finds_is_exact_or_saturated():
-    assert ort_product(onnxruntime) in (WANTED, SATURATED)
+    assert ort_product(onnxruntime) in (EXACT_SUM, SATURATED)
 
 
 @pytest.mark.parametrize("engine", [OrtCpuSession, OpenvinoSession])
@@ -111,14 +111,14 @@ def test_an_engine_says_how_it_computes(engine):
 def test_openvino_is_asked_by_a_product_of_its_own(monkeypatch):
     """Weights whose product is not the one wanted stand for a processor that saturates."""
     pytest.importorskip("openvino")
-    monkeypatch.setattr(arithmetic, "WANTED", WANTED + 1)
+    monkeypatch.setattr(arithmetic, "EXACT_SUM", EXACT_SUM + 1)
     assert OpenvinoSession.arithmetic() == SATURATING
 
 
 @pytest.fixture
 def saturating(monkeypatch):
     """A processor without VNNI: what it would compute is believed."""
-    found = {False: SATURATED, True: WANTED}
+    found = {False: SATURATED, True: EXACT_SUM}
     monkeypatch.setattr(arithmetic, "ort_product", lambda ort, precise=False, written=False: found[precise])
     return found
 
@@ -126,7 +126,7 @@ def saturating(monkeypatch):
 def test_where_products_saturate_the_option_is_set(tmp_path: Path, saturating):
     session = OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
     assert option(session) == "1"
-    assert (session.run({"a": np.full(SHAPE, 255, np.uint8)})["y"] == WANTED).all()
+    assert (session.run({"a": np.full(SHAPE, 255, np.uint8)})["y"] == EXACT_SUM).all()
     assert OrtCpuSession.arithmetic() == EXACT_BY_OPTION
     saturating[True] = SATURATED
     assert OrtCpuSession.arithmetic() == SATURATING
@@ -160,7 +160,7 @@ def test_where_products_saturate_the_reference_is_opened_so_that_they_are_exact(
     levels = onnxruntime.GraphOptimizationLevel
     session = ReferenceSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
     assert (option(session), level(session)) == ("1", levels.ORT_ENABLE_EXTENDED)
-    assert (session.run({"a": np.full(SHAPE, 255, np.uint8)})["y"] == WANTED).all()
+    assert (session.run({"a": np.full(SHAPE, 255, np.uint8)})["y"] == EXACT_SUM).all()
     assert ReferenceSession.arithmetic() == EXACT_BY_OPTION
 
 
@@ -181,7 +181,7 @@ def test_the_reference_opens_signed_activations_all_the_same(tmp_path: Path, sat
 def test_signed_activations_open_all_the_same_and_stay_signed(tmp_path: Path, saturating):
     """Beside such a product ONNX Runtime would rewrite convolutions of int8 to uint8, with which they saturate."""
     session = OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.INT8), threads=1)
-    assert option(session, SIGNED[0]) == "1"
+    assert option(session, SIGNED_OPTION[0]) == "1"
     assert (session.run({"a": np.full(SHAPE, 127, np.int8)})["y"] == 127 * 127 * 64).all()
 
 
@@ -191,7 +191,7 @@ def test_the_first_error_is_told(tmp_path: Path, saturating):
 
 
 def test_where_products_are_exact_nothing_is_set(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(arithmetic, "ort_product", lambda ort, precise=False, written=False: WANTED)
+    monkeypatch.setattr(arithmetic, "ort_product", lambda ort, precise=False, written=False: EXACT_SUM)
     session = OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
     assert OrtCpuSession.arithmetic() == EXACT
     with pytest.raises(RuntimeError):

@@ -101,9 +101,9 @@ def onnxruntime() -> Seen:
     """Ask ONNX Runtime by a product that saturates without VNNI."""
     import onnxruntime as library
 
-    from vlatool.runtime.arithmetic import WANTED, ort_product
+    from vlatool.runtime.arithmetic import EXACT_SUM, ort_product
 
-    return {EXACT_INT8: ort_product(library) == WANTED}
+    return {EXACT_INT8: ort_product(library) == EXACT_SUM}
 
 
 def openvino() -> Seen:

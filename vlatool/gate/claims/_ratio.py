@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vlatool.accuracy.moved import Ratio
+from vlatool.accuracy.motion_comparison import Ratio
 from vlatool.gate.claim import Claim
 from vlatool.gate.plan import Need
 from vlatool.gate.verdict import CONFIDENCE, Judgement, Outcome, judge_interval, samples_wanted, worst

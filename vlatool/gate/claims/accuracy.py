@@ -12,11 +12,11 @@ from pydantic import Field
 
 from vlatool.accuracy.credibility import DECIDE, Credibility, credibility
 from vlatool.accuracy.losses import drop, losses
-from vlatool.accuracy.paired import few_starts, repeated_starts
+from vlatool.accuracy.success_comparison import few_starts, repeated_starts
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import read_recording
 from vlatool.errors import DataError
-from vlatool.evaluate.recorded import alone, run_recorded
+from vlatool.evaluate.recorded import run_recorded, single_policy_measurements
 from vlatool.gate.claim import Claim
 from vlatool.gate.evidence import Evidence, recorded_data
 from vlatool.gate.plan import Need, Plan
@@ -116,7 +116,9 @@ class Accuracy(Claim):
             title = "more distance from the expert's actions than the baseline has:"
         interval = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
         judged = self._held(RECORDED_DROP, title, interval, len(indices))
-        return _Part(judged, tuple(alone(action, theirs, expert, episodes)), notes=recording.unjudged_steps)
+        return _Part(
+            judged, tuple(single_policy_measurements(action, theirs, expert, episodes)), notes=recording.unjudged_steps
+        )
 
     def _held(
         self, quantity: Quantity, title: str, drop: tuple[float, float, float], samples: int, starts: int = 0

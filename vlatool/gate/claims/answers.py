@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from pydantic import Field
 
-from vlatool.data import DRAWN, OTHER, RECORDED
+from vlatool.data import RANDOM_KIND, RECORDED_KIND, REWORDED_KIND
 from vlatool.gate.claim import Claim
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Need, Plan
@@ -17,9 +17,9 @@ from vlatool.measures.actions import FOLLOWS
 from vlatool.report import Measurement
 
 KINDS = {
-    RECORDED: "recorded observations with other bits",
-    OTHER: "recorded observations under another instruction",
-    DRAWN: "drawn observations",
+    RECORDED_KIND: "recorded observations with other bits",
+    REWORDED_KIND: "recorded observations under another instruction",
+    RANDOM_KIND: "drawn observations",
     SEQUENCE: "observations in a row",
 }
 EXAMPLE = """
@@ -114,5 +114,5 @@ def _least(followed: Sequence[OutputAgreement]) -> list[OutputAgreement]:
     Where there are recordings, observations that are drawn without any are far from what the policy is for, and say
     little of a copy in fewer bits.
     """
-    near = [output for output in followed if output.kind != DRAWN] or list(followed)
+    near = [output for output in followed if output.kind != RANDOM_KIND] or list(followed)
     return sorted(near, key=lambda output: output.correlation)[:1]

@@ -7,14 +7,14 @@ from pydantic import Field, model_validator
 from vlatool.gate.claim import Claim
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Need
-from vlatool.gate.timed import Timed
+from vlatool.gate.timing_processes import Timed
 from vlatool.gate.verdict import Judgement, Outcome, Verdict
 from vlatool.measures.latency import LATENCY
 from vlatool.stats.percentiles import PERCENTILES, Percentile, percentile, proven_above
 
 MIN_PROCESSES, MAX_PROCESSES = 10, 60
 """Processes that are measured at least, for they differ, and at most."""
-KNOWN = ", ".join(f"{percent:g}" for percent in PERCENTILES)
+ALLOWED_PERCENTILES = ", ".join(f"{percent:g}" for percent in PERCENTILES)
 EXAMPLE = """
 deadline: null
 # deadline:            # a percentile below a deadline, with 99 % confidence, on the machine that runs the gate
@@ -31,12 +31,12 @@ class Deadline(Claim):
     example = EXAMPLE
 
     ms: float = Field(gt=0, description="the deadline")
-    percent: float = Field(99.0, description=f"which percentile: {KNOWN}")
+    percent: float = Field(99.0, description=f"which percentile: {ALLOWED_PERCENTILES}")
 
     @model_validator(mode="after")
     def _percentile_is_one(self) -> Deadline:
         if self.percent not in PERCENTILES:
-            raise ValueError(f"percent must be one of {KNOWN}")
+            raise ValueError(f"percent must be one of {ALLOWED_PERCENTILES}")
         return self
 
     def examine(self, evidence: Evidence) -> Verdict:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from pydantic import Field
 
-from vlatool.accuracy.disturbed import drops_by_disturbance
-from vlatool.accuracy.paired import few_starts
+from vlatool.accuracy.disturbance_drops import drops_by_disturbance
+from vlatool.accuracy.success_comparison import few_starts
 from vlatool.gate.claims._drops import Drops
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Plan

@@ -11,7 +11,7 @@ from pydantic import AliasChoices, Field, model_validator
 from vlatool.gate.claim import Claim
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Need, Plan
-from vlatool.gate.timed import Timed
+from vlatool.gate.timing_processes import Timed
 from vlatool.gate.verdict import CONFIDENCE, Judgement, Outcome, Verdict
 from vlatool.measurement.turns import CONFIRM
 from vlatool.measures import Quantity
@@ -19,7 +19,7 @@ from vlatool.measures.latency import LATENCY_MEAN_RATIO, LATENCY_RATIO, ratio_at
 from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES, Decision, judge_jointly
 from vlatool.stats.signed_rank import min_differences
 
-MEASURED = ((LATENCY_RATIO, "medians"), (LATENCY_MEAN_RATIO, "means of ratios"))
+STATISTICS = ((LATENCY_RATIO, "medians"), (LATENCY_MEAN_RATIO, "means of ratios"))
 """Statistics of the calls, and of the observations, each the median of its calls: the median and the mean."""
 MAX_PROCESSES = 1000
 """Number of processes beyond which it is not a useful advice that they would decide."""
@@ -98,8 +98,8 @@ class Latency(Claim):
             pairs = timed.process(number)
             return pairs.log_ratio, pairs.mean_log_ratio
 
-        decisions, _ = judge_jointly(ratios, len(MEASURED), self.margin, self.interim_analyses)
-        judged = [self._judged(*named, decision) for named, decision in zip(MEASURED, decisions, strict=True)]
+        decisions, _ = judge_jointly(ratios, len(STATISTICS), self.margin, self.interim_analyses)
+        judged = [self._judged(*named, decision) for named, decision in zip(STATISTICS, decisions, strict=True)]
         found = Verdict.of(judged, slow=slow_observations(timed, self.worst))
         return replace(found, outcome=Outcome.FAIL) if found.facts["slow"] else found
 

@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 
 from vlatool import registry
 from vlatool.accuracy.doubt import Doubt
-from vlatool.accuracy.moved import doubts, known_of, pairs_above_none, ratios
+from vlatool.accuracy.motion_comparison import doubts, known_of, pairs_above_none, ratios
 from vlatool.gate.claims._ratio import Ratios, confidence_of
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.verdict import Judgement, Outcome, Reason, Verdict, worst
@@ -16,7 +16,7 @@ from vlatool.report import Row
 OF_BODY = ("path_length", "joint_path", "jerk", "joint_jerk")
 OF_ACTIONS = ("action_rate",)
 """Metrics that count where the environment tells nothing of the robot's body."""
-NOTHING = "no episode in which both succeed tells how they move"
+NO_METRIC = "no episode in which both succeed tells how they move"
 EXAMPLE = """
 # These are about the episodes that accuracy names, where it names any:
 motion: null           # where both succeed, neither path nor jerk grows by more than the margin
@@ -47,7 +47,7 @@ class Motion(Ratios):
         """Examine the metrics that the claim names, or those of the body that the environment tells.
 
         Where the baseline has nothing of a metric (no collision in any episode) there is no ratio: the candidate passes
-        with nothing either, and fails where it has some in so many episodes that chance is no explanation.
+        with nothing either, and fails where it has some in so many episodes that chance does not explain it.
         """
         rows = evidence.episodes
         names = self.metrics or _metrics_of(rows[0])
@@ -70,7 +70,7 @@ class Motion(Ratios):
         if compared:
             parts.insert(0, (worst(each.outcome for each in compared), self.ratio_words(compared)))
         elif not none:
-            parts.append((Outcome.INCONCLUSIVE, NOTHING))
+            parts.append((Outcome.INCONCLUSIVE, NO_METRIC))
         if lacking:
             words = "; ".join(f"no ratio of {each.title} ({each.facts['doubt'] or 'not told'})" for each in lacking)
             parts.insert(0, (Outcome.INCONCLUSIVE, words))

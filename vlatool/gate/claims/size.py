@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
-from vlatool.data import PLAYED, is_of_recording
+from vlatool.data import OBSERVATIONS_FILE, is_of_recording
 from vlatool.files.ownership import LEDGER
 from vlatool.gate.claims._growth import Growth
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.verdict import Verdict
 from vlatool.measures.resources import SIZE
 
-ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, PLAYED, "recipe.yaml", "SIGNATURE",
+ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, OBSERVATIONS_FILE, "recipe.yaml", "SIGNATURE",
          "reports/report.html", "reports/report.md", "reports/report.json", "reports/difference.json",
          "reports/smooth_quant.json", "reports/weights.json")  # fmt: skip
 """Files of a bundle that no robot needs, beside the golden one and recordings."""

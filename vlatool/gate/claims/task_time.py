@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from vlatool.accuracy.moved import doubts, ratios
+from vlatool.accuracy.motion_comparison import doubts, ratios
 from vlatool.gate.claims._ratio import Ratios
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.verdict import CONFIDENCE, Outcome, Reason, Verdict

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from vlatool.accuracy.moved import drops_by_task
-from vlatool.accuracy.paired import few_starts
+from vlatool.accuracy.motion_comparison import drops_by_task
+from vlatool.accuracy.success_comparison import few_starts
 from vlatool.gate.claims._drops import Drops
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.verdict import CONFIDENCE, Verdict

@@ -45,7 +45,7 @@ def samples_with_state(bundle: Bundle, moments: Iterable[Moment]) -> Iterator[tu
         if policy is not None and moment.begins:
             policy.reset(moment.number)
         if moment.counts:
-            yield moment.observation, {} if policy is None else policy.program.kept
+            yield moment.observation, {} if policy is None else policy.program.kept_values
         if policy is not None:
             policy.infer(moment.observation)
 

@@ -44,7 +44,6 @@ def build_controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) 
     """Return a controller that acts with a policy: ``chunked``, ``late`` where there is a delay, or what is named.
 
     Args:
-        policy: The policy that infers.
         names: Entries of the kind ``control``, each around those before it; wrappers of policies are innermost.
         delay: Control steps that an inference takes.
 

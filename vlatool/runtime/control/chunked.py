@@ -19,7 +19,6 @@ class ChunkQueue:
     Steps that overlap are refused: the actions of one chunk are one robot's. A reset waits for the step under way.
 
     Args:
-        policy: The policy that infers.
         execute: Actions taken from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
 
     Raises:

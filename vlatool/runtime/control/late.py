@@ -26,7 +26,6 @@ class LateController(ChunkQueue):
     for. ``act`` runs the inference itself and withholds the chunk, so that the actions depend on ``delay`` alone.
 
     Args:
-        policy: The policy that infers.
         execute: Actions taken from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
         delay: Control steps that an inference takes: whole ones, for one that ends within its own step is in time.
 

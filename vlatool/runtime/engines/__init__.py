@@ -48,7 +48,7 @@ def build_tool(name: str) -> Any:
     return require(f"onnxruntime.{name}", "ort")
 
 
-def traced(path: Path, scratch: Path) -> OrtProfiled:
+def open_traced(path: Path, scratch: Path) -> OrtProfiled:
     """Open a graph as it is written, without any rewriting, to see what its nodes are fed and give.
 
     Raises:

@@ -20,8 +20,8 @@ class BranchesSession(OrtCpuSession):
 
     @classmethod
     def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
-        if arithmetic.ort_product(ort) >= arithmetic.WANTED:
+        if arithmetic.ort_product(ort) >= arithmetic.EXACT_SUM:
             return super()._open(ort, model, threads)
         options = session_options(ort, threads)
-        options.add_session_config_entry(*arithmetic.UNFUSED)
+        options.add_session_config_entry(*arithmetic.UNFUSED_OPTION)
         return open_session(ort, model, options)

@@ -29,7 +29,7 @@ NO_CPU_FALLBACK = ("session.disable_cpu_ep_fallback", "1")
 """The option of ONNX Runtime (``onnxruntime_session_options_config_keys.h``) that refuses a graph with nodes that none
 of the named providers runs; left alone it computes them on the processor without a word."""
 CUT_OFF_REWRITES = ["ReluQuantRewrite", "ClipQuantRewrite"]
-SMALL = 256 * 1024
+MAX_BOUND_BYTES = 256 * 1024
 """Bytes of all inputs and outputs up to which a run goes through buffers that are bound once."""
 NUMPY_OF: dict[str, np.dtype[Any]] = {
     "tensor(float)": np.dtype(np.float32),
@@ -155,7 +155,7 @@ class OnnxRuntimeSession(Engine):
         return "; ".join([*parts, *gpus(), *filter(None, [gpu_driver()])])
 
     @classmethod
-    def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
+    def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
         """Open a graph with ONNX Runtime's trace of every node on.
 
         Raises:
@@ -296,7 +296,7 @@ class BoundBuffers:
         small = {name: buffer for name, buffer in inputs.items() if buffer is not None}
         results = {name: buffer for name, buffer in outputs.items() if buffer is not None}
         total = sum(buffer.nbytes for buffer in (*small.values(), *results.values()))
-        if len(small) < len(inputs) or len(results) < len(outputs) or total > SMALL:
+        if len(small) < len(inputs) or len(results) < len(outputs) or total > MAX_BOUND_BYTES:
             return None
         return (cls if memory == HOST else DeviceBuffers)(session, ort, small, results, memory)
 
@@ -337,7 +337,7 @@ def _buffer(node: Any) -> Array | None:
     dtype = NUMPY_OF.get(str(node.type))
     if dtype is None or not all(isinstance(size, int) for size in node.shape):
         return None
-    if 0 in node.shape or int(np.prod(node.shape)) * dtype.itemsize > SMALL:
+    if 0 in node.shape or int(np.prod(node.shape)) * dtype.itemsize > MAX_BOUND_BYTES:
         return None
     return np.zeros(node.shape, dtype)
 

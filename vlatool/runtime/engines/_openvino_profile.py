@@ -54,7 +54,6 @@ def fused_names(compiled: Any, known: Mapping[str, str]) -> dict[str, tuple[str,
     often the quantization of what it gives.
 
     Args:
-        compiled: The compiled model.
         known: Name of each node as it was read -> its operator type.
     """
     names: dict[str, tuple[str, str]] = {}

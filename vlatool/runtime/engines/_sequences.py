@@ -16,9 +16,6 @@ def joins_a_sequence(model: Any) -> bool:
     OpenVINO (2026.4) generates one kernel for Linear, GELU, Linear on matrices. Where the sum of a residual connection
     behind it does not fit into that kernel, as with a bias in both, it reads the kernel as one that it could still add
     to, and a null pointer ends the process.
-
-    Args:
-        model: An ``openvino.Model``.
     """
     products: dict[str, int] = {}  # of what varies with an input: how many products without anything else between
     for node in model.get_ordered_ops():

@@ -86,7 +86,7 @@ class OpenvinoSession(Engine):
             core = openvino.Core()
             model = core.read_model(io.BytesIO(content) if isinstance(content, bytes) else str(content))
             declared = [[port.get_any_name() for port in ports] for ports in (model.inputs, model.outputs)]
-            self._compiled = compiled(core, model, settings)
+            self._compiled = compile_for_cpu(core, model, settings)
             self._request = self._compiled.create_infer_request()
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
             words = f"OpenVINO {self.version()} refuses {path}: {_last_line(error)}"
@@ -238,14 +238,14 @@ class OpenvinoSession(Engine):
         return plans
 
     @classmethod
-    def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
+    def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
         """Open a graph with OpenVINO's counters of every node on.
 
         Raises:
             GraphError: when OpenVINO refuses it.
         """
         settings = {**settings_for(threads, compute), "PERF_COUNT": True}
-        return OpenvinoProfiled(cls.library(), path, lambda core, model: compiled(core, model, settings))
+        return OpenvinoProfiled(cls.library(), path, lambda core, model: compile_for_cpu(core, model, settings))
 
     @classmethod
     def node_precision(cls, node: Node) -> str:
@@ -288,7 +288,7 @@ def _without_float8(model: Path | bytes) -> str:
     return ""
 
 
-def compiled(core: Any, model: Any, settings: dict[str, Any]) -> Any:
+def compile_for_cpu(core: Any, model: Any, settings: dict[str, Any]) -> Any:
     """Compile a model for the CPU; where that fails or would crash, without kernels generated for several operators.
 
     OpenVINO (2026.4) takes Linear, Mish, Linear for a sequence that it can generate code for, and then has none for

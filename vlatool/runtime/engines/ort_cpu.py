@@ -48,11 +48,11 @@ class OrtCpuSession(OnnxRuntimeSession):
         products would end the process, pairs are computed in float, which is exact, too.
         """
         entries: list[tuple[str, str] | None] = [None]
-        if arithmetic.ort_product(ort) < arithmetic.WANTED and not is_true_of(weights_fit, model):
+        if arithmetic.ort_product(ort) < arithmetic.EXACT_SUM and not is_true_of(weights_fit, model):
             breaks = is_true_of(arithmetic.breaks_precise, ort, model)
-            entries = [] if breaks else [arithmetic.PRECISE, arithmetic.SIGNED]
+            entries = [] if breaks else [arithmetic.PRECISE_OPTION, arithmetic.SIGNED_OPTION]
         option_sets = []
-        for entry in (*entries, arithmetic.UNFUSED):
+        for entry in (*entries, arithmetic.UNFUSED_OPTION):
             option_sets.append(session_options(ort, threads))
             if entry is not None:
                 option_sets[-1].add_session_config_entry(*entry)

@@ -27,7 +27,7 @@ from onnx import TensorProto, helper
 from vlatool.bundle.bundle import Bundle, replace_manifest, seal
 from vlatool.bundle.manifest import FileRecord
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data import DRAWN, Drawer, read_recording
+from vlatool.data import RANDOM_KIND, Drawer, read_recording
 from vlatool.evaluate.recorded import run_recorded
 from vlatool.runtime.golden import load_goldens
 from vlatool.runtime.policy import Policy
@@ -357,7 +357,7 @@ def tiny(base: Bundle, out: Path) -> Bundle:
     random = np.random.default_rng(0)
     for path in sorted((out / "data").glob("*.npz")):
         drawn = Drawer(base, [read_recording(path, base.manifest.spec)]).draw(320, random)
-        near = [each.observation for each in drawn if each.kind != DRAWN]
+        near = [each.observation for each in drawn if each.kind != RANDOM_KIND]
         np.savez(path, **{name: np.stack([np.asarray(each[name]) for each in near]) for name in near[0]})
         recording = read_recording(path, base.manifest.spec)
         right = run_recorded(base, recording, list(range(len(recording))), "", Context())

@@ -23,7 +23,7 @@ TABLES = {"studies", "trials", "trial_params", "version_info"}
 """Some of those that Optuna makes."""
 
 
-def check_place(url: str) -> None:
+def check_storage(url: str) -> None:
     """Refuse what cannot keep trials, without writing anything.
 
     Args:
@@ -31,7 +31,7 @@ def check_place(url: str) -> None:
 
     Raises:
         UsageError: for another kind of database, one whose driver is missing, or a file that cannot be.
-        DataError: for a file that is no journal, or a damaged one.
+        DataError: for a file that is not a journal, or a damaged one.
     """
     if not url.strip():
         raise UsageError("--study names no place.", EXAMPLES)
@@ -54,7 +54,7 @@ def _check_database(url: str) -> None:
         made = sqlalchemy.engine.make_url(url)
         dialect = made.get_dialect()
     except (sqlalchemy.exc.ArgumentError, ValueError) as error:
-        raise UsageError(f"The study {shown} is no address of a database that is known here.", EXAMPLES) from error
+        raise UsageError(f"The study {shown} is not the address of a known kind of database.", EXAMPLES) from error
     try:
         dialect.import_dbapi()
     except ImportError as error:
@@ -71,7 +71,7 @@ def _check_tables(path: Path, shown: str) -> None:
     """Refuse a database that is somebody else's: Optuna would write its tables among the others.
 
     Raises:
-        DataError: when it holds tables, and those of a study are not among them; or it is no database.
+        DataError: when it holds tables, and those of a study are not among them; or it is not a database.
     """
     if not path.is_file() or not path.stat().st_size:
         return
@@ -79,7 +79,7 @@ def _check_tables(path: Path, shown: str) -> None:
         with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
             tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except sqlite3.Error as error:
-        raise DataError(f"{shown} is no database of trials: {error}.", EXAMPLES) from error
+        raise DataError(f"{shown} is not a database of trials: {error}.", EXAMPLES) from error
     if tables and not tables >= TABLES:
         others = ", ".join(sorted(tables - TABLES)[:3])
         raise DataError(f"{shown} is not a study: it is a database with the tables {others}.", "name a new file")
@@ -123,9 +123,9 @@ def _is_record(line: bytes) -> bool:
 
 def _refuse_line(path: Path, number: int) -> None:
     if number == 1:
-        raise DataError(f"{path} is not a study: its first line is no record of trials.", "name a new file")
+        raise DataError(f"{path} is not a study: its first line is not a record of trials.", "name a new file")
     raise DataError(
-        f"The study {path} is damaged: line {number} is no record.",
+        f"The study {path} is damaged: line {number} is not a record.",
         f"keep what is before it: head -n {number - 1} {path} > repaired.journal, and name that file",
     )
 
@@ -157,9 +157,6 @@ class FileLock:
 
     ``flock`` on a file beside it, which also holds between machines that share an NFS. Optuna's own lock is a link that
     a killed process leaves.
-
-    Args:
-        path: The file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -202,7 +199,7 @@ def _locked(handle: int) -> bool:
 
 
 @contextlib.contextmanager
-def used(url: str) -> Iterator[None]:
+def storage_errors(url: str) -> Iterator[None]:
     """Turn what Optuna and its databases raise of a study into a sentence that tells no password."""
     try:
         yield

@@ -13,7 +13,7 @@ from vlatool.cli import main
 from vlatool.hardware.profile import Profile, load_profile
 from vlatool.optimize.pipeline import _write_bundle
 from vlatool.optimize.plan import make_plan
-from vlatool.optimize.pruned import PrunedSearch, front_of, with_measured
+from vlatool.optimize.pruning_search import PrunedSearch, front_of, with_measured
 from vlatool.optimize.recipe import read_recipe
 from vlatool.optimize.space import FLOAT32, Shape, Space
 from vlatool.optimize.study import Tried
@@ -109,7 +109,7 @@ def test_without_episodes_the_error_on_recorded_observations_decides(
         ([], "{tirals: 3}", 3, "tirals"),
         ([], "7", 3, "pruning"),
         (["--trials", "2", "--study", " "], "trials: 1", 2, "--study names no place"),
-        (["--trials", "2", "--study", "nothing://here"], "trials: 1", 2, "no address of a database"),
+        (["--trials", "2", "--study", "nothing://here"], "trials: 1", 2, "not the address of a known kind of database"),
         (["--trials", "2", "--study", "sqlite:////proc/none/x.db"], "trials: 1", 2, "a folder that does not exist"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,

@@ -15,7 +15,7 @@ from vlatool.files.npz import open_npz
 from vlatool.runtime.observation import EncodedObservation
 
 Array = NDArray[Any]
-PLAYED = "data/played.npz"
+OBSERVATIONS_FILE = "data/played.npz"
 BEGINS = "(begins)"
 """Array that says of each row whether an episode begins with it, where the policy keeps values."""
 MAX_PLAYED = 128
@@ -46,9 +46,9 @@ def played_observations(source: Bundle) -> list[Encoded]:
     Raises:
         DataError: when the file is corrupt, or does not fit the spec.
     """
-    if PLAYED not in source.manifest.files:
+    if OBSERVATIONS_FILE not in source.manifest.files:
         return []
-    path = source.file(PLAYED)
+    path = source.file(OBSERVATIONS_FILE)
     arrays = open_npz(path, fix=REMEDY)
     for tensor in source.manifest.spec.inputs:
         _check(path, tensor, arrays.get(tensor.name))

@@ -16,7 +16,6 @@ class Timed:
 
     Args:
         job: What each measures; process n has the seed ``job.seed + n``.
-        context: For progress.
         timeout: Seconds that a process may take.
         inputs: What the bundles are called with; drawn by each process from the baseline's spec when None.
     """

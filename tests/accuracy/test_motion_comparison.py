@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from vlatool.accuracy.moved import drops_by_task, ratios
-from vlatool.accuracy.paired import Outcome, compare_success, success_row
-from vlatool.evaluate._told import told
+from vlatool.accuracy.motion_comparison import drops_by_task, ratios
+from vlatool.accuracy.success_comparison import Outcome, compare_success, success_row
+from vlatool.evaluate._sentences import sentences
 from vlatool.measures import with_derived
 from vlatool.render._format import full
 from vlatool.report import Measurement, Row
@@ -146,8 +146,8 @@ def test_what_the_baseline_has_none_of_is_told_though_it_has_no_ratio():
     sentence = (
         "Where both succeed, the baseline has none of these: collisions (in 10 of 39 episodes, 0.513 on average)."
     )
-    assert sentence in told((baseline, row), "")
+    assert sentence in sentences((baseline, row), "")
     few = [outcome("a", seed, True, 10, collisions=2.0 if seed < 5 else 0.0) for seed in range(40)]
     baseline, row = rows([outcome("a", seed, True, 10, collisions=0.0) for seed in range(40)], few)
     assert row.value("collisions_added") == 0.25
-    assert not any("collisions" in said for said in told((baseline, row), "")), "five may be chance"
+    assert not any("collisions" in said for said in sentences((baseline, row), "")), "five may be chance"

@@ -11,7 +11,7 @@ import pytest
 
 from tests._reach import folder_of
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import MAX_PLAYED, PLAYED, Encoded, kept_rows, played_observations, recorded_observations
+from vlatool.data import MAX_PLAYED, OBSERVATIONS_FILE, Encoded, kept_rows, played_observations, recorded_observations
 from vlatool.errors import DataError
 from vlatool.quantize.calibration.activation_statistics import calibrate
 from vlatool.quantize.static_int8 import StaticInt8
@@ -36,7 +36,7 @@ def test_what_was_written_is_read_and_gives_the_statistics_of_the_raw_observatio
 ):
     bundle = copied(float_bundle)
     assert played_observations(bundle) == []
-    save_npz(bundle.path / PLAYED, encoded_rows(bundle))
+    save_npz(bundle.path / OBSERVATIONS_FILE, encoded_rows(bundle))
     bundle = resealed(bundle)
     played = played_observations(bundle)
     assert len(played) == 12
@@ -69,7 +69,7 @@ def test_a_wrong_file_is_refused(
     bundle = copied(float_bundle)
     rows = encoded_rows(bundle)
     change(rows)
-    save_npz(bundle.path / PLAYED, rows)
+    save_npz(bundle.path / OBSERVATIONS_FILE, rows)
     with pytest.raises(DataError, match=why):
         run_transform(StaticInt8(), resealed(bundle), tmp_path / "int8", Context())
 
@@ -78,9 +78,9 @@ def test_a_damaged_file_is_refused(
     float_bundle: Bundle, copied: Callable[[Bundle], Bundle], resealed: Callable[[Bundle], Bundle], tmp_path: Path
 ):
     bundle = copied(float_bundle)
-    save_npz(bundle.path / PLAYED, encoded_rows(bundle))
-    whole = (bundle.path / PLAYED).read_bytes()
-    (bundle.path / PLAYED).write_bytes(whole[: len(whole) // 2])
+    save_npz(bundle.path / OBSERVATIONS_FILE, encoded_rows(bundle))
+    whole = (bundle.path / OBSERVATIONS_FILE).read_bytes()
+    (bundle.path / OBSERVATIONS_FILE).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"played\.npz"):
         run_transform(StaticInt8(), resealed(bundle), tmp_path / "int8", Context())
 
@@ -122,11 +122,11 @@ def test_an_input_may_be_called_as_it_likes_and_a_second_training_keeps_its_own(
                                    .replace("(state)", "(file)").replace("state[", "file["))  # fmt: skip
     source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context())
     once = run_transform(build_stage("quantize.qat", QUICK), source, tmp_path / "once", Context())
-    before = (once.path / PLAYED).read_bytes()
+    before = (once.path / OBSERVATIONS_FILE).read_bytes()
     other = {**QUICK, "first_seed": 2_000_000}
     twice = run_transform(build_stage("quantize.qat", other), once, tmp_path / "twice", Context())
     assert [set(bundle) for bundle in played_observations(twice)[:1]] == [{"file"}]
-    assert (once.path / PLAYED).read_bytes() == before != (twice.path / PLAYED).read_bytes()
+    assert (once.path / OBSERVATIONS_FILE).read_bytes() == before != (twice.path / OBSERVATIONS_FILE).read_bytes()
 
 
 def test_a_policy_without_recordings_calibrates_on_its_training(tmp_path: Path):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from vlatool.accuracy.paired import Outcome, success_row
-from vlatool.accuracy.shown import differs_most, with_episode
+from vlatool.accuracy.episode_choice import differs_most, with_episode
+from vlatool.accuracy.success_comparison import Outcome, success_row
 
 
 def outcome(seed: int, success: bool = True, steps: int = 40, jerk: float = 1.0) -> Outcome:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vlatool.accuracy.paired import Outcome
-from vlatool.accuracy.shown import differs_most, stands_out
+from vlatool.accuracy.episode_choice import differs_most, stands_out
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.film import Film
 from vlatool.episodes.filmable import check_filmable
@@ -33,8 +33,6 @@ class Again:
 
     Args:
         outcomes: With their steps, the baseline's first; empty where it could not be played, or is shown by no report.
-        sentences: What the video shows.
-        warnings: Why there is no video.
     """
 
     outcomes: tuple[Outcome, ...] = ()
@@ -70,17 +68,14 @@ def played_again(
     All that is measured was measured before, so that nothing here fails: what cannot be shown is left out.
 
     Args:
-        job: Of any episodes.
         played: Outcomes of all episodes, the baseline's first, when there is one.
-        plays: Play jobs, one for each.
-        bundles: The variants.
         context: Says where the video is to be written.
     """
     paired = len(played) > 1
     if not paired and not context.video:
         return Again()
-    place, why = _place(played)
-    before = [outcomes[place] for outcomes in played]
+    index, why = _place(played)
+    before = [outcomes[index] for outcomes in played]
     again = replace(job, task=before[-1].task, seeds=(before[-1].seed,), show=True)
     warnings = []
     if context.video:
@@ -110,8 +105,8 @@ def _unrepeatable(before: Sequence[Outcome], outcomes: Sequence[Outcome], names:
 def _place(played: Sequence[list[Outcome]]) -> tuple[int, str]:
     if len(played) > 1:
         return differs_most(played[0], played[-1]), "the episode in which the variants differ most"
-    place = stands_out(played[0])
-    return place, "the longest episode" if played[0][place].success else "the first episode that fails"
+    index = stands_out(played[0])
+    return index, "the longest episode" if played[0][index].success else "the first episode that fails"
 
 
 def _drawn(again: EpisodesJob, plays: Sequence[Play]) -> tuple[Outcome, ...]:
@@ -127,7 +122,7 @@ def _filmed(
     """Play the episode, film it and write the video; return its outcomes, and what is to be seen."""
     context.progress("filming an episode", None)
     with scratch_directory() as scratch:
-        folders = [scratch / str(place) for place in range(len(plays))]
+        folders = [scratch / str(index) for index in range(len(plays))]
         found = [play([replace(again, film=str(folder))])[0] for play, folder in zip(plays, folders, strict=True)]
         names = names_of(bundles)
         shots = [_shot(name, outcome, Film.open(folder))

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.accuracy.success_comparison import Outcome, compare_success, success_row
 from vlatool.measures import series, tables
 from vlatool.measures.motion import RATIO, STEPS_RATIO
 from vlatool.measures.success import DISTURBED_DROP, SUCCESS, SUCCESS_DISTURBED, SUCCESS_DROP
@@ -18,7 +18,7 @@ from vlatool.stats.success_sequential import exact_drop
 Played = Sequence[Outcome]
 Disturbance = tuple[str, float]
 """Kind and strength."""
-SHOWN = {"task_time": "task time", "path_length": "path", "jerk": "jerk", "action_rate": "action rate"}
+TABLE_METRICS = {"task_time": "task time", "path_length": "path", "jerk": "jerk", "action_rate": "action rate"}
 """Metrics of motion that the table has, where both succeed."""
 
 
@@ -61,7 +61,6 @@ def without_effect(name: str, played: Mapping[Disturbance, Played], undisturbed:
     """Yield a warning for each disturbance that changed nothing, so that what is kept under it shows nothing.
 
     Args:
-        name: Of the variant.
         played: Disturbance -> its episodes, of one seed after the other.
         undisturbed: Those of the same seeds without any.
     """
@@ -79,11 +78,7 @@ def _course(outcome: Outcome) -> tuple[Any, ...]:
 
 
 def worst_record(row: Row) -> tuple[Mapping[str, Any], str] | None:
-    """Return the line of the table under which most is lost, and its disturbance in words; None without a table.
-
-    Args:
-        row: Of ``with_disturbed``.
-    """
+    """Return the line of the table under which most is lost, and its disturbance in words; None without a table."""
     table = row.details.get(tables.UNDER)
     if not table:
         return None
@@ -129,5 +124,5 @@ def _record(kind: str, strength: float, row: Row, base: Sequence[Outcome] | None
     record["success"] = round(row.value(SUCCESS), 4)
     if drop := row.get(SUCCESS_DROP):
         record |= {"drop": round(drop.value, 4), "low": round(drop.low or 0.0, 4), "high": round(drop.high or 0.0, 4)}
-    ratios = {"steps": STEPS_RATIO, **{words: RATIO.quantity(name) for name, words in SHOWN.items()}}
+    ratios = {"steps": STEPS_RATIO, **{words: RATIO.quantity(name) for name, words in TABLE_METRICS.items()}}
     return record | {f"{words}, x": round(ratio.value, 3) for words, one in ratios.items() if (ratio := row.get(one))}

@@ -25,8 +25,8 @@ from vlatool.errors import DataError
 from vlatool.runtime.statistics import Normaliser, load_normaliser
 
 Array = NDArray[Any]
-RECORDED, OTHER, DRAWN = "recorded", "other", "drawn"
-PATTERN = (RECORDED, OTHER, RECORDED, DRAWN)
+RECORDED_KIND, REWORDED_KIND, RANDOM_KIND = "recorded", "other", "drawn"
+PATTERN = (RECORDED_KIND, REWORDED_KIND, RECORDED_KIND, RANDOM_KIND)
 EXTREME = 4.0
 """Standard deviations (or halves of the range) up to which a state is drawn."""
 LENGTHS = (0, 1, 2, 3, 5, 8, 13)
@@ -52,7 +52,6 @@ class Drawer:
 
     Args:
         bundle: Whose spec, vocabulary and statistics say what an observation may hold.
-        recordings: Of that spec.
 
     Raises:
         SpecError: when statistics are missing or do not fit.
@@ -69,10 +68,10 @@ class Drawer:
 
     def draw(self, count: int, random: np.random.Generator) -> list[Drawn]:
         """Return ``count`` observations of all kinds that can be drawn, in random order."""
-        kinds = [PATTERN[number % len(PATTERN)] if self._recordings else DRAWN for number in range(count)]
+        kinds = [PATTERN[number % len(PATTERN)] if self._recordings else RANDOM_KIND for number in range(count)]
         drawn = partial(self._drawn, structured=Structures(random))
         makers: dict[str, Callable[[np.random.Generator], dict[str, Any]]]
-        makers = {RECORDED: self._recorded, OTHER: self._other, DRAWN: drawn}
+        makers = {RECORDED_KIND: self._recorded, REWORDED_KIND: self._other, RANDOM_KIND: drawn}
         return [Drawn(kinds[index], makers[kinds[index]](random)) for index in random.permutation(count)]
 
     def _recorded(self, random: np.random.Generator) -> dict[str, Any]:
@@ -193,9 +192,6 @@ class Structures:
 
     Which one an input begins with is drawn. Extremes come in pairs of opposite signs, so that of eight observations one
     has each element at its highest, and one at its lowest: left to chance, some gates would see neither.
-
-    Args:
-        random: Of all values.
     """
 
     def __init__(self, random: np.random.Generator) -> None:

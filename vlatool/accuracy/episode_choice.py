@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from vlatool.accuracy.paired import Outcome
+from vlatool.accuracy.success_comparison import Outcome
 from vlatool.measures import series, tables
 from vlatool.report import Row
 
@@ -13,18 +13,18 @@ from vlatool.report import Row
 def differs_most(base: Sequence[Outcome], own: Sequence[Outcome]) -> int:
     """Return the place of the pair that differs most: in success, then in steps, then in the worst ratio of motion."""
 
-    def difference(place: int) -> tuple[float, ...]:
-        one, two = base[place], own[place]
+    def difference(index: int) -> tuple[float, ...]:
+        one, two = base[index], own[index]
         alike = (abs(two.motion[name] - value) / value for name, value in one.motion.items()
                  if value > 0 and name in two.motion)  # fmt: skip
-        return abs(one.success - two.success), abs(one.steps - two.steps), max(alike, default=0.0), -place
+        return abs(one.success - two.success), abs(one.steps - two.steps), max(alike, default=0.0), -index
 
     return max(range(len(base)), key=difference)
 
 
 def stands_out(outcomes: Sequence[Outcome]) -> int:
     """Return the place of the first episode that fails; of the longest one where none does."""
-    return max(range(len(outcomes)), key=lambda place: (not outcomes[place].success, _length(outcomes[place]), -place))
+    return max(range(len(outcomes)), key=lambda index: (not outcomes[index].success, _length(outcomes[index]), -index))
 
 
 def _length(outcome: Outcome) -> int:

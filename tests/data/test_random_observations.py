@@ -10,7 +10,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import Drawer, read_drawn, read_recording, save_drawn
-from vlatool.data._drawn import EXTREME, words_of
+from vlatool.data._random_observations import EXTREME, words_of
 from vlatool.errors import DataError
 
 VOCABULARY = {"go", "to", "the", "red", "blue", "ball", "box"}

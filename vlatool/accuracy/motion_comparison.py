@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.accuracy.doubt import KNOWN, Cause, Doubt
+from vlatool.accuracy.doubt import MIN_KNOWN_SHARE, Cause, Doubt
 from vlatool.measures import Quantity, series, tables
 from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
 from vlatool.measures.success import WORST_TASK_DROP
@@ -22,12 +22,12 @@ from vlatool.stats.success_sequential import exact_drop
 
 Array = NDArray[np.float64]
 AGAINST = {series.TASK: tables.AGAINST_BY_TASK, series.INSTRUCTION: tables.AGAINST_BY_INSTRUCTION}
-NAMED = ", the worst of "
+WORST_TASK_PREFIX = ", the worst of "
 """What follows the name of the task in the note of that measurement."""
 CONFIDENCE = 0.95
 DOUBT = 0.25
-"""Chance below which it is no accident that the variant's values are missing more often (an exact sign test): the doubt
-is not the baseline's, so that two episodes suffice."""
+"""Chance (an exact sign test) below which it is not an accident that the variant's values are missing more often: the
+doubt is not the baseline's, so that two episodes suffice."""
 LONGEST = 20
 """Tasks, or instructions, of a table: those that lose most."""
 
@@ -97,7 +97,7 @@ def drops_by_task(baseline: Row, row: Row, confidence: float = CONFIDENCE) -> di
 
 def worst_task(drop: Measurement) -> str:
     """Return the name of the task that a measurement of ``WORST_TASK_DROP`` is about."""
-    return drop.note.partition(NAMED)[0]
+    return drop.note.partition(WORST_TASK_PREFIX)[0]
 
 
 def _ratio(
@@ -152,7 +152,7 @@ class _Pairs:
         total = int(self._both.sum())
         ours, theirs = (int((self._both & ~one & other).sum()) for one, other in ((own, base), (base, own)))
         known = int((self._both & own & base).sum())
-        if total and known < KNOWN * total:
+        if total and known < MIN_KNOWN_SHARE * total:
             return Doubt(Cause.RARELY_KNOWN, known, total)
         if ours > theirs and sign_test(ours, ours + theirs) <= DOUBT:
             return Doubt(Cause.MISSING_MORE_OFTEN, ours, theirs)
@@ -197,8 +197,8 @@ class _Pairs:
         if series.TASK not in self._places:
             return
         longest = np.zeros(len(steps[0]))
-        for place in range(len(self._names[series.TASK])):
-            own = self._places[series.TASK] == place
+        for index in range(len(self._names[series.TASK])):
+            own = self._places[series.TASK] == index
             longest[own] = max(one[own].max() for one in steps)
         base, own = (np.where(won, one, longest) for won, one in zip(self._wins, steps, strict=True))
         if ratio := self._ratio_of(own, base, np.ones(len(own), bool)):
@@ -210,15 +210,15 @@ class _Pairs:
         drops = self.drops()
         if len(drops) > 1:
             name = max(drops, key=lambda task: drops[task].value)
-            yield replace(drops[name], note=f"{name}{NAMED}{len(drops)} tasks")
+            yield replace(drops[name], note=f"{name}{WORST_TASK_PREFIX}{len(drops)} tasks")
 
     def drops(self) -> dict[str, Measurement]:
         """Return task -> its drop; all intervals together have the coverage of the pairs (Bonferroni)."""
         names = self._names.get(series.TASK, [])
         confidence = 1 - (1 - self._confidence) / max(1, len(names))
         drops = {}
-        for place, name in enumerate(names):
-            (value, low, high), count = self._drop(self._places[series.TASK] == place, confidence)
+        for index, name in enumerate(names):
+            (value, low, high), count = self._drop(self._places[series.TASK] == index, confidence)
             drops[name] = WORST_TASK_DROP.measurement(
                 value, samples=count, low=low, high=high, confidence=confidence, note=name
             )
@@ -227,8 +227,8 @@ class _Pairs:
     def table(self, key: str) -> list[dict[str, Any]]:
         """Return how each task, or instruction, does and moves, that which loses most first."""
         records = []
-        for place, name in enumerate(self._names.get(key, ())):
-            own = self._places[key] == place
+        for index, name in enumerate(self._names.get(key, ())):
+            own = self._places[key] == index
             (value, low, high), count = self._drop(own, self._confidence)
             before, after = (float(won[own].mean()) for won in self._wins)
             record: dict[str, Any] = {
@@ -255,8 +255,8 @@ class _Pairs:
     def _worst_of(self, own: Array, base: Array, known: NDArray[np.bool_]) -> Iterator[str]:
         """Yield the task whose ratio is the largest, as a part of a note, where there are several tasks."""
         ratios = []
-        for place, name in enumerate(self._names.get(series.TASK, ())):
-            chosen = known & (self._places[series.TASK] == place)
+        for index, name in enumerate(self._names.get(series.TASK, ())):
+            chosen = known & (self._places[series.TASK] == index)
             if chosen.sum() >= MIN_PAIRS and base[chosen].mean() > 0:
                 ratios.append((float(own[chosen].mean() / base[chosen].mean()), name))
         if len(ratios) > 1:

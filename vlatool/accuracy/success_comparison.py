@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from vlatool.accuracy.doubt import Cause, Doubt
-from vlatool.accuracy.moved import compare_motion
+from vlatool.accuracy.motion_comparison import compare_motion
 from vlatool.errors import DataError
 from vlatool.measures import series, tables
 from vlatool.measures.motion import mean_of
@@ -31,9 +31,6 @@ class Outcome:
     """How one episode ended.
 
     Args:
-        task: Of the environment.
-        seed: Of the reset.
-        success: Whether it succeeded.
         steps: Control steps that it took.
         instruction: What the policy was told; empty for one that takes no text.
         motion: Metric of motion -> its number.
@@ -100,21 +97,13 @@ def _starts(starts: Sequence[Hashable]) -> str:
 
 
 def few_starts(row: Row) -> Doubt | None:
-    """Return why episodes decide nothing: they repeat their first observations, and have too few; None otherwise.
-
-    Args:
-        row: Of ``success_row``.
-    """
+    """Return why episodes decide nothing: they repeat their first observations, and have too few; None otherwise."""
     starts = row.raw.get(series.START, [])
     return Doubt(Cause.REPEATED_STARTS, distinct_starts(starts), len(starts)) if has_too_few_starts(starts) else None
 
 
 def repeated_starts(row: Row) -> tuple[str, ...]:
-    """Return a sentence where episodes begin alike, so that they say less than their number promises.
-
-    Args:
-        row: Of ``success_row``.
-    """
+    """Return a sentence where episodes begin alike, so that they say less than their number promises."""
     starts = row.raw.get(series.START, [])
     count, size = distinct_starts(starts), independent_starts(starts)
     if count == len(starts):
@@ -146,7 +135,7 @@ def _refused(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
 
 def _places(table: list[dict[str, Any]], column: str, values: Sequence[str]) -> list[float]:
     """Return the place of each value in a table."""
-    places = {record[column]: float(place) for place, record in enumerate(table)}
+    places = {record[column]: float(index) for index, record in enumerate(table)}
     return [places[value] for value in values]
 
 

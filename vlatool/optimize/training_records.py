@@ -27,9 +27,7 @@ def with_wrong_instruction(row: Row, told: Measurement | None, reference: Measur
     """Return the row of a trained candidate with how often it succeeds when it is told the wrong instruction.
 
     Args:
-        row: With what ``with_trainings`` adds.
         told: The candidate's success; None where it is not known.
-        reference: That of float32.
     """
     if told is None or reference is None:
         return row

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vlatool.accuracy.paired import compare_success
+from vlatool.accuracy.success_comparison import compare_success
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import carries_evaluation
@@ -22,14 +22,14 @@ from vlatool.measures.latency import SPEEDUP
 from vlatool.measures.success import SUCCESS_DROP
 from vlatool.measures.training import TRAINING_TIME
 from vlatool.optimize.budget import budget_of
-from vlatool.optimize.made import candidate
+from vlatool.optimize.build_candidates import candidate
 from vlatool.optimize.moves import Held, judge_moves
 from vlatool.optimize.plan import Plan, transforms
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.search import QUICK
 from vlatool.optimize.space import Shape, Space, quantizations, space_of
 from vlatool.optimize.study import Study, Tried
-from vlatool.optimize.trained import trainings
+from vlatool.optimize.training_records import trainings
 from vlatool.report import Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
@@ -39,10 +39,10 @@ from vlatool.stage.run import cached_measure
 SELECTION_SEEDS = 2 * EVALUATION_SEEDS
 """First seed of the episodes that trials play: no training may reach it, and no evaluation is so long."""
 FINALISTS = 3
-TIMED = 60
-SAID = "the study says"
-NOT_MEASURED = "not measured in this run"
-MEASURED_AGAIN = "measured as a candidate"
+TIMED_RUNS = 60
+STUDY_COLUMN = "the study says"
+UNMEASURED_NOTE = "not measured in this run"
+CANDIDATE_NOTE = "measured as a candidate"
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,7 @@ class PrunedSearch:
 
     Args:
         plan: With the recipe; its candidates are how a pruned policy may be quantized.
-        source: Of the policy.
         baseline: The whole policy in float32.
-        context: For progress.
     """
 
     plan: Plan
@@ -70,22 +68,22 @@ class PrunedSearch:
         """
         if study := self.plan.recipe.pruning.study:
             return self._run(study)
-        place = self.plan.cache / STREAMS / f"optimize.trials-{self._name().rpartition('-')[2]}"
-        with work_directory(place):  # of this machine, so that an interrupted run goes on
-            return self._run(f"sqlite:///{place.absolute() / 'trials.db'}")
+        directory = self.plan.cache / STREAMS / f"optimize.trials-{self._name().rpartition('-')[2]}"
+        with work_directory(directory):  # of this machine, so that an interrupted run goes on
+            return self._run(f"sqlite:///{directory.absolute() / 'trials.db'}")
 
     def _run(self, url: str) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
         pruning = self.plan.recipe.pruning
         study = Study(url, self._name(), self._allowed, pruning.seed)
-        quantized = study.agreed(self._quantizations())
+        quantized = study.agree_on(self._quantizations())
         space = space_of(self.source, pruning, quantized, self.plan.cache, self.context)
         study.begin(space)
         while (asked := study.ask(pruning.trials)) is not None:
             number, shape = asked
-            place = len(study.tried()) + 1  # numbers of the study count shapes that were asked for twice, too
-            self.context.progress(f"trial {place} of {pruning.trials}: {space.name(shape)}", None)
+            count = len(study.ended_trials()) + 1  # numbers of the study count shapes that were asked for twice, too
+            self.context.progress(f"trial {count} of {pruning.trials}: {space.name(shape)}", None)
             study.tell(number, self._try(shape, space))
-        tried = study.tried()
+        tried = study.ended_trials()
         chosen = self._finalists(tried, space)
         return (
             {space.name(each.shape): space.stages(each.shape) for each in chosen},
@@ -131,7 +129,7 @@ class PrunedSearch:
     def _speedup(self, bundle: Bundle) -> float:
         engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self.plan.board_set.is_confined else ""
         threads = self.plan.recipe.effort.threads
-        timing = Latency(against=(bundle.path,), iterations=TIMED, threads=threads, engine=engine, **QUICK)
+        timing = Latency(against=(bundle.path,), iterations=TIMED_RUNS, threads=threads, engine=engine, **QUICK)
         return cached_measure(timing, self.baseline, self.plan.cache, self.context).rows[-1].value(SPEEDUP)
 
     def _judged(self, bundle: Bundle) -> tuple[float, Held]:
@@ -169,7 +167,7 @@ class PrunedSearch:
         inside.sort(key=lambda each: (bool(each.refused), -each.speedup))
         return inside[:FINALISTS] or sorted(pruned, key=lambda each: each.drop)[:1]
 
-    def _told(self, drop: float) -> str:
+    def _describe_drop(self, drop: float) -> str:
         if not math.isfinite(drop):
             return ""
         points = self.plan.closed_loop is not None and not self.plan.recipe.limits.metric
@@ -190,17 +188,19 @@ class PrunedSearch:
         speed = f"{each.speedup:.2f}x" if each.speedup else ""
         note = each.note or each.refused
         if each.elsewhere:
-            said = ", ".join(filter(None, (speed, self._told(each.drop) and f"drop {self._told(each.drop)}", note)))
-            words = {"note": NOT_MEASURED, SAID: said or "nothing"}
+            said = ", ".join(
+                filter(None, (speed, self._describe_drop(each.drop) and f"drop {self._describe_drop(each.drop)}", note))
+            )
+            words = {"note": UNMEASURED_NOTE, STUDY_COLUMN: said or "nothing"}
             return dict.fromkeys(("speed-up", "drop", "within", "on the front", "training"), "") | words
         return {
             "speed-up": speed,
-            "drop": self._told(each.drop),
+            "drop": self._describe_drop(each.drop),
             "within": "yes" if each.drop <= self._allowed and not each.refused else "no",
             "on the front": "yes" if on_the_front else "",
             "training": f"{each.training_s / 60:.1f} min" if each.training_s else "",
             "note": note,
-            SAID: "",
+            STUDY_COLUMN: "",
         }
 
 
@@ -208,14 +208,13 @@ def with_measured(table: list[dict[str, Any]], rows: Mapping[str, Row]) -> list[
     """Return the trials with the speed-up and the drop of those that were measured in this run after all.
 
     Args:
-        table: Of ``PrunedSearch.run``.
         rows: Name -> row of each candidate, as it was measured.
     """
     lines = []
     for line in table:
         speed = rows[line["policy"]].get(SPEEDUP) if line["policy"] in rows else None
         if not line["within"] and speed is not None and speed.known:
-            line = {**line, "speed-up": f"{speed.value:.2f}x", "note": MEASURED_AGAIN}
+            line = {**line, "speed-up": f"{speed.value:.2f}x", "note": CANDIDATE_NOTE}
         lines.append(line)
     return lines
 

@@ -13,12 +13,7 @@ FIX = f"leave --first-seed out: evaluations begin at {EVALUATION_SEEDS}, where n
 
 
 def seen_in_training(bundles: Sequence[Bundle], jobs: Sequence[EpisodesJob]) -> tuple[str, ...]:
-    """Return a sentence for each training of a bundle that played some of the episodes.
-
-    Args:
-        bundles: The variants.
-        jobs: What is played.
-    """
+    """Return a sentence for each training of a bundle that played some of the episodes."""
     seeds = {seed for job in jobs for seed in job.seeds}
     tasks = len({job.task for job in jobs})
     sentences = []

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from vlatool.accuracy.disturbed import worst_record
-from vlatool.accuracy.moved import pairs_above_none, worst_task
+from vlatool.accuracy.disturbance_drops import worst_record
+from vlatool.accuracy.motion_comparison import pairs_above_none, worst_task
 from vlatool.measures.latency import LATENCY_IN_THE_LOOP
 from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
 from vlatool.measures.success import WORST_TASK_DROP
 from vlatool.report import Measurement, Row
 
-LEAST = 1.005
+MIN_RATIO = 1.005
 """Ratio below which two decimals say 1.00, and nothing is worth a sentence."""
 FEWEST_ADDED = 6
 """Pairs in which the variant alone has something, so that an exact two-sided sign test gives less than 5 %."""
 
 
-def told(rows: Sequence[Row], board: str) -> Iterator[str]:
+def sentences(rows: Sequence[Row], board: str) -> Iterator[str]:
     """Yield sentences on the last row.
 
     Args:
@@ -45,7 +45,7 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
 
 
 def _added(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield what the baseline has nothing of, and the variant in so many pairs that chance is no explanation."""
+    """Yield what the baseline has nothing of, and the variant in so many pairs that chance does not explain it."""
     if len(rows) < 2:
         return
     added = ADDED_MEAN.members(rows[-1])
@@ -71,7 +71,7 @@ def _disturbed(row: Row) -> Iterator[str]:
 
 def _is_more(ratio: Measurement) -> bool:
     """Say whether a ratio is shown to be above 1, by as much as is printed."""
-    return ratio.value >= LEAST and (ratio.low or 0.0) > 1
+    return ratio.value >= MIN_RATIO and (ratio.low or 0.0) > 1
 
 
 def _times(ratio: float) -> str:
