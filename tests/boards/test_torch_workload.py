@@ -100,7 +100,7 @@ def test_a_large_policy_is_counted_without_its_memory(tmp_path: Path) -> None:
     code = (
         "import json, resource, sys\nfrom pathlib import Path\nimport torch\n"
         "from vlatool.user_code import trust\nfrom vlatool.bundle.bundle import Bundle\n"
-        "from vlatool.boards.torch_workload import torch_workload\ntrust.name(Path(sys.argv[2]))\n"
+        "from vlatool.boards.torch_workload import torch_workload\ntrust.allow(Path(sys.argv[2]))\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "found = torch_workload(Bundle.open(Path(sys.argv[1]))).graphs['main']\n"
         "grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before\n"
