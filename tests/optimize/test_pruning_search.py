@@ -86,8 +86,8 @@ def test_without_episodes_the_error_on_recorded_observations_decides(
     search = PrunedSearch(plan, float_bundle, float_bundle, Context())
     drop, _ = search._judged(int8_bundle)
     assert 0 < drop < 0.2
-    assert search._told(drop) == f"{drop:.4g}"
-    assert search._told(float("inf")) == ""
+    assert search._describe_drop(drop) == f"{drop:.4g}"
+    assert search._describe_drop(float("inf")) == ""
 
 
 @pytest.mark.parametrize(
