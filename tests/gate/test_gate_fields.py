@@ -113,7 +113,7 @@ COMPARED: dict[str, tuple[Change, str]] = {
     "PolicySpec.outputs": (one_more_output, "output value: it is in the candidate alone"),
     "PolicySpec.control_hz": (spec(control_hz=1.0), r"control_hz 1\.0 in the candidate"),
     "PolicySpec.chunk": (spec(chunk=2, execute=0), "chunk 2 in the candidate"),
-    "PolicySpec.execute": (spec(execute=1), "executed_actions 1 in the candidate"),
+    "PolicySpec.execute": (spec(execute=1), "executed 1 in the candidate"),
     "ProgramStep.repeat": (step(repeat=3), "the program's repeat 3"),
     "ProgramStep.schedule": (step(schedule={"t": [1.0]}), "the program's schedule"),
     "ProgramStep.noise": (step(noise={"x": {"shape": [1, 2]}}), "the program's noise"),

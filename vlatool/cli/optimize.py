@@ -64,6 +64,7 @@ EveryCandidate = Annotated[
 StudyPlace = Annotated[
     str | None, typer.Option(help="file or database URL that keeps the trials, so that several machines share them")
 ]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout: the report, or the plan with --dry-run")]
 
 
 def optimize(
@@ -95,9 +96,7 @@ def optimize(
     fresh: Annotated[bool, typer.Option("--fresh", help="measure again, even what was measured before")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and stop")] = False,
     force: Force = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="print JSON on stdout: the report, or the plan with --dry-run")
-    ] = False,
+    as_json: AsJson = False,
     raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
 ) -> None:
     """Export a policy, quantize it in several ways, measure and evaluate each, and keep the fastest inside the budget.

@@ -16,7 +16,8 @@ from vlatool.graph.random_ops import random_operators
 
 MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite")
 """What a robot relies on; files of statistics and tokenizers may differ."""
-RATE = ("control_hz", "chunk", "executed_actions")
+RATE = {"control_hz": "control_hz", "chunk": "chunk", "executed": "executed_actions"}
+"""What a message calls a rate -> the field or property of the spec."""
 FEWER_STEPS = "prune.steps"
 ACCURACY = "accuracy"
 """The claim that alone says what steps are worth."""
@@ -129,7 +130,7 @@ def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
 
 
 def _rates(mine: Manifest, theirs: Manifest) -> str:
-    pairs = [(name, getattr(mine.spec, name), getattr(theirs.spec, name)) for name in RATE]
+    pairs = [(name, getattr(mine.spec, of), getattr(theirs.spec, of)) for name, of in RATE.items()]
     return "; ".join(text for name, one, two in pairs if (text := _difference(name, one, two)))
 
 

@@ -12,8 +12,8 @@ import pytest
 
 from vlatool.errors import GraphError, MissingExtra
 from vlatool.machine import host
-from vlatool.runtime.engines import OnnxRuntimeSession, _onnx_runtime
-from vlatool.runtime.engines._onnx_runtime import DeviceBuffers
+from vlatool.runtime.engines import OnnxRuntimeSession, _bound_buffers, _onnx_runtime
+from vlatool.runtime.engines._bound_buffers import DeviceBuffers
 from vlatool.runtime.engines._reference import ReferenceSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
@@ -103,7 +103,7 @@ def test_buffers_of_a_device_give_the_same_and_results_do_not_change_later(path:
 
 def test_a_class_chooses_the_memory_of_its_device(path: Path, monkeypatch) -> None:
     asked: list[str] = []
-    monkeypatch.setattr(_onnx_runtime, "DeviceBuffers", lambda *given: asked.append(given[-1]))
+    monkeypatch.setattr(_bound_buffers, "DeviceBuffers", lambda *given: asked.append(given[-1]))
     engine(CPU, memory="cuda")(path, 1)
     assert asked == ["cuda"]
 
