@@ -157,7 +157,7 @@ def test_a_path_is_text():
     outer = Outer((), file=Path("a/b"))
     assert to_json(outer, defaults=False) == {"inner": [], "file": "a/b"}
     assert from_json(Outer, {"inner": [], "file": "a/b"}) == outer
-    with pytest.raises(ValueError, match="'message.file' is 3, not text"):
+    with pytest.raises(ValueError, match=r"'message\.file' is 3, not text"):
         from_json(Outer, {"inner": [], "file": 3})
 
 
@@ -167,9 +167,9 @@ def test_null_is_nan_for_a_number_of_a_report_and_a_whole_number_stays_one():
     assert math.isnan(read.values["b"][1])
     assert math.isnan(from_json(Outer, {"inner": [], "scale": None}).scale)
     for wrong in ("1", True, [1]):
-        with pytest.raises(ValueError, match="'report.scale' is .*, not a number"):
+        with pytest.raises(ValueError, match=r"'report\.scale' is .*, not a number"):
             from_json(Outer, {"inner": [], "scale": wrong}, "report")
-    with pytest.raises(ValueError, match="'report.values.a' is 1.5, not a list"):
+    with pytest.raises(ValueError, match=r"'report\.values\.a' is 1\.5, not a list"):
         from_json(Outer, {"inner": [], "values": {"a": 1.5}}, "report")
 
 

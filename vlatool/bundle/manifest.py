@@ -161,10 +161,9 @@ class Manifest:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``from_dict`` turns back into an equal manifest; what has its default is left out."""
-        plain = {"schema": self.schema, **to_json(self, defaults=False)}
-        for name, nothing in {"graphs": {}, "program": [], "files": {}}.items():
-            plain.setdefault(name, nothing)
-        return plain | {"files": dict(sorted(plain["files"].items()))}
+        plain: dict[str, Any] = {"schema": self.schema, **to_json(self, defaults=False)}
+        plain |= {"graphs": plain.get("graphs", {}), "program": plain.get("program", [])}
+        return plain | {"files": dict(sorted(plain.get("files", {}).items()))}
 
 
 def check_files(manifest: Manifest) -> None:

@@ -60,7 +60,7 @@ def field_values(kind: type, value: Any, where: str, error: Kind) -> dict[str, A
 
 
 def _may_be_tuple(annotation: str) -> bool:
-    """Return whether a type is a tuple or an alternative of one; its text is enough, which a robot need not evaluate."""
+    """Return whether a type is or may be a tuple, from its text: nothing is evaluated where a robot loads a bundle."""
     return any(part.strip().startswith("tuple[") for part in annotation.split("|"))
 
 

@@ -25,13 +25,13 @@ class Claim(Numeric):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     needs: ClassVar[frozenset[Need]] = frozenset()
-    """Evidence that it looks at."""
+    """Evidence that the claim looks at."""
     by_default: ClassVar[bool] = False
     """Whether a gate file that does not name it claims it."""
     order: ClassVar[int] = 100
-    """Its position in a gate file, and among claims with the same needs."""
+    """Position in a gate file, and among claims with the same needs."""
     example: ClassVar[str] = ""
-    """Its lines in a new gate file; its name and the first line of its docstring when empty."""
+    """Lines in a new gate file; its name and the first line of its docstring when empty."""
 
     @classmethod
     def name(cls) -> str:

@@ -1,4 +1,4 @@
-"""Whether two bundles are versions of one policy: only those can be held against each other."""
+"""Check that two bundles are versions of one policy: only those can be held against each other."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from vlatool.graph.files import read
 from vlatool.graph.random_ops import random_operators
 
 MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite")
-"""What a robot relies on; files of statistics and tokenizers may differ."""
+"""Fields that a robot relies on; files of statistics and tokenizers may differ."""
 RATE = {"control_hz": "control_hz", "chunk": "chunk", "executed": "executed_actions"}
-"""What a message calls a rate -> the field or property of the spec."""
+"""Name of a rate in messages -> field or property of the spec."""
 FEWER_STEPS = "prune.steps"
 ACCURACY = "accuracy"
 """The claim that alone says what steps are worth."""
 LARGEST_TOLERANCE = 1.0
-"""Of a golden action: with more, ``load`` would accept any."""
+"""Largest tolerance of a golden action: with more, ``load`` would accept any."""
 
 
 def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
-    """Say before anything is measured why it cannot be.
+    """Refuse what cannot be compared, before anything is measured.
 
     Raises:
         BundleError: when a bundle has no graph or lacks the baseline's golden action, or the two have other inputs or

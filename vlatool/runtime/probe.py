@@ -99,9 +99,7 @@ def main() -> None:
 
 
 def _run(job: Job) -> dict[str, Any]:
-    policy = Policy.open(
-        Bundle.open(job.path), engine=job.engine, threads=job.threads, seed=0, memory_mb=job.memory_mb
-    )
+    policy = Policy.open(Bundle.open(job.path), engine=job.engine, threads=job.threads, seed=0, memory_mb=job.memory_mb)
     policy.replay_golden(1, job.first_run_s)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     refused = None
