@@ -11,7 +11,6 @@ import math
 import os
 import resource
 import shlex
-import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -22,14 +21,13 @@ from vlatool import errors
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, VlatoolError
 from vlatool.files.messages import from_json, to_json
+from vlatool.machine.processes import NO_MEMORY, python_code, signal_name
 from vlatool.runtime.contract import allowed_mb
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 
 START_S = 60.0
 """What the child may take beside its first run: Python, the engine's library, opening the graphs on a slow board."""
-NO_MEMORY = ("MemoryError", "bad_alloc", "bad allocation", "ailed to allocate", "ut of memory", "annot allocate")
-"""What Python, C++ and the engines say when a limit is reached."""
-CHILD = "import sys; sys.path[:0] = {path!r}; from vlatool.runtime import probe; probe.main()"
+CHILD = "from vlatool.runtime import probe; probe.main()"
 
 
 @dataclass(frozen=True)
@@ -73,8 +71,8 @@ def probe(
     job = Job(path, engine, threads, first_run_s, allowed)
     try:
         done = subprocess.run(
-            [sys.executable, "-I", "-c", CHILD.format(path=_search_path())],
-            input=json.dumps(to_json(job)), capture_output=True, text=True, check=False, timeout=START_S + first_run_s,
+            python_code(CHILD), input=json.dumps(to_json(job)), timeout=START_S + first_run_s,
+            capture_output=True, text=True, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise _too_long(path, START_S + first_run_s) from None
@@ -113,12 +111,6 @@ def _run(job: Job) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _search_path() -> list[str]:
-    """Return where this process finds modules, without the current directory and the script's."""
-    here = str(Path(__file__).parents[2])
-    return [here, *(entry for entry in sys.path[1:] if entry and entry != here and Path(entry).is_absolute())]
-
-
 def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) -> dict[str, Any]:
     """Return the child's answer, or raise its error."""
     answer: dict[str, Any] = {}
@@ -134,7 +126,9 @@ def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) 
         kind = getattr(errors, str(answer["error"]), GraphError)
         raise kind(message, str(answer.get("fix", "")))
     if done.returncode < 0:
-        raise GraphError(f"{path}: the first run ends its process with {_signal(-done.returncode)}.", "do not load it")
+        raise GraphError(
+            f"{path}: the first run ends its process with {signal_name(done.returncode)}.", "do not load it"
+        )
     if done.returncode or not answer:
         last = (message.strip() or f"exit code {done.returncode}").splitlines()[-1]
         raise GraphError(
@@ -149,9 +143,3 @@ def _too_long(path: Path, seconds: float) -> GraphError:
         f"{path}: no first action after {seconds:g} s, so the process was ended.",
         "allow a slow policy more with load(..., first_run_s=...) or vlatool inspect --probe --first-run SECONDS",
     )
-
-
-def _signal(number: int) -> str:
-    with contextlib.suppress(ValueError):
-        return signal.Signals(number).name
-    return f"signal {number}"
