@@ -309,7 +309,6 @@ def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
     """Refuse a bundle that a stage found something wrong with.
 
     Args:
-        bundle: An open bundle.
         accept: Names of findings that are overruled.
 
     Raises:

@@ -101,7 +101,6 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     """Return the result that an answer holds, or raise what it says that was raised.
 
     Args:
-        told: the answer.
         about: name of the code that the child runs.
         own: the child runs vlatool's code alone: what fails in it is a bug of vlatool.
 
@@ -162,7 +161,6 @@ def ending_error(status: bytes, about: str, last: ChildState) -> BaseException:
     Args:
         status: its exit code, as the server says it.
         about: name of the code that it ran.
-        last: what it did.
     """
     text = status.decode("ascii", "replace").strip()
     if not text.lstrip("-").isdigit():
