@@ -1,1 +1,1 @@
-"""How well a policy does: losses, success, pairs, and whether the reference can be believed."""
+"""How well a policy does: losses, success, pairs, and whether the reference can be trusted."""
