@@ -40,11 +40,9 @@ class Candidate:
 
     Args:
         name: Description of the change.
-        stage: Stage with the change.
         layers: Number of additional layers in float32.
         bundle: The new bundle; None until it is built.
         error: Relative L2 error of the raw action to float32, mean over the observations.
-        contestant: Contestant with its latencies.
         failed: Reason why it could not be built.
     """
 
@@ -69,7 +67,6 @@ class Comparison:
     Args:
         current: The bundle to explain.
         baseline: The float32 bundle; None when it was not found.
-        others: Candidates.
     """
 
     current: Candidate
@@ -141,17 +138,7 @@ def measure(
     threads: int,
     context: Context,
 ) -> Comparison:
-    """Build the candidates and measure error and interleaved latency of all.
-
-    Args:
-        bundle: The bundle to explain.
-        baseline: The float32 bundle.
-        tried: Result of ``plan_candidates``.
-        observations: Raw observations for errors and latencies.
-        scratch: Directory of the candidates.
-        threads: Number of intra-op threads.
-        context: Receiver of progress.
-    """
+    """Build the candidates and measure error and interleaved latency of all."""
     current = Candidate("as it is", None, bundle=bundle)
     base = Candidate("float32", None, bundle=baseline) if baseline is not None else None
     for number, candidate in enumerate(tried):

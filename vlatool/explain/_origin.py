@@ -46,7 +46,6 @@ class Observations:
     """Observations to run the bundles on.
 
     Args:
-        values: Raw observations.
         words: Description of their source.
         recorded: Whether they are recorded, so that errors on them are meaningful.
     """

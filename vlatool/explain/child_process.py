@@ -32,9 +32,7 @@ def explanation_in_child(bundle: Bundle, baseline: Bundle | None, context: Conte
     """Return the sentences of ``explanation``, or one with the reason why it failed.
 
     Args:
-        bundle: Bundle to explain.
         baseline: The float32 bundle that it was made from.
-        context: Receiver of progress.
         limits: Limits for ``explanation``.
     """
     paths = [str(each.path.absolute()) if each is not None else "" for each in (bundle, baseline)]

@@ -230,7 +230,6 @@ class Tally:
 
         Args:
             weight: Identity of its weight; a known weight is read again, not stored again. Empty: a new weight.
-            times: Number of runs.
         """
         before = self._parts.get(part, (0, 0, 0, 0))
         added = zip(before, (times * macs, times * weights, times * written, times), strict=True)

@@ -61,10 +61,8 @@ class Phase:
     """One graph of an inference on a candidate.
 
     Args:
-        name: Name of the graph.
         runs: Number of runs in one inference.
         once: Prediction of one run.
-        question: Question to the model.
     """
 
     name: str
@@ -131,8 +129,6 @@ def engine_for(profile: Profile, load: Workload, own: str = "") -> str:
     """Return the engine of a board that a policy runs in: its own, the preferred one, or the first that can run it.
 
     Args:
-        profile: Profile of the board.
-        load: Workload of the policy.
         own: Engine that the bundle was made for, if any.
 
     Returns:

@@ -74,7 +74,6 @@ def tune(
     Args:
         seconds: Time limit of the search.
         seed: Random seed of the order of the coordinates.
-        tell: Receiver of each improvement.
     """
     names = [field.name for field in dataclasses.fields(Scales) if field.name != "constant"]
     names += [f"shares.{field.name}" for field in dataclasses.fields(Shares)]
@@ -222,8 +221,6 @@ def fit(
     Args:
         before: Start of the search for scales; ``Scales()`` and ``Shares()`` when None.
         seconds: Time limit of the search; 0 keeps the scales.
-        seed: Random seed of the search.
-        tell: Receiver of progress.
     """
     parts: dict[str, TrainingData] = {}
     shares: dict[str, Shares] = {}
@@ -271,7 +268,6 @@ def fit_files(
     Args:
         anew: Start the search for scales at ``Scales()`` and ``Shares()``, instead of those of the shipped model, which
             was fitted on all published figures.
-        tell: Receiver of progress.
 
     Raises:
         DataError: when the file is malformed, or has no row to fit on.

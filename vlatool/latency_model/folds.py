@@ -28,7 +28,6 @@ class Sample:
     """The rows of a fit.
 
     Args:
-        questions: Question of each row.
         logs: (n,) natural logarithm of ms.
         models, devices: (n,) codes of the groups that are left out as a whole.
         units: (n,) index into ``UNITS``.
@@ -65,13 +64,7 @@ def _codes(names: Sequence[str]) -> Array:
 
 
 class Folds:
-    """Predictions of each row without its group.
-
-    Args:
-        rows: Rows of the sample.
-        sample: The sample.
-        scales: Scales of the process.
-    """
+    """Predictions of each row without its group."""
 
     def __init__(self, rows: Rows, sample: Sample, scales: Scales) -> None:
         covariance = kernel(rows, rows, scales)

@@ -153,9 +153,7 @@ class Process:
     """The process conditioned on measurements.
 
     Args:
-        rows: Measured rows.
         logs: (n,) natural logarithm of the latency in ms.
-        scales: Scales of the fit.
         noise: (n,) standard deviation of each measurement; that of the fit when None.
     """
 

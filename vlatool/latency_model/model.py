@@ -60,9 +60,7 @@ class TrainingData:
     """Data of a process: figures and scales.
 
     Args:
-        rows: Measured rows.
         logs: (n,) natural logarithm of the ms.
-        scales: Scales of the fit.
     """
 
     rows: Rows
@@ -193,7 +191,6 @@ def unknown_reason(question: Question, published: bool, device_known: bool) -> s
     """Return why a question cannot be answered, or an empty string.
 
     Args:
-        question: The question.
         published: Whether a figure of the runtime is known.
         device_known: Whether a figure of this device is known.
     """

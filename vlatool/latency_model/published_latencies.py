@@ -65,7 +65,6 @@ class Point:
         group: Name of the board for hold-out: see ``DEVICE_ALIASES``.
         kind: ``device_class``: cpu, gpu, igpu, npu.
         model: Name of the model for hold-out.
-        why: Reason why there is no question.
     """
 
     question: Question | None

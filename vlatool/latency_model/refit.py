@@ -31,7 +31,6 @@ def refit_points(
     not on the intervals.
 
     Args:
-        path: File of published latencies.
         held_out: ``models``: a tenth of the models at a time; ``devices``: each board.
         seed: Random seed of the folds, of the search, and of the calibrating models.
         seconds: Time limit of the search of each part.

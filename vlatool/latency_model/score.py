@@ -31,7 +31,6 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
     """Predict a file; with ``held_out`` from its own other rows.
 
     Args:
-        path: File of published latencies.
         held_out: ``models``: a tenth of the models is left out at a time; ``devices``: each device; ``calibrated``:
             each device except for one of its models. The widths of the intervals come from the errors of the others,
             whose predictions used the rows that are left out here; ``refit`` is stricter.

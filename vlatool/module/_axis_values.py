@@ -13,7 +13,6 @@ class Values:
     """The axes of the values of a graph, and the products that it computes.
 
     Attributes:
-        factors: what axes are made of.
         products: axes over which each multiply-accumulate runs.
         widths: widths of each product, axes of the weights that it takes, without those of a kernel.
         reads: factors of axes of weights over which a product sums: what reads units, where others write them.
@@ -78,7 +77,6 @@ class Values:
         """Note a product.
 
         Args:
-            axes: axes over which it runs.
             widths: those of its weights, without those of a kernel.
         """
         self.products.append(axes)

@@ -41,7 +41,6 @@ class Member:
 
     Args:
         weight: name in the state of the module.
-        axis: number of the axis.
         atom: position of the factor in the axis.
         reads: whether a product sums over the axis: the weight reads the units, which others write.
         numbers: unit that each element of the axis belongs to; -1 for none.

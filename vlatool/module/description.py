@@ -41,7 +41,6 @@ class Description:
         folder: where relative paths start, and whose code runs once it is trusted.
         factory: ``path.py:make`` or ``package.module:make`` of the torch modules; empty for a policy that is graphs.
         graphs: graph name -> ONNX file, of a policy that is graphs already.
-        arguments: keyword arguments of the factory.
         program: how the graphs are run; one graph of all inputs and outputs when empty.
         environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation, and
             ``timeout``: seconds that a call of it may take.

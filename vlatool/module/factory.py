@@ -114,7 +114,6 @@ def iterate_function(function: str, folder: Path, arguments: dict[str, Any]) -> 
 
     Args:
         function: name of the function, in the form of a factory.
-        folder: where its file lies.
 
     Raises:
         SourceError: when it raises, or gives nothing to go through.

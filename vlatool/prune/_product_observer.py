@@ -58,7 +58,6 @@ def input_rows(named_arguments: Mapping[str, Any], *, is_linear: bool) -> Tensor
     """Return the rows that a weight is multiplied with: (N, inputs).
 
     Args:
-        named_arguments: Arguments of the product by name.
         is_linear: Whether the layer is linear instead of a convolution.
     """
     inputs, weight = named_arguments["input"], named_arguments["weight"]

@@ -37,7 +37,6 @@ class UnitGroup:
         leaf: Factor of ``vlatool.module.axes``.
         members: Axes of weights that contain the units.
         step: Number of units to remove at a time.
-        importance: Importance of each unit, by index.
         keep: Indices of the units to keep.
     """
 
@@ -95,7 +94,6 @@ def find_groups(walks: Mapping[str, Walk], selection: Selection, multiple: int, 
     """Return all groups of removable units; none where operators keep all of them.
 
     Args:
-        selection: Selection of weights.
         multiple: Number of neurons or channels to remove at a time; heads go one by one.
     """
     groups = []
@@ -132,7 +130,6 @@ def rank_units(
     Args:
         rank: ``gate``: the expected squared change of the action when a unit is scaled; ``magnitude``: the norms of
             the weights that write and that read it; ``random``.
-        source: Bundle with recorded observations.
     """
     if rank == "random":
         random = np.random.default_rng(SEED)

@@ -246,8 +246,6 @@ class _Selector:
     """Selects units and blocks to remove by their measured costs.
 
     Args:
-        stacks: Stacks of removable blocks.
-        work: Counter of multiply-accumulates of the groups.
         prices: Role of a group -> milliseconds for a multiply-accumulate.
         least: Least share of each group that stays.
     """

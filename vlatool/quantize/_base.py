@@ -246,7 +246,6 @@ def fit_range_to_host(stage: StageT, engine: str) -> StageT:
     """Return a stage with ``reduce_range`` where int8 products saturate on this host, unless the option was given.
 
     Args:
-        stage: Stage with the option.
         engine: Engine that will run the bundle; the default one when empty.
     """
     if "reduce_range" in stage.model_fields_set or int8_arithmetic(engine) in (EXACT, UNKNOWN):

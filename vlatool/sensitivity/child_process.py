@@ -28,7 +28,6 @@ def sensitivities_in_child(
         stage: Stage that selects the layers and their style.
         recorded: Number of observations of that recording to choose from.
         samples: Number of observations to measure on, spread over these.
-        seconds: See ``sensitivities``.
 
     Raises:
         VlatoolError: errors of ``sensitivities``; GraphError when the engine crashes the child.

@@ -42,7 +42,6 @@ class LayerError:
 
     Args:
         name: Node name, for example ``blocks.3.attn.out/MatMul``; names joined by ``+`` for a group.
-        graph: Name of its graph.
         error: Relative L2 error of the raw action output, mean over the observations.
         elements: Label -> mean |error| in physical units (un-normalised); empty for discrete actions.
         flips: Share of steps whose gripper element changes sign, or (discrete) whose largest logit is another one; 0

@@ -51,7 +51,6 @@ class Expert:
         """Choose observations, and write them with the expert's actions unless an earlier run did.
 
         Args:
-            recording: recorded observations to choose from.
             share: share of them, at least one.
             seed: seed of the choice; a smaller share is a part of a larger one.
             encode: observation -> what the policy takes.

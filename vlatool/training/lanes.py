@@ -46,7 +46,6 @@ def side_by_side(begins: Array, count: int) -> Iterator[Lanes]:
 
     Args:
         begins: (N,) whether an episode begins with a row.
-        count: count of lanes.
     """
     firsts = np.flatnonzero(begins)
     ends = np.array([*firsts[1:], len(begins)])

@@ -91,10 +91,7 @@ class _Rows:
     """The rows of batches, one after the other.
 
     Args:
-        batches: what the function yields.
         function: its name, for messages.
-        encode: the policy's own.
-        count: rows in all.
         size: rows of a batch, at most.
         along: whether batches also hold the number of the episode of each row.
     """

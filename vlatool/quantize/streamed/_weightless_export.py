@@ -28,7 +28,6 @@ class GraphTemplate:
     Args:
         model: An ``onnx_ir.Model`` whose initializers have shapes and dtypes, and values only when they are small.
         tensors: Initializer -> location of its bytes.
-        opset: Opset of the default domain.
     """
 
     model: Any

@@ -36,7 +36,6 @@ class RecordFile:
     """The finished file.
 
     Args:
-        bytes: Size of the file.
         notes: Figures that each record's ``fill`` returned.
         resumed: Number of records that an earlier run had finished.
     """

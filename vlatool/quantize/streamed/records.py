@@ -26,8 +26,6 @@ class Tools:
     """Resources of one process, reused from record to record.
 
     Args:
-        reader: Reader of the stored weights.
-        scratch: Buffers of the arithmetic.
         buffer: Page-aligned memory for a record.
     """
 

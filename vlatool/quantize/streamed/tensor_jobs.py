@@ -43,7 +43,6 @@ class Job:
     """Computation of one record, in plain values that can be sent to another process.
 
     Args:
-        form: Format of quantized weights.
         choose: Name in ``METHODS`` of the method that finds scales and zero points.
         tolerance: Largest relative L2 error of a quantized weight.
         first, count: Range of elements, for a tensor that is copied.
