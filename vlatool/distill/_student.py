@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.errors import RecipeError
 
 DEPTH = "prune.depth"
 STAGES = {"depth": DEPTH, "width": "prune.structured"}
@@ -35,7 +35,7 @@ def student_steps(text: str) -> tuple[tuple[str, dict[str, Any]], ...]:
                 f"write it as {EXAMPLE}",
             )
         if name not in STAGES:
-            raise RecipeError(f"--student knows no '{name}'; {suggest(name, STAGES)}.", fix_for(name, STAGES))
+            raise RecipeError.unknown(f"--student knows no '{name}'", name, STAGES)
         if name in shares:
             raise RecipeError(f"--student names {name} twice: '{text}'.", "name it once")
         shares[name] = _share(name, value)

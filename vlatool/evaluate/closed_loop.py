@@ -20,7 +20,7 @@ from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
-from vlatool.errors import DataError, SourceError, UsageError, fix_for, suggest
+from vlatool.errors import DataError, SourceError, UsageError
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._loop_latency import loop_latency, with_latency
 from vlatool.evaluate._names import BASELINE, names_of
@@ -254,10 +254,7 @@ class ClosedLoop(Measure):
             return ()
         known = disturbances_of(source, job, context)
         if unknown := [kind for kind in self.disturb if kind not in (*known, ALL)]:
-            raise UsageError(
-                f"There is no disturbance '{unknown[0]}'; {suggest(unknown[0], (*known, ALL))}.",
-                fix_for(unknown[0], (*known, ALL)),
-            )
+            raise UsageError.unknown(f"There is no disturbance '{unknown[0]}'", unknown[0], (*known, ALL))
         return known if ALL in self.disturb else tuple(dict.fromkeys(self.disturb))
 
     def _whose(self, names: Sequence[str]) -> list[str]:
@@ -368,7 +365,7 @@ class ClosedLoop(Measure):
             )
         for task in self.tasks:
             if known and task not in known and not self.environment:
-                raise UsageError(f"There is no task '{task}'; {suggest(task, known)}.", fix_for(task, known))
+                raise UsageError.unknown(f"There is no task '{task}'", task, known)
         timeout = self.environment_timeout or timeout_of(named)
         job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control,
                           controller=self.controller, timeout_s=timeout)  # fmt: skip

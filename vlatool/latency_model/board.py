@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from vlatool.errors import ProfileError, fix_for, suggest
+from vlatool.errors import ProfileError
 from vlatool.graph.workload import PRECISIONS, GraphWorkload, Workload, stored_precision
 from vlatool.hardware.profile import EngineFigures, Profile
 from vlatool.latency_model.features import ComputeUnit, Question, Shares, Work, roofline_parts
@@ -49,10 +49,7 @@ class Candidate:
         """
         engines = self.profile.engines
         if self.engine not in engines:
-            raise ProfileError(
-                f"{self.profile.name} has no engine '{self.engine}'; {suggest(self.engine, engines)}.",
-                fix_for(self.engine, engines),
-            )
+            raise ProfileError.unknown(f"{self.profile.name} has no engine '{self.engine}'", self.engine, engines)
         return engines[self.engine]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.errors import RecipeError
 from vlatool.graph.nodes import matches
 
 
@@ -28,9 +28,7 @@ class Selection:
         """Refuse a pattern that matches nothing."""
         for pattern in (*self.include, *self.exclude):
             if not any(matches(name, (pattern,)) for name in names):
-                raise RecipeError(
-                    f"No {what} matches '{pattern}'; {suggest(pattern, list(names))}.", fix_for(pattern, list(names))
-                )
+                raise RecipeError.unknown(f"No {what} matches '{pattern}'", pattern, names)
 
     def selects(self, names: Iterable[str]) -> bool:
         """Return whether a part with these names may be removed: one of them is included, and none is excluded."""
