@@ -21,12 +21,11 @@ from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
 from vlatool.errors import DataError, SourceError, UsageError
-from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._loop_latency import loop_latency, with_latency
 from vlatool.evaluate._names import BASELINE, names_of
 from vlatool.evaluate._player import Player
 from vlatool.evaluate._replay import check_video_of, played_again
-from vlatool.evaluate._sentences import sentences
+from vlatool.evaluate._sentences import found_wrong, sentences
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._training_overlap import FIX, seen_in_training
 from vlatool.files.resumable_work import Store

@@ -20,8 +20,8 @@ from vlatool.bundle.program import keeps_values
 from vlatool.bundle.spec import TensorSpec
 from vlatool.data import Moment, Recording, carries_evaluation, evaluation_recording
 from vlatool.errors import DataError
-from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._names import names_of
+from vlatool.evaluate._sentences import found_wrong
 from vlatool.machine.host import fingerprint
 from vlatool.measures import with_derived
 from vlatool.measures.actions import BASELINE, EXPERT, RELATIVE_ERROR, Reference

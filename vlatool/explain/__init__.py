@@ -202,7 +202,6 @@ def _times(findings: _Findings, options: Options, context: Context) -> None:
         context.progress("profiling the operators of float32", None)
         compared = reference_engine(findings.bundle)
         findings.float_operators = profile(findings.baseline, values, options.runs, options.threads, compared)
-    engine = findings.bundle.manifest.engine or DEFAULT_ENGINE
     for name, graph in findings.bundle.manifest.graphs.items():
         seen = QuantizedGraph(name, findings.bundle.file(graph.file))
         findings.round_trips += seen.round_trips()

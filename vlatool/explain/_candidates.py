@@ -149,11 +149,9 @@ def measure(
             candidate.bundle = run_transform(candidate.stage, baseline, scratch / str(number), Context())
         except VlatoolError as error:
             candidate.failed = error.message
-    candidates = [
-        candidate for candidate in (base, current, *tried) if candidate is not None and candidate.bundle is not None
-    ]
     reference: list[Any] = []
-    for candidate in candidates:
+    contestants: list[Contestant] = []
+    for candidate in filter(None, (base, current, *tried)):
         if candidate.bundle is None:
             continue
         context.progress(f"errors of the candidate: {candidate.name}", None)
@@ -163,10 +161,7 @@ def measure(
         if base is not None:
             reference = reference or outputs
             candidate.error = float(np.mean([relative_error(*pair) for pair in zip(outputs, reference, strict=True)]))
-        candidate.contestant = Contestant(
-            candidate.name, candidate.bundle, policy, [dict(item) for item in observations]
-        )
-    run_interleaved(
-        [candidate.contestant for candidate in candidates if candidate.contestant], ITERATIONS, 5, context.progress
-    )
+        contestants.append(Contestant(candidate.name, candidate.bundle, policy, list(map(dict, observations))))
+        candidate.contestant = contestants[-1]
+    run_interleaved(contestants, ITERATIONS, 5, context.progress)
     return Comparison(current, base, [candidate for candidate in tried if candidate.bundle is not None])

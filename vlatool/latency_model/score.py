@@ -99,13 +99,12 @@ def _predict_left_out(sample: Sample, part: str, held_out: str, seed: int) -> di
         why = unknown_reason(question, not unknown[index], regime != "unseen")
         if not why and half > MAX_HALF_INTERVAL:
             why = "published figures leave too wide an interval"
-        if calibrating[index] or why:
-            predictions[question] = Prediction(
-                math.nan, regime="told" if calibrating[index] else regime, why=why or "it was told"
-            )
+        if calibrating[index]:
+            predictions[question] = Prediction(math.nan, regime="told", why=why or "it was told")
+        elif why:
+            predictions[question] = Prediction(math.nan, regime=regime, why=why)
         else:
-            ms = math.exp(sample.logs[index] + error[index])
-            predictions[question] = Prediction(ms, ms * math.exp(-half), ms * math.exp(half), regime)
+            predictions[question] = Prediction.between(sample.logs[index] + error[index], half, regime)
     return predictions
 
 

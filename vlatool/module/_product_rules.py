@@ -57,8 +57,7 @@ def _bilinear(walk: Values, node: Any) -> Shape:
     one, other, weight = (walk.shape_of(each) for each in node.args[:3])
     for number, given in ((1, one), (2, other)):
         walk.contract(node.args[number - 1], given[-1], node.args[2], weight[number])
-    if argument(node, "bias") is not None:
-        walk.factors.unite(weight[0], walk.shape_of(argument(node, "bias"))[0])
+    walk.unite_argument(node, "bias", weight[0])
     lead = walk.broadcast([one[:-1], other[:-1]])
     walk.multiply([*lead, *weight], weight)
     return [*lead, weight[0]]
@@ -93,10 +92,8 @@ def _group_channels(walk: Values, node: Any) -> tuple[Shape, Shape, Axis, Axis]:
 def _convolution_output(walk: Values, node: Any, given: Shape, out: Axis, kernel: Shape) -> Shape:
     """Return the axes of what a convolution gives: batch, channels, places."""
     lead, spatial = given[: -len(kernel) - 1], given[-len(kernel) :]
-    if argument(node, "bias") is not None:
-        walk.factors.unite(out, walk.shape_of(argument(node, "bias"))[0])
-    for axis in (*spatial, *kernel):
-        walk.factors.freeze(axis)
+    walk.unite_argument(node, "bias", out)
+    walk.freeze((*spatial, *kernel))
     weight = walk.shape_of(node.args[1])
     space = walk.frozen_axes(sizes_of(node.meta["val"])[-len(kernel) :])
     counted = spatial if "transpose" in node.target._opname else space
@@ -143,8 +140,7 @@ def _recurrent(walk: Values, node: Any) -> list[Shape]:
     each = len(weights) // (ways * layers)
     if len(given) != 3 or each != (4 if argument(node, "has_biases") else 2):
         raise ValueError("a projection, or a packed sequence")
-    for axis in given[:2]:
-        walk.factors.freeze(axis)
+    walk.freeze(given[:2])
     read, hidden = given[-1], walk.shape_of(weights[1])[1]
     (way,) = walk.frozen_axes([ways])
     for layer in range(layers):

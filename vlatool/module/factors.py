@@ -283,13 +283,10 @@ class Factors:
             return
         first, rest = segment[0], segment[1:]
         if not rest:
-            self._cut_leaf(first, offset)
+            reasons = self._frozen.pop(first, set())
+            self._segments[first] = self._new(offset, reasons), self._new(self.sizes[first] - offset, reasons)
             return
         before, within = divmod(offset, self.size(rest))
         for bound in (before, before + bool(within)):
             self._end_segment((first,), bound)
         self._end_segment(rest, within)
-
-    def _cut_leaf(self, leaf: int, offset: int) -> None:
-        reasons = self._frozen.pop(leaf, set())
-        self._segments[leaf] = self._new(offset, reasons), self._new(self.sizes[leaf] - offset, reasons)

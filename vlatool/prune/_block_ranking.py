@@ -104,12 +104,10 @@ class BlockRanking:
 
     @contextlib.contextmanager
     def _forward_hooks(self, blocks: Collection[BlockId], hook: Callable[[BlockId], Any]) -> Iterator[None]:
-        handles = [self._blocks[block].register_forward_hook(hook(block), with_kwargs=True) for block in blocks]
-        try:
+        with contextlib.ExitStack() as hooks:
+            for block in blocks:
+                hooks.callback(self._blocks[block].register_forward_hook(hook(block), with_kwargs=True).remove)
             yield
-        finally:
-            for handle in handles:
-                handle.remove()
 
 
 def _block_input(given: Any, named: Any) -> Any:

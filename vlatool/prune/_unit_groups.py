@@ -174,13 +174,7 @@ class Macs:
                     self._add(graph, walk, leaves, keepers, runs[graph] * macs)
 
     def savings(self, number: int, size: int, sizes: Sequence[int]) -> int:
-        """Return the multiply-accumulates saved by reducing one group.
-
-        Args:
-            number: Index of the group.
-            size: Number of its units afterwards.
-            sizes: Number of units of each group.
-        """
+        """Return the multiply-accumulates saved by reducing one group to ``size`` units, from ``sizes`` of all."""
         less = {number: size}
         terms = (self._terms[term][:2] for term in self._terms_of_group[number])
         return sum(

@@ -178,7 +178,8 @@ class Session:
             self._write_round(0, about)
 
     def _train(self, end: int) -> None:
-        with self._processes.training(self._frames.count, len(self._frames), end):
+        job = {"rounds": self._frames.count, "rows": len(self._frames), "until": end}
+        with self._processes.calling("train", job):
             self._trainer.look(partial(self._objective.look, self._frames, self._expert.frames))
             self._trainer.train(end, self._draw, self._report)
             self._trainer.save()

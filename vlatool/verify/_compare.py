@@ -17,10 +17,9 @@ from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import draw
 from vlatool.verify._causes import causes
 from vlatool.verify._original import Original, as_fed
-from vlatool.verify._sample import Sample, error_of
+from vlatool.verify._sample import MAX_ERROR, Sample, error_of
 
 Array = NDArray[Any]
-MAX_ERROR = 1e9
 
 
 def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
