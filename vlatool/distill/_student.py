@@ -12,7 +12,7 @@ STAGES = {"depth": DEPTH, "width": "prune.structured"}
 """Share that stays -> the stage that takes the rest away; in this order, so that no width is ranked for nothing."""
 EXAMPLE = "depth=0.5,width=0.75"
 DECIMALS = 6
-"""Of a share that count: 1 - 0.9 is then the 0.1 that a person would have asked the stage for."""
+"""Decimals of a share that count: 1 - 0.9 is then the 0.1 that a person would have asked the stage for."""
 
 
 def student_steps(text: str) -> tuple[tuple[str, dict[str, Any]], ...]:

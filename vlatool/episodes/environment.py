@@ -40,7 +40,7 @@ def time_limit(
     """Let whoever watches this process end it where a call of an environment, the block, takes too long.
 
     Args:
-        seed: Of the episode; None before there is one.
+        seed: seed of the episode; None before there is one.
         timeout_s: Seconds that it may take; the limit ``environment_seconds`` when 0.
         when: How the call is related to the seed: ``at`` or ``after``.
     """

@@ -31,7 +31,6 @@ def refuse_random_ops(model: Any, graph: str) -> None:
 
     Args:
         model: An ``onnx_ir.Model``.
-        graph: Name of the graph in the program.
 
     Raises:
         GraphError: with number and location of the draws, and how to declare the noise instead.

@@ -6,15 +6,12 @@ import math
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.graph.workload import PRECISIONS, TRAITS
 from vlatool.latency_model.gaussian_process import KEYS, Rows
-
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
 
 PROXIES = {"bfloat16": "float16", "float8": "int8"}
 """Precision -> precision whose published latencies stand for it."""

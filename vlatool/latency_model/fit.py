@@ -11,10 +11,8 @@ import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import DataError, OutputError
 from vlatool.latency_model.features import Shares, rows_of
@@ -22,8 +20,8 @@ from vlatool.latency_model.folds import UNITS, Folds, Sample
 from vlatool.latency_model.gaussian_process import Scales
 from vlatool.latency_model.model import DATA, LEVEL, LatencyModel, TrainingData, read_model, write
 from vlatool.latency_model.published_latencies import Point, merge_versions, read_points
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 TAIL_WEIGHT = 0.3
 """Weight of the 90th percentile relative to the median."""
 DEVICE_WEIGHT = 0.6

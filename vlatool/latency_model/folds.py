@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.latency_model.features import Question
 from vlatool.latency_model.gaussian_process import Rows, Scales, kernel
 from vlatool.latency_model.published_latencies import Point, merge_versions
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 UNITS = ("cpu", "gpu", "igpu", "npu")
 MAX_MODELS = 32
 """Largest number of models that calibrate a held-out device, one at a time."""

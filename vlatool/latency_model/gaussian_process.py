@@ -14,9 +14,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
 
 KEYS = ("unit", "core", "device", "runtime", "kind", "made", "line", "pair", "setting", "model", "known")
 """Categories of a row: class of unit; instruction set of its cores; device and unit; runtime; runtime and precision;

@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import DataError
 from vlatool.files.user_files import atomic_file
 from vlatool.latency_model.features import PROXIES, Question, Shares, rows_of
 from vlatool.latency_model.gaussian_process import KEYS, PARTS, Process, Rows, Scales
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 DATA = Path(__file__).with_name("data")
 MODEL_ENV = "VLATOOL_LATENCY"
 """Environment variable with a directory of ``vlatool hwselect fit``."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import DataError, UsageError, fix_for
 from vlatool.latency_model.features import rows_of
@@ -18,8 +17,8 @@ from vlatool.latency_model.fit import Scores, split_by_part
 from vlatool.latency_model.folds import UNITS, Folds, Sample
 from vlatool.latency_model.model import LEVEL, MAX_HALF_INTERVAL, MODEL_ENV, Prediction, load_model, unknown_reason
 from vlatool.latency_model.published_latencies import Point, read_points
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 SPLITS = ("models", "devices", "calibrated")
 DRAWS = 5
 """Number of models that calibrate each device, one at a time."""

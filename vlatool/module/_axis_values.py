@@ -8,6 +8,9 @@ from typing import Any
 from vlatool.module._zero_values import ZeroValues
 from vlatool.module.factors import Axis, Factors, Shape
 
+Rule = Callable[["Values", Any], Any]
+"""Walk and node -> axes of what the node gives."""
+
 
 class Values:
     """The axes of the values of a graph, and the products that it computes.

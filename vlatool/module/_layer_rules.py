@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from vlatool.module._axis_values import Values, argument, for_each_value, sizes_of
+from vlatool.module._axis_values import Rule, Values, argument, for_each_value, sizes_of
 from vlatool.module.factors import Shape
-
-Rule = Callable[[Values, Any], Any]
 
 
 def _channels(walk: Values, node: Any) -> Shape:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from vlatool.module._axis_values import Values, argument, sizes_of
+from vlatool.module._axis_values import Rule, Values, argument, sizes_of
 from vlatool.module.factors import Axis, Shape
-
-Rule = Callable[[Values, Any], Any]
 
 
 def _linear(walk: Values, node: Any) -> Shape:
@@ -159,7 +157,7 @@ def _gates(walk: Values, node: Any, read: Axis, weights: Sequence[Any], lead: Sh
     """Unite the axes of a recurrent layer's weights; return that of its hidden units.
 
     Args:
-        weights: of the input (gates x hidden, read), of the state (gates x hidden, hidden), biases (gates x hidden).
+        weights: for the input (gates x hidden, read), for the state (gates x hidden, hidden), biases (gates x hidden).
     """
     first, second = walk.shape_of(weights[0]), walk.shape_of(weights[1])
     walk.contract(node, read, weights[0], first[1])

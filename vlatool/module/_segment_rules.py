@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from vlatool.module._axis_values import Values, argument, replace_axis, sizes_of
+from vlatool.module._axis_values import Rule, Values, argument, replace_axis, sizes_of
 from vlatool.module.factors import Axis, Shape
 
-Rule = Callable[[Values, Any], Any]
 FIXED_AXES = {"hstack": 1, "column_stack": 1, "vstack": 0, "dstack": 2, "hsplit": 1, "vsplit": 0, "dsplit": 2}
 """Operators that join or split along one axis, of values of rank 2 or more -> which it is."""
 SPLITS = ("chunk", "split", "split_with_sizes", "tensor_split", "unsafe_chunk", "unsafe_split",

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
+from vlatool.module._axis_values import Rule, argument, for_each_value, replace_axis, sizes_of
 from vlatool.module._axis_values import Values as Values
-from vlatool.module._axis_values import argument, for_each_value, replace_axis, sizes_of
 from vlatool.module._axis_values import size_of as size_of
 from vlatool.module._layer_rules import LAYERS
 from vlatool.module._product_rules import PRODUCTS
 from vlatool.module._segment_rules import SEGMENTS
 from vlatool.module.factors import Shape
-
-Rule = Callable[[Values, Any], Any]
 
 
 def _same(walk: Values, node: Any) -> Shape:

@@ -27,11 +27,7 @@ BlockId = tuple[str, str, int]
 
 
 class BlockRanking:
-    """Effect of blocks on the action, on recorded observations.
-
-    Args:
-        source: Bundle with the program and the encoding of observations.
-    """
+    """Effect of blocks on the action, on recorded observations."""
 
     def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> None:
         self._program = BatchedProgram(source.manifest.program, modules)

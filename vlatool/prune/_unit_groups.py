@@ -63,11 +63,7 @@ class UnitGroup:
         self.keep = sorted([*self.keep, *units])
 
     def cheapest_units(self, min_share: float) -> tuple[float, list[int]]:
-        """Return the total importance of the least important units, and their indices; none when all must stay.
-
-        Args:
-            min_share: Least share of the units that stays.
-        """
+        """Return the total importance of the least important units, and their indices; none when all must stay."""
         count = self.remaining % self.step or self.step
         if self.remaining - count < max(1, round(self.size * min_share)):
             return 0.0, []

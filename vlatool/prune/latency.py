@@ -247,7 +247,6 @@ class _Selector:
 
     Args:
         prices: Role of a group -> milliseconds for a multiply-accumulate.
-        least: Least share of each group that stays.
     """
 
     def __init__(

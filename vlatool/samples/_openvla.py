@@ -28,7 +28,6 @@ class OpenShape:
         second: SigLIP-SO400M, without its last block too.
         vocabulary: Number of token ids that mean something; id 0 is padding.
         rows: Rows of the embedding and the head (padded vocabulary).
-        bins: Number of bins of an action element.
         action: Elements of the action, each one token.
     """
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
@@ -25,13 +24,12 @@ from vlatool.machine.engine_calls import engine_call
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.engines import of_branches
-from vlatool.runtime.interface import Action
+from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.sensitivity._switches import add_switches
 from vlatool.stage.base import Context, SampleSet
 
-Array = NDArray[Any]
 LayerId = tuple[str, str]
 """Graph name and layer name."""
 
@@ -151,7 +149,6 @@ class Switchboard:
     """A float32 policy in which any combination of layers can be computed in int8; a context manager.
 
     Args:
-        stage: Stage that selects the layers and their style.
         ranges: Ranges from ``ranges_of``.
         threads: Number of intra-op threads; the cores that this process may use when None.
     """

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FOLDER = "held-out"
 SHARE = 0.1
-"""Of the episodes, or of the stretches where episodes are not recorded."""
+"""Share of the episodes, or of the stretches where episodes are not recorded, that is held out."""
 STRETCHES = 20
 """Parts of a recording without episodes: neighbours look alike, and stay together."""
 

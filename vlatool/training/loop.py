@@ -79,7 +79,6 @@ class Trainer:
 
     Args:
         group: the processes that train together; the first one writes checkpoints.
-        constraint: what holds of the weights after each step.
     """
 
     def __init__(

@@ -5,7 +5,7 @@ The function is user code, as an environment is: it runs in a child process, whi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,18 +21,17 @@ from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 from vlatool.training.frames import begins_file
 from vlatool.training.rounds import write_observations
-from vlatool.user_code.children import call
+from vlatool.user_code.children import OnProgress, call
 
 MODULE = "vlatool.training.user_batches"
 PRELOAD = ("numpy", MODULE)
 DEFAULT_ROWS = 8192
 """Default number of rows."""
 EPISODE = "episode"
-"""Of a batch whose rows are steps: the number of the episode of each; where it changes, the policy is reset."""
+"""Name of the episode numbers in a batch whose rows are steps; where the number changes, the policy is reset."""
 MAX_BATCH_ROWS = 256
 """Rows of a batch that the function is asked for, at most."""
 GUIDE = "docs/guides/your-own-policy.md shows one"
-OnProgress = Callable[[str, float | None], None]
 
 
 def requested_rows(asked: int | None, source: Bundle, plays: bool) -> int:

@@ -6,15 +6,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import VlatoolError
+from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import Policy
 
 if TYPE_CHECKING:
     from vlatool.verify._sample import Sample
 
-Array = NDArray[Any]
 Change = Callable[["Sample"], Mapping[str, Array]]
 MAX_TRIED = 6
 """Observations on which a guess must make both equal."""

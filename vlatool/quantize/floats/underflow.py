@@ -133,7 +133,6 @@ def underflow_nodes(model: Any, sizes: GraphSizes, excluded: set[str], strict: b
     addend keeps a value from zero, the readers of that value are included until it is no longer small.
 
     Args:
-        sizes: Sizes of its values on recorded observations.
         excluded: Nodes that stay float32 in any case.
         strict: Whether every single element counts, instead of whole tensors.
     """

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
+
 RANGE_FACTORS = (1.06, 0.97)
 """Candidates of the scale search, relative to the range of a block."""
 NEGLIGIBLE_RANGE = 1e-30

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import GraphError
 from vlatool.quantize.streamed._block_quantization import (
@@ -29,9 +28,9 @@ from vlatool.quantize.streamed._block_quantization import (
 )
 from vlatool.quantize.streamed._graph_rewrite import PART_BYTES, Piece, Task, stores_zeros
 from vlatool.quantize.streamed.records import Record, Tools, round_to_page
+from vlatool.runtime.interface import Array
 from vlatool.weights.shards import FLOATS, StoredTensor
 
-Array = NDArray[Any]
 READ_BYTES = 1 << 22
 CHUNK_ELEMENTS = 1 << 17
 """Elements computed at once: as many as fit into a core's cache."""
