@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 from pydantic_core import PydanticCustomError
@@ -29,6 +29,7 @@ from vlatool.evaluate._sentences import found_wrong, sentences
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._training_overlap import FIX, seen_in_training
 from vlatool.files.resumable_work import Store
+from vlatool.hardware.profile import Profile
 from vlatool.machine.host import cache_directory, fingerprint
 from vlatool.measures import series, with_derived
 from vlatool.measures.success import SUCCESS
@@ -40,9 +41,6 @@ from vlatool.stage.base import Context, Measure
 from vlatool.stage.cache import STREAMS
 from vlatool.stats.starts import distinct_starts
 from vlatool.user_code import trust
-
-if TYPE_CHECKING:
-    from vlatool.hardware.profile import Profile
 
 ALL = "all"
 """Every disturbance that there is."""
@@ -73,10 +71,7 @@ class ClosedLoop(Measure):
     instruction: Literal["right", "wrong"] = Field("right", description="wrong: the control that a policy must fail")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
     limit: float | None = Field(
-        None,
-        ge=0,
-        lt=1,
-        description="stop when it is decided whether the drop is above this share (0.03 = 3 points)",
+        None, ge=0, lt=1, description="stop when it is decided whether the drop is above this share (0.03 = 3 points)"
     )
     disturb: tuple[str, ...] = Field(
         (),
@@ -101,8 +96,7 @@ class ClosedLoop(Measure):
         "as smooth,late; when not given, late with --latency-in-the-loop, and chunked without",
     )
     board: str = Field(
-        "",
-        description="profile whose predicted latency that is; --profile sets it; measured here when empty",
+        "", description="profile whose predicted latency that is; --profile sets it; measured here when empty"
     )
 
     @field_validator("disturb", "controller", mode="before")

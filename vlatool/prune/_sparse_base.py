@@ -43,8 +43,7 @@ class SparsePruning(ModuleStage):
 
     ratio: float = Field(0.5, gt=0, lt=1, description="share of each layer's weights that becomes zero")
     pattern: Pattern = Field(
-        "unstructured",
-        description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half",
+        "unstructured", description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half"
     )
     samples: int = Field(32, ge=1, description="recorded observations to look at")
     include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")

@@ -263,11 +263,7 @@ def silenced_quantizer() -> Iterator[Path]:
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
-        with (
-            scratch_directory() as scratch,
-            contextlib.redirect_stdout(io.StringIO()),
-            warnings.catch_warnings(),
-        ):
+        with scratch_directory() as scratch, contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield scratch
     finally:

@@ -39,8 +39,7 @@ class Qat(ImitationStage):
     weights: Literal["int8", "int4"] = Field("int8", description="int8 with int8 activations; int4 weights alone")
     learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
     layout: LayoutName = Field(
-        "ort",
-        description="of the bundle, as the method that follows takes it; that of --profile's board unless given",
+        "ort", description="of the bundle, as the method that follows takes it; that of --profile's board unless given"
     )
 
     def compute_context(self) -> contextlib.AbstractContextManager[Any]:

@@ -154,11 +154,7 @@ class Switchboard:
     """
 
     def __init__(
-        self,
-        bundle: Bundle,
-        stage: StaticInt8,
-        ranges: Mapping[str, Mapping[str, Range]],
-        threads: int | None = None,
+        self, bundle: Bundle, stage: StaticInt8, ranges: Mapping[str, Mapping[str, Range]], threads: int | None = None
     ) -> None:
         self._opened = contextlib.ExitStack()
         folder = self._opened.enter_context(scratch_directory())
