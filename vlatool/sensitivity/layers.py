@@ -150,12 +150,9 @@ class Switchboard:
 
     Args:
         ranges: Ranges from ``ranges_of``.
-        threads: Number of intra-op threads; the cores that this process may use when None.
     """
 
-    def __init__(
-        self, bundle: Bundle, stage: StaticInt8, ranges: Mapping[str, Mapping[str, Range]], threads: int | None = None
-    ) -> None:
+    def __init__(self, bundle: Bundle, stage: StaticInt8, ranges: Mapping[str, Mapping[str, Range]]) -> None:
         self._opened = contextlib.ExitStack()
         folder = self._opened.enter_context(scratch_directory())
         self._tape = _OutputTape()
@@ -174,7 +171,7 @@ class Switchboard:
                     path = folder / f"{name}.onnx"
                     save(model, path)
             with engine_call(of_branches(), f"opened the graph '{name}' with switches"):
-                self._sessions[name] = _SwitchableSession(of_branches()(path, threads), flags, self._tape)
+                self._sessions[name] = _SwitchableSession(of_branches()(path), flags, self._tape)
         self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), DEFAULT_ENGINE)
 
     def __enter__(self) -> Switchboard:
@@ -215,15 +212,10 @@ class Switchboard:
         self._state = {}
 
     def errors(
-        self,
-        groups: Sequence[Sequence[LayerId]],
-        observations: Sequence[Mapping[str, Any]],
-        context: Context,
-        *,
-        ordered: bool = True,
+        self, groups: Sequence[Sequence[LayerId]], observations: Sequence[Mapping[str, Any]], context: Context, *,
         seconds: float = math.inf,
-    ) -> list[LayerError]:
-        """Return the error of each group of layers, the worst first when ``ordered``; see ``sensitivities``.
+    ) -> list[LayerError]:  # fmt: skip
+        """Return the error of each group of layers, the worst first; see ``sensitivities``.
 
         Raises:
             DataError: when there is no observation.
@@ -245,7 +237,7 @@ class Switchboard:
                 context.progress(f"int8 in layer {index + 1} of {len(groups)}, all else in float32", done)
                 rows[index].append(_compare(spec, self.run(group, observation), reference))
         layers = [self._error(group, row) for group, row in zip(groups, rows, strict=True)]
-        return sorted(layers, key=lambda layer: -layer.error) if ordered else layers
+        return sorted(layers, key=lambda layer: -layer.error)
 
     def _error(self, group: Sequence[LayerId], rows: list[tuple[Array, ...]]) -> LayerError:
         spec = self.policy.spec.action
