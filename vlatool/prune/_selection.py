@@ -24,6 +24,19 @@ class Selection:
     protected: tuple[str, ...] = ()
     parts: tuple[str, ...] = ()
 
+    @classmethod
+    def protecting(
+        cls, words: tuple[str, ...], parts: Mapping[str, Sequence[str]],
+        include: tuple[str, ...] = (), exclude: tuple[str, ...] = (),
+    ) -> Selection:  # fmt: skip
+        """Return the selection where names with these words are protected, and parts that a description names so.
+
+        Args:
+            parts: Name of a part, such as ``action_head`` -> globs of modules.
+        """
+        globs = [glob for name, globs in parts.items() if _has_word(name, words) for glob in globs]
+        return cls(include, exclude, words, tuple(globs))
+
     def check(self, names: Sequence[str], what: str) -> None:
         """Refuse a pattern that matches nothing."""
         for pattern in (*self.include, *self.exclude):
@@ -39,15 +52,6 @@ class Selection:
     def protects(self, name: str) -> bool:
         """Return whether a part stays unless it is included."""
         return _has_word(name, self.protected) or matches(name, self.parts)
-
-
-def protected_parts(parts: Mapping[str, Sequence[str]], words: Sequence[str]) -> tuple[str, ...]:
-    """Return the globs of the parts in a policy's description with a protected word in their names.
-
-    Args:
-        parts: Name of a part, such as ``action_head`` -> globs of modules.
-    """
-    return tuple(pattern for name, globs in parts.items() if _has_word(name, words) for pattern in globs)
 
 
 def _has_word(name: str, words: Sequence[str]) -> bool:

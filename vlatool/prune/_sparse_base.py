@@ -18,7 +18,7 @@ from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._output_layers import output_layers
 from vlatool.prune._product_observer import is_product_layer, observe_products
-from vlatool.prune._selection import Selection, protected_parts
+from vlatool.prune._selection import Selection
 from vlatool.runtime.engine import usable_engines
 from vlatool.stage.base import Context
 
@@ -185,7 +185,7 @@ def select_layers(
                 found.setdefault(id(part.weight), ((graph, name), part))
     named = dict(found.values())
     full = {(graph, name): f"{graph}.{name}" if len(modules) > 1 else name for graph, name in named}
-    selection = Selection(include, exclude, PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS))
+    selection = Selection.protecting(PROTECTED_WORDS, source.manifest.parts, include, exclude)
     selection.check([*full.values(), *(name for _, name in named)], "layer")
     outputs = output_layers(modules, source, named.values()) if not include else set()
     prunable = {
