@@ -56,6 +56,16 @@ class VlatoolError(Exception):
     def __str__(self) -> str:
         return f"{self.message}\n  fix: {self.fix}" if self.fix else self.message
 
+    @classmethod
+    def unknown(cls, problem: str, name: str, known: Iterable[str]) -> VlatoolError:
+        """Return the error for an unknown name: the message lists the known names, the fix is the most similar one.
+
+        Args:
+            problem: what is wrong, without the full stop.
+        """
+        names = list(known)
+        return cls(f"{problem}; {suggest(name, names)}.", fix_for(name, names))
+
     def __reduce__(self) -> tuple[type[VlatoolError], tuple[str, str]]:
         """Pickle message and fix, so that an error passes between processes unchanged."""
         return type(self), (self.message, self.fix)

@@ -21,7 +21,7 @@ from importlib import metadata
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import PluginError, UsageError, VlatoolError, fix_for, suggest
+from vlatool.errors import PluginError, UsageError, VlatoolError
 
 PACKAGE_OF_KIND = {
     "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
@@ -90,9 +90,7 @@ def module(kind: str, name: str) -> ModuleType:
     if own_name in _builtin_names(kind):
         return importlib.import_module(f"{package_of(kind)}.{own_name}")
     if own_name not in plugins(kind):
-        raise UsageError(
-            f"Unknown {noun_of(kind)} '{name}'; {suggest(own_name, names(kind))}.", fix_for(own_name, names(kind))
-        )
+        raise UsageError.unknown(f"Unknown {noun_of(kind)} '{name}'", own_name, names(kind))
     entry = plugins(kind)[own_name]
     try:
         return importlib.import_module(entry.module)

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 
 LOWEST_OPSET = 18
-"""Of torch's dynamo exporter."""
+"""Lowest opset of torch's dynamo exporter."""
 
 
 class ExportOnnx(Transform):

@@ -15,7 +15,7 @@ from vlatool.module.edits import BLOCKS, Edit, refuse_traced
 from vlatool.module.feeds import unrecorded_note
 from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._block_ranking import BlockId, BlockRanking, StackId
-from vlatool.prune._selection import Selection, protected_parts
+from vlatool.prune._selection import Selection
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -144,9 +144,7 @@ class Depth(ModuleStage):
                 "class, each with an output like its input.",
                 "prune widths instead: vlatool prune neurons",
             )
-        selection = Selection(
-            self.include, self.exclude, PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS)
-        )
+        selection = Selection.protecting(PROTECTED_WORDS, source.manifest.parts, self.include, self.exclude)
         selection.check(names, "stack of blocks")
         selected = {(graph, name): size for (graph, name), size in sizes.items() if selection.selects((name,))}
         if not selected:

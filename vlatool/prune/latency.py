@@ -34,7 +34,7 @@ from vlatool.prune._latency_costs import (
     role_of,
 )
 from vlatool.prune._latency_meter import LatencyMeter, LatencyPredictor
-from vlatool.prune._selection import Selection, protected_parts
+from vlatool.prune._selection import Selection
 from vlatool.prune._trials import Trials
 from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, no_units, rank_units, trace_walks
 from vlatool.prune.depth import PROTECTED_WORDS
@@ -175,7 +175,7 @@ class LatencyPruning(ModuleStage):
         """Return the stacks that may lose blocks, with the importance of each block; none for a policy without any."""
         if not self.blocks or self.rank != "gate":
             return []
-        protected = Selection((), (), PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS))
+        protected = Selection.protecting(PROTECTED_WORDS, source.manifest.parts)
         found = [
             Stack(lists, tuple(name for name, _ in blocks.named_children()))
             for lists, blocks in stacks_of(modules)
@@ -246,10 +246,7 @@ class _Selector:
     """Selects units and blocks to remove by their measured costs.
 
     Args:
-        stacks: Stacks of removable blocks.
-        work: Counter of multiply-accumulates of the groups.
         prices: Role of a group -> milliseconds for a multiply-accumulate.
-        least: Least share of each group that stays.
     """
 
     def __init__(

@@ -51,10 +51,6 @@ class Float16(Quantization):
     calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
     samples: int = Field(16, ge=1, description="samples in which to look for values beyond float16")
 
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file."""
-        return (self.calibration,) if self.calibration else ()
-
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Find values beyond float16, then convert every selected graph."""
         bundle = source_of(source, self.name())

@@ -39,15 +39,7 @@ from vlatool.quantize.int8.frame_normalization import fold_normalization
 from vlatool.quantize.int8.integer_matmul import use_integer_matmul
 from vlatool.quantize.int8.quantizer_hoisting import hoist_quantizers
 from vlatool.quantize.int8.reductions import keep_reduced_axes
-from vlatool.runtime.engine import (
-    DEFAULT_ENGINE,
-    STANDARD_LAYOUT,
-    Engine,
-    Int8Layout,
-    class_for,
-    engine_class,
-    layouts,
-)
+from vlatool.runtime.engine import DEFAULT_ENGINE, STANDARD_LAYOUT, Engine, Int8Layout, class_for, engine_class, layouts
 from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.errors import RecipeError
 from vlatool.module.batched_program import BatchedProgram
 from vlatool.training.feature_distillation import with_hints
 from vlatool.training.flow import CHUNK, check_loops, flow_loss
@@ -49,10 +49,7 @@ class ImitationStage(TrainingStage):
         """The loss is known, and fits the action."""
         known = registry.names("losses")
         if self.loss != "auto" and self.loss not in known:
-            raise RecipeError(
-                f"Unknown loss '{self.loss}'; {suggest(self.loss, ['auto', *known])}.",
-                fix_for(self.loss, ["auto", *known]),
-            )
+            raise RecipeError.unknown(f"Unknown loss '{self.loss}'", self.loss, ["auto", *known])
         super().check(source, profile)
         if source is not None and self.loss == "kl" and source.manifest.spec.action.kind != "discrete":
             raise RecipeError("The loss kl compares discrete actions; the policy's are continuous.", "try --loss l1")

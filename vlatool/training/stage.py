@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
 from vlatool.bundle.bundle import MANIFEST, REPORTS, Bundle
@@ -30,7 +29,7 @@ from vlatool.training.generalization_gap import gap_lines
 from vlatool.training.launcher import launch_processes
 from vlatool.training.loop import Settings, seconds_of
 from vlatool.training.objective import Objective
-from vlatool.training.report import along_lines, write_training_report
+from vlatool.training.report import along_lines, course, write_training_report
 from vlatool.training.rounds import scene_of
 from vlatool.training.session import Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
@@ -223,16 +222,14 @@ class TrainingStage(ModuleStage):
     def summary(self, made: Bundle) -> tuple[str, ...]:
         """Return sentences on the training data and the losses."""
         training = json.loads(made.file(TRAINING).read_bytes())
-        losses, last = training["losses"], max(1, len(training["losses"]) // 20)
         seen = sum(round_["observations"] for round_ in training["rounds"])
-        first, end = np.mean(losses[:last]), np.mean(losses[-last:])
         played = ", ".join(
             f"{round_['actor']} {round_['successes'] / round_['episodes']:.1%} of {round_['episodes']}"
             for round_ in training["rounds"] if round_.get("episodes")
         )  # fmt: skip
         return (
             *along_lines(training),
-            f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
+            f"{course(training)} on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
             *gap_lines(training["rounds"]),
             *_hint_lines(training.get("hints", {})),
