@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from vlatool.stage.base import Context
 from vlatool.user_code import children
 
 PRELOAD = ("numpy", "onnx", "onnxruntime", __name__)
-Tell = Callable[[str, float | None], None]
 
 
 def explain_in_child(bundle: Bundle, options: Options, context: Context) -> Report:
@@ -32,9 +31,7 @@ def explanation_in_child(bundle: Bundle, baseline: Bundle | None, context: Conte
     """Return the sentences of ``explanation``, or one with the reason why it failed.
 
     Args:
-        bundle: Bundle to explain.
         baseline: The float32 bundle that it was made from.
-        context: Receiver of progress.
         limits: Limits for ``explanation``.
     """
     paths = [str(each.path.absolute()) if each is not None else "" for each in (bundle, baseline)]
@@ -44,13 +41,13 @@ def explanation_in_child(bundle: Bundle, baseline: Bundle | None, context: Conte
         return (f"This could not be explained: {error.message}",)
 
 
-def report(job: Mapping[str, Any], tell: Tell) -> str:
+def report(job: Mapping[str, Any], tell: children.OnProgress) -> str:
     """Explain the bundle of a job in this process; return the report as JSON."""
     options = from_json(Options, job["options"], "options")
     return explain(Bundle.open(Path(job["bundle"])), options, Context(tell)).to_json()
 
 
-def sentences(job: Mapping[str, Any], tell: Tell) -> list[str]:
+def sentences(job: Mapping[str, Any], tell: children.OnProgress) -> list[str]:
     """Explain the bundle of a job in a few sentences in this process."""
     bundle, baseline = (Bundle.open(Path(path), verify=False) if path else None for path in job["paths"])
     return list(explanation(bundle, baseline, Context(tell), **job["limits"])) if bundle else []

@@ -33,7 +33,6 @@ class BoardMeasurement:
 
     Args:
         profile, mode, engine, precision: Names as in a profile.
-        work: Work of one inference.
         ms: Median latency.
     """
 
@@ -63,7 +62,6 @@ def report_measurements(
 
     Args:
         report: ``report.json`` or its directory.
-        profile: Profile of the board.
         mode: Power mode of the board; the default one when None.
         load: Workload of the policy, for a report without it.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,8 @@ def sensitivities_in_child(
 
     Args:
         bundle: A float32 bundle with a recording.
-        stage: Stage that selects the layers and their style.
         recorded: Number of observations of that recording to choose from.
         samples: Number of observations to measure on, spread over these.
-        seconds: See ``sensitivities``.
 
     Raises:
         VlatoolError: errors of ``sensitivities``; GraphError when the engine crashes the child.
@@ -41,7 +39,7 @@ def sensitivities_in_child(
     return from_json(list[LayerError], json.loads(reply), "layers")
 
 
-def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:
+def run(job: Mapping[str, Any], tell: children.OnProgress) -> str:
     """Measure the layers of a job in this process; return them as JSON, with possible infinities and NaN."""
     bundle = Bundle.open(Path(job["bundle"]), verify=False)
     observations, limit = recorded_observations(bundle, job["recorded"]), job["samples"]
