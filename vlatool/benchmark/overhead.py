@@ -34,7 +34,7 @@ ROUND = 40
 class Overhead(Measure):
     """Measure what ``infer`` adds to the engine's bare ``run()`` on the same inputs.
 
-    Rounds of consecutive calls of one kind, as a controller makes them, alternate with rounds of the other; the
+    Rounds of consecutive calls of one kind, as a controller makes, alternate with rounds of the other; the
     overhead is the median over pairs of rounds of the difference of their medians. A second figure is the harder case:
     single calls of both kinds in turn, so that each finds the processor's caches as the other left them.
     """

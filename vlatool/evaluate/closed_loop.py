@@ -53,7 +53,7 @@ CONTROL_EPISODES = 20
 class ClosedLoop(Measure):
     """Run episodes in a gymnasium environment: success rate with Wilson interval, and McNemar's exact test when paired.
 
-    With a baseline, actions that do not look at the observation are played, too: it must succeed more often than they.
+    With a baseline, actions that ignore the observation are played, too: the baseline must succeed more often.
     Episode ``k`` of a task has the seed ``first_seed + k`` for every bundle, so that outcomes are paired.
     """
 
@@ -66,7 +66,7 @@ class ClosedLoop(Measure):
     first_seed: int = Field(EVALUATION_SEEDS, ge=0, description="seed of the first episode of every task")
     baseline: Path | None = Field(None, description="bundle to pair with, usually float32")
     control: Literal["", "random", "constant"] = Field(
-        "", description="actions that do not look, in the place of the policy's: what succeeds by chance"
+        "", description="actions that ignore the observation, instead of the policy's: shows what succeeds by chance"
     )
     instruction: Literal["right", "wrong"] = Field("right", description="wrong: the control that a policy must fail")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
@@ -81,14 +81,14 @@ class ClosedLoop(Measure):
     strength: tuple[float, ...] = Field(
         (1.0,),
         min_length=1,
-        description="of the disturbances, or several, such as 0.5,1,2; 1: what an ordinary day brings",
+        description="strength of the disturbances, or several, such as 0.5,1,2; 1 is ordinary operation",
     )
-    latency_in_the_loop: bool = Field(False, description="let actions come as late as inferences take")
+    latency_in_the_loop: bool = Field(False, description="delay actions by the time that inferences take")
     environment_timeout: float = Field(
         0.0,
         ge=0,
         le=1e6,
-        description="seconds that a call of the environment may take; when 0, what policy.yaml says, or 300",
+        description="seconds that a call of the environment may take; when 0, the limit in policy.yaml, or 300",
     )
     controller: tuple[str, ...] = Field(
         (),

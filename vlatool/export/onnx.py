@@ -52,8 +52,8 @@ LOWEST_OPSET = 18
 class ExportOnnx(Transform):
     """Export every graph of a torch policy to ONNX (dynamo exporter, static shapes).
 
-    The files count only after ONNX Runtime loaded them and gave, through the policy's whole program, what torch gives
-    on calibration observations.
+    The files are accepted only after ONNX Runtime has loaded them and, through the policy's whole program, given the
+    same results as torch on calibration observations.
     """
 
     takes_modules: ClassVar[bool] = True

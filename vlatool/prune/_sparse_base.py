@@ -45,7 +45,7 @@ class SparsePruning(ModuleStage):
     pattern: Pattern = Field(
         "unstructured", description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half"
     )
-    samples: int = Field(32, ge=1, description="recorded observations to look at")
+    samples: int = Field(32, ge=1, description="recorded observations to use")
     include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")
     exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
 

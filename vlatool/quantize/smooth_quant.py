@@ -57,7 +57,7 @@ class SmoothQuant(CalibratedQuantization):
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
 
     alpha: Annotated[str, BeforeValidator(_alpha)] = Field(
-        "0.5", description="0 to 1: how much moves into the weights; auto: by the estimated int8 error of each layer"
+        "0.5", description="0 to 1: share of outliers moved into the weights; auto: by the int8 error of each layer"
     )
     outliers: float = Field(
         1.0, ge=1, description="smooth activations whose largest channel is this many times the median one"

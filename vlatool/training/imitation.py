@@ -31,18 +31,18 @@ class ImitationStage(TrainingStage):
     """Trains a student to do what its teacher does, from the same observation and the same noise."""
 
     loss: str = Field("auto", description="kl (discrete actions), l1, l2 or huber; kl or l1 when auto")
-    temperature: float = Field(2.0, gt=0, le=100, description="of kl")
-    delta: float = Field(0.1, gt=0, le=1000, description="of huber")
+    temperature: float = Field(2.0, gt=0, le=100, description="temperature of the loss kl")
+    delta: float = Field(0.1, gt=0, le=1000, description="threshold of the loss huber")
     targets: Literal["chunk", "flow"] = Field(
         "chunk",
-        description="what is compared: the action at the end of all denoising steps, or one step of each observation, "
-        "from where the teacher stood (flow)",
+        description="target of the loss: the action after all denoising steps, or one step for each observation, from "
+        "the teacher's state (flow)",
     )
     features: float = Field(
-        0.0, ge=0, le=1e6, description="weight in the loss of what blocks give, compared with the teacher's; 0 for none"
+        0.0, ge=0, le=1e6, description="weight of the loss between the outputs of blocks and the teacher's; 0 for none"
     )
     attention: float = Field(
-        0.0, ge=0, le=1e6, description="weight of which tokens are alike in what blocks give; 0 for none"
+        0.0, ge=0, le=1e6, description="weight of the loss between token similarities in block outputs; 0 for none"
     )
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
