@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 from vlatool.bundle.program import ProgramStep, check_program, program_from
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import BundleError
 from vlatool.files.limits import check_limit
-from vlatool.files.validate import finite_number, integer, known_keys, mapping, path_problem, sequence, short_repr, text
+from vlatool.files.messages import field_values, to_json
+from vlatool.files.validate import finite_number, integer, mapping, path_problem, sequence, short_repr, text
 
 SCHEMA = 1
 GOLDEN_TOLERANCE = 0.05
@@ -139,9 +140,8 @@ class Manifest:
             BundleError: for a newer schema, a missing key or a wrong type.
             SpecError: for an impossible spec or program.
         """
-        values = mapping(data, "The manifest", BundleError)
-        check_schema(values.get("schema"))
-        known_keys(values, [item.name for item in fields(cls)], "The manifest", BundleError)
+        check_schema(mapping(data, "The manifest", BundleError).get("schema"))
+        values = field_values(cls, data, "The manifest", BundleError)
         for item in fields(cls):
             if item.name in values:
                 _check_type(item.name, values[item.name], item)
@@ -161,17 +161,10 @@ class Manifest:
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a mapping that ``from_dict`` turns back into an equal manifest; empty values are left out."""
-        plain: dict[str, Any] = {"schema": self.schema, "name": self.name, "version": self.version}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name not in plain and value:
-                plain[item.name] = value
-        plain["spec"] = self.spec.to_dict()
-        plain["graphs"] = {name: _nonempty(graph) for name, graph in self.graphs.items()}
-        plain["program"] = [_nonempty(step) for step in self.program]
-        plain["files"] = {path: asdict(record) for path, record in sorted(self.files.items())}
-        return plain
+        """Return a mapping that ``from_dict`` turns back into an equal manifest; defaults are left out."""
+        plain: dict[str, Any] = {"schema": self.schema, **to_json(self, defaults=False)}
+        plain |= {"graphs": plain.get("graphs", {}), "program": plain.get("program", [])}
+        return plain | {"files": dict(sorted(plain.get("files", {}).items()))}
 
 
 def check_files(manifest: Manifest) -> None:
@@ -222,16 +215,14 @@ def _check_type(name: str, value: Any, item: Any) -> None:
 
 
 def _graph(name: str, data: Any) -> Graph:
-    values = mapping(data, f"The graph '{name}'", BundleError)
-    known_keys(values, [item.name for item in fields(Graph)], f"The graph '{name}'", BundleError)
+    values = field_values(Graph, data, f"The graph '{name}'", BundleError)
     if "file" not in values:
         raise BundleError(f"The graph '{name}' has no 'file'.", "export the policy again")
     return Graph(**values)
 
 
 def _record(path: str, data: Any) -> FileRecord:
-    values = mapping(data, f"The record of {short_repr(path)}", BundleError)
-    known_keys(values, ("sha256", "bytes"), f"The record of {short_repr(path)}", BundleError)
+    values = field_values(FileRecord, data, f"The record of {short_repr(path)}", BundleError)
     digest = values.get("sha256")
     if not isinstance(digest, str) or not SHA256.fullmatch(digest):
         raise BundleError(f"The record of {short_repr(path)} has the SHA-256 {short_repr(digest)}, not 64 hex digits.")
@@ -254,12 +245,3 @@ def _entries(data: Any, where: str, keys: tuple[str, ...]) -> tuple[dict[str, An
         named = " and ".join(f"'{key}'" for key in keys)
         raise BundleError(f"The manifest has a malformed '{where}'; it must be a list of mappings with {named}.")
     return tuple(dict(entry) for entry in data)
-
-
-def _nonempty(value: Any) -> dict[str, Any]:
-    plain = {}
-    for item in fields(value):
-        content = getattr(value, item.name)
-        if content not in ({}, [], "", 0) and not (item.name == "repeat" and content == 1):
-            plain[item.name] = content
-    return plain

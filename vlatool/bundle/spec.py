@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
-from vlatool.files.validate import integer, known_keys, mapping, path_problem, short_repr, text
+from vlatool.files.messages import field_values, to_json
+from vlatool.files.validate import integer, path_problem, short_repr, text
 
 DTYPES = (
     "float32", "float16", "int64", "int32", "uint8", "bool", "float64", "int8", "int16", "uint16", "uint32", "uint64",
@@ -163,13 +164,10 @@ class TensorSpec:
             SpecError: for an unknown key or an impossible value.
         """
         name = short_repr(data.get("name", "?") if isinstance(data, Mapping) else data)
-        values = _known_only(cls, data, f"tensor {name}")
+        values = field_values(cls, data, f"The tensor {name}", SpecError)
         if values.get("kind") == "text":
             values.setdefault("dtype", "int64")
-            values.setdefault("shape", [1, values.get("max_tokens", 1)])
-        for key in ("shape", "labels", "unit"):
-            if isinstance(values.get(key), list):
-                values[key] = tuple(values[key])
+            values.setdefault("shape", (1, values.get("max_tokens", 1)))
         if "name" not in values or not isinstance(values.get("shape"), tuple):
             raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {short_repr(values.get('shape'))}.")
         if values.get("kind") == "discrete":
@@ -178,7 +176,8 @@ class TensorSpec:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields that differ from their defaults, with tuples as lists."""
-        return _plain(self)
+        plain: dict[str, Any] = to_json(self, defaults=False)
+        return plain
 
 
 def _indices(shape: tuple[Any, ...]) -> tuple[str, ...]:
@@ -254,10 +253,10 @@ class PolicySpec:
         Raises:
             SpecError: for a missing or unknown key or an impossible value.
         """
-        values = _known_only(cls, data, "spec")
+        values = field_values(cls, data, "The spec", SpecError)
         for key in ("inputs", "outputs"):
             listed = values.get(key)
-            if not isinstance(listed, list | tuple):
+            if not isinstance(listed, tuple):
                 raise SpecError(f"The spec needs '{key}', a list of tensors; got {short_repr(listed)}.")
             values[key] = tuple(TensorSpec.from_dict(item) for item in listed)
         if "control_hz" not in values:
@@ -266,23 +265,5 @@ class PolicySpec:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a mapping that ``from_dict`` turns back into an equal spec."""
-        plain = _plain(self)
-        plain["inputs"] = [tensor.to_dict() for tensor in self.inputs]
-        plain["outputs"] = [tensor.to_dict() for tensor in self.outputs]
+        plain: dict[str, Any] = to_json(self, defaults=False)
         return plain
-
-
-def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
-    values = mapping(data, f"The {where}", SpecError)
-    known_keys(values, [field.name for field in fields(cls)], f"The {where}", SpecError)
-    return values
-
-
-def _plain(value: Any) -> dict[str, Any]:
-    """Return the non-default fields of a dataclass, tuples as lists (required fields always)."""
-    plain = {}
-    for field in fields(value):
-        item = getattr(value, field.name)
-        if item != field.default:
-            plain[field.name] = list(item) if isinstance(item, tuple) else item
-    return plain

@@ -9,7 +9,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError
 from vlatool.explain import Options, explain, explanation
-from vlatool.files.messages import to_json
+from vlatool.files.messages import from_json, to_json
 from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.user_code import children
@@ -23,7 +23,7 @@ def explain_in_child(bundle: Bundle, options: Options, context: Context) -> Repo
     Raises:
         VlatoolError: errors of ``explain``; GraphError when an engine crashes the child.
     """
-    job = {"bundle": str(bundle.path.absolute()), "options": _options_to_json(options)}
+    job = {"bundle": str(bundle.path.absolute()), "options": to_json(options)}
     return Report.from_json(_call("report", job, context))
 
 
@@ -43,9 +43,8 @@ def explanation_in_child(bundle: Bundle, baseline: Bundle | None, context: Conte
 
 def report(job: Mapping[str, Any], tell: children.OnProgress) -> str:
     """Explain the bundle of a job in this process; return the report as JSON."""
-    options = job["options"]
-    paths = {name: Path(options[name]) if options[name] else None for name in ("baseline", "data")}
-    return explain(Bundle.open(Path(job["bundle"])), Options(**{**options, **paths}), Context(tell)).to_json()
+    options = from_json(Options, job["options"], "options")
+    return explain(Bundle.open(Path(job["bundle"])), options, Context(tell)).to_json()
 
 
 def sentences(job: Mapping[str, Any], tell: children.OnProgress) -> list[str]:
@@ -56,8 +55,3 @@ def sentences(job: Mapping[str, Any], tell: children.OnProgress) -> list[str]:
 
 def _call(function: str, job: Mapping[str, Any], context: Context) -> Any:
     return children.call(f"{__name__}:{function}", job, context.progress, "explain", PRELOAD, own=True)
-
-
-def _options_to_json(options: Options) -> dict[str, Any]:
-    paths = {name: str(path) if path else "" for name, path in (("baseline", options.baseline), ("data", options.data))}
-    return {**to_json(options), **paths}

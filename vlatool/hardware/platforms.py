@@ -9,6 +9,7 @@ from pydantic import Field, ValidationError
 
 from vlatool.errors import ProfileError
 from vlatool.files.yaml import read_yaml
+from vlatool.hardware._problems import describe_problem
 from vlatool.hardware.profile import NAME, SUFFIXES, Kind, Strict
 
 
@@ -57,9 +58,11 @@ def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
         return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
+        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        if first["type"] == "extra_forbidden":
+            problem = describe_problem(first, Platform.model_fields)
         raise ProfileError(
-            f"The platform {path} is malformed: {where}: {first['msg']}.",
+            f"The platform {path} is malformed: {problem.rstrip('.')}.",
             "correct it in the file; the platforms that come with vlatool show what belongs there",
         ) from error
 

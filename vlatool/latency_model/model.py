@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import DataError
+from vlatool.files.messages import to_json
 from vlatool.files.user_files import atomic_file
 from vlatool.latency_model.features import PROXIES, Question, Shares, rows_of
 from vlatool.latency_model.gaussian_process import KEYS, PARTS, Process, Rows, Scales
@@ -249,8 +250,6 @@ def read_model(folder: Path) -> LatencyModel:
 
 def write(model: LatencyModel, folder: Path) -> None:
     """Write ``latency.npz`` and ``latency.json`` as ``load_model`` reads them."""
-    import dataclasses
-
     arrays: dict[str, Array] = {}
     described: dict[str, Any] = {}
     for part, known in model.parts.items():
@@ -260,8 +259,8 @@ def write(model: LatencyModel, folder: Path) -> None:
             arrays[f"{part}.{name}"] = getattr(rows, name).astype(np.float32)
         arrays[f"{part}.logs"] = known.logs.astype(np.float32)
         described[part] = {
-            "scales": {key: float(f"{value:.5g}") for key, value in dataclasses.asdict(known.scales).items()},
-            "shares": {key: float(f"{value:.5g}") for key, value in dataclasses.asdict(model.shares[part]).items()},
+            "scales": {key: float(f"{value:.5g}") for key, value in to_json(known.scales).items()},
+            "shares": {key: float(f"{value:.5g}") for key, value in to_json(model.shares[part]).items()},
             "conformal": {
                 regime: {unit: round(value, 4) for unit, value in units.items()}
                 for regime, units in model.conformal[part].items()

@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vlatool.errors import DataError, UsageError
+from vlatool.files.messages import from_json, to_json
 from vlatool.latency_model.fit import fit
 from vlatool.latency_model.model import LatencyModel, Prediction
 from vlatool.latency_model.published_latencies import Point, merge_versions, read_points
@@ -63,7 +63,7 @@ def refit_points(
     with single_threads(), contextlib.closing(parts):
         for done, part in enumerate(parts, 1):
             for kind, rows in part.items():
-                answered[kind] += [(points[number], Prediction(**values)) for number, values in rows]
+                answered[kind] += [(points[number], from_json(Prediction, values)) for number, values in rows]
             tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
     unasked = [point for point in points if not point.question]
     summaries = {}
@@ -92,7 +92,7 @@ def fold(job: Mapping[str, Any], _tell: OnProgress) -> dict[str, Any]:
     points = read_points(Path(job["points"]))
     numbers = {id(point): number for number, point in enumerate(points)}
     answered = one_fold(points, frozenset(job["held"]), job["held_out"], job["seed"], job["seconds"])
-    return {kind: [[numbers[id(point)], asdict(answer)] for point, answer in part] for kind, part in answered.items()}
+    return {kind: [[numbers[id(point)], to_json(answer)] for point, answer in part] for kind, part in answered.items()}
 
 
 def one_fold(

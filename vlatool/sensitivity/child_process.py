@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
+from vlatool.files.messages import from_json, to_json
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.sensitivity.layers import LayerError, sensitivities
 from vlatool.stage.base import Context
@@ -36,7 +36,7 @@ def sensitivities_in_child(
         "samples": samples, "seconds": seconds,
     }  # fmt: skip
     reply = children.call(f"{__name__}:run", job, context.progress, "measuring the layers", PRELOAD, own=True)
-    return [LayerError(**layer) for layer in json.loads(reply)]
+    return from_json(list[LayerError], json.loads(reply), "layers")
 
 
 def run(job: Mapping[str, Any], tell: children.OnProgress) -> str:
@@ -46,4 +46,4 @@ def run(job: Mapping[str, Any], tell: children.OnProgress) -> str:
     selected = observations[:: max(1, len(observations) // limit)][:limit]
     stage = StaticInt8(**job["options"])
     layers = sensitivities(bundle, stage, None, selected, Context(tell), seconds=job["seconds"])
-    return json.dumps([asdict(layer) for layer in layers])
+    return json.dumps(to_json(layers))
