@@ -30,7 +30,7 @@ class Listener:
 
 def test_a_stage_runs_into_place_and_nothing_is_left_beside_it(float_bundle, tmp_path):
     out = tmp_path / "place" / "out"
-    made = run_transform(DynamicInt8(), float_bundle, out, Context())
+    made = run_transform(DynamicInt8(), float_bundle, out, Context()).bundle
     assert Bundle.open(out).hash == made.hash
     assert made.manifest.parent == float_bundle.hash
     assert list(out.parent.iterdir()) == [out]
@@ -67,9 +67,9 @@ def test_a_stage_is_checked_before_anything_is_written(float_bundle, tmp_path):
 
 
 def test_a_second_run_reads_the_cache_and_gives_the_same_bundle(float_bundle, tmp_path):
-    first = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context())
+    first = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context()).bundle
     before = stamps(tmp_path)
-    second = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context())
+    second = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context()).bundle
     assert (second.hash, second.path) == (first.hash, first.path)
     assert stamps(tmp_path) == before
 
@@ -94,10 +94,10 @@ def test_other_options_are_another_entry(float_bundle, tmp_path):
     ids=["graph changed", "graph missing", "manifest cut", "manifest missing"],
 )
 def test_a_damaged_bundle_in_the_cache_is_made_again_and_that_is_said(float_bundle, tmp_path, damage):
-    first = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context())
+    first = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context()).bundle
     damage(first.path)
     listener = Listener()
-    assert cached_transform(DynamicInt8(), float_bundle, tmp_path, listener.context).hash == first.hash
+    assert cached_transform(DynamicInt8(), float_bundle, tmp_path, listener.context).bundle.hash == first.hash
     assert Bundle.open(first.path).hash == first.hash
     assert "the cached quantize.dynamic_int8 is damaged; making it again" in listener.told
 

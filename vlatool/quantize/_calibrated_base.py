@@ -25,7 +25,8 @@ from vlatool.quantize._base import Quantization
 from vlatool.quantize.calibration.activation_statistics import ValueNames, calibrate
 from vlatool.quantize.calibration.ranges import Statistics
 from vlatool.quantize.calibration.samples import played_moments, recorded_moments
-from vlatool.stage.base import Context, SampleSet
+from vlatool.stage.base import Context
+from vlatool.stage.record import SampleSet
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -42,10 +43,6 @@ class CalibratedQuantization(Quantization):
 
     calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
     samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
-
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file."""
-        return (self.calibration,) if self.calibration else ()
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is calibration data."""

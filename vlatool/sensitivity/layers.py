@@ -29,7 +29,8 @@ from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.sensitivity._switches import add_switches
-from vlatool.stage.base import Context, SampleSet
+from vlatool.stage.base import Context
+from vlatool.stage.record import SampleSet
 
 Array = NDArray[Any]
 LayerId = tuple[str, str]
