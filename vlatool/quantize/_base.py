@@ -7,7 +7,7 @@ import fnmatch
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -27,11 +27,11 @@ from vlatool.graph.precision import FLOATS
 from vlatool.quantize.calibration.non_finite import finite_layers
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
-from vlatool.stage import record
 from vlatool.stage.base import Context, Result, Transform
 from vlatool.stage.finish import MAX_COMPARED, carry_over, finish, history
 from vlatool.stage.precision_shares import count_shares
 from vlatool.stage.products import int8_arithmetic
+from vlatool.stage.record import SampleSet, made_by
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -101,11 +101,16 @@ class Quantization(Transform):
         context: Context,
         quantize: QuantizeGraph,
         engine: str = "",
-        made_by: dict[str, Any] | None = None,
+        samples: SampleSet | None = None,
+        report: Mapping[str, Any] | None = None,
     ) -> Result:
         """Run ``quantize(graph name, original file, new file)`` on each selected graph and finish the bundle.
 
         The phases of a graph that computes in bfloat16 (``graph.phase``) move to a separate float32 graph.
+
+        Args:
+            samples: samples that the method calibrated on, for the record of the bundle.
+            report: further entries of that record.
         """
         (out / "graphs").mkdir()
         graphs: dict[str, Graph] = {}
@@ -132,8 +137,8 @@ class Quantization(Transform):
         carry_over(source, out)
         context.progress("running the quantized graphs", None)
         changes = {"program": program, "engine": engine or source.manifest.engine}
-        made_by = made_by or record.made_by(self)
-        made = finish(source, out, made_by=made_by, graphs=graphs, changes=changes, **self.golden_arguments(source))
+        recorded = {**made_by(self, calibration=samples), **(report or {})}
+        made = finish(source, out, made_by=recorded, graphs=graphs, changes=changes, **self.golden_arguments(source))
         return Result(made, messages)
 
     @property

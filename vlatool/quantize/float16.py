@@ -25,7 +25,7 @@ from vlatool.quantize.floats.underflow import measure_sizes, underflow_nodes
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, Result
-from vlatool.stage.record import SampleSet, made_by
+from vlatool.stage.record import SampleSet
 
 CRASH_FIX = "leave layers beside a Transpose in float32 with --exclude, or use another method"
 
@@ -95,8 +95,7 @@ class Float16(Quantization):
             report["subnormal_weights"] += weight_losses(model, kept).subnormal
             report["moved"][name] = float(f"{change:.2g}")
 
-        recorded = {**made_by(self, calibration=samples), "float16": report}
-        return self.transform(source, out, context, convert, made_by=recorded)
+        return self.transform(source, out, context, convert, samples=samples, report={"float16": report})
 
     def summarize(self, quantized: Bundle) -> tuple[str, ...]:
         """Return a summary of the new bundle for the user."""

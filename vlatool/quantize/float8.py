@@ -15,7 +15,7 @@ from vlatool.quantize._base import QUANTIZED_OPS, check_ops
 from vlatool.quantize._calibrated_base import CalibratedQuantization
 from vlatool.quantize.floats.float8_qdq import Float8Writer
 from vlatool.stage.base import Context, Result
-from vlatool.stage.record import SampleSet, made_by
+from vlatool.stage.record import SampleSet
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -55,4 +55,4 @@ class Float8(CalibratedQuantization):
             Float8Writer(model, layers[name], peaks, self.per_channel).write()
             save(model, target)
 
-        return self.transform(source, out, context, quantize, made_by=made_by(self, calibration=samples))
+        return self.transform(source, out, context, quantize, samples=samples)

@@ -24,7 +24,7 @@ from vlatool.quantize.int8.smoothing_scales import PeakExcess, best_alpha, int8_
 from vlatool.runtime.golden import load_golden
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, Result
-from vlatool.stage.record import SampleSet, made_by
+from vlatool.stage.record import SampleSet
 
 Array = NDArray[Any]
 
@@ -91,7 +91,7 @@ class SmoothQuant(CalibratedQuantization):
                 notes.append({"graph": name, **self._smooth(model, group, largest, sum(map(len, halves)))})
             save(model, target)
 
-        result = self.transform(source, out, context, smooth, made_by=made_by(self, calibration=samples))
+        result = self.transform(source, out, context, smooth, samples=samples)
         (out / REPORT).parent.mkdir(exist_ok=True)
         (out / REPORT).write_text(json.dumps({"groups": notes}, indent=1) + "\n", encoding="utf-8")
         _check_same(source, result.bundle)

@@ -49,7 +49,7 @@ from vlatool.runtime.engine import (
     layouts,
 )
 from vlatool.stage.base import Context, Result
-from vlatool.stage.record import SampleSet, made_by
+from vlatool.stage.record import SampleSet
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -194,7 +194,7 @@ class StaticInt8(CalibratedQuantization):
                 open_in_child(target, self.engine, "int8", CRASH_FIX)
             return "" if self.compute == "float32" else self.compute
 
-        result = self.transform(source, out, context, quantize, self.engine, made_by(self, calibration=samples))
+        result = self.transform(source, out, context, quantize, self.engine, samples)
         return name_float_layers(result, layers)
 
     def ranges(self, statistics: Mapping[str, Statistics], unsigned: Collection[str] = ()) -> dict[str, Range]:
