@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -183,26 +183,18 @@ class Bundle:
         return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith(prefixes))
 
 
-def seal(directory: Path, manifest: Manifest, hashed: Mapping[str, FileRecord] | None = None) -> Bundle:
-    """Hash every file below ``directory``, write ``manifest.json`` and its digest last, and return the bundle.
-
-    Args:
-        hashed: records of files that were hashed while they were written.
-    """
+def seal(directory: Path, manifest: Manifest) -> Bundle:
+    """Hash every file below ``directory``, write ``manifest.json`` and its digest last, and return the bundle."""
     files = {}
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
         if path.is_file() and name.partition("/")[0] not in UNRECORDED_NAMES and path.name not in DESKTOP_FILES:
-            files[name] = (hashed or {}).get(name) or _record(path)
+            status = path.stat()
+            linked = status.st_nlink > 1  # shared among stages of the cache, and read-only
+            files[name] = FileRecord(cached_hash(path) if linked else hash_file(path), status.st_size)
     sealed = replace(manifest, files=files)
     write_manifest(directory, sealed)
     return Bundle(directory, sealed)
-
-
-def _record(path: Path) -> FileRecord:
-    status = path.stat()
-    linked = status.st_nlink > 1  # shared among stages of the cache, and read-only
-    return FileRecord(cached_hash(path) if linked else hash_file(path), status.st_size)
 
 
 def replace_manifest(bundle: Bundle, manifest: Manifest) -> Bundle:

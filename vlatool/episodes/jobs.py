@@ -33,13 +33,9 @@ Outcomes = tuple[Outcome, ...]
 
 
 def run_jobs(
-    bundle: Bundle,
-    jobs: list[EpisodesJob],
-    engine: str,
-    context: Context,
-    tally: Tally | None = None,
-    store: Store | None = None,
-) -> list[Outcome]:
+    bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context, tally: Tally | None = None,
+    store: Store | None = None
+) -> list[Outcome]:  # fmt: skip
     """Play all episodes and return their outcomes in the order of the jobs, whoever plays them.
 
     Args:

@@ -28,15 +28,9 @@ class Player:
     """
 
     def __init__(
-        self,
-        bundle: Bundle,
-        latency: Measurement | None,
-        engine: str,
-        context: Context,
-        most: int,
-        baseline: Player | None = None,
-        store: Store | None = None,
-    ) -> None:
+        self, bundle: Bundle, latency: Measurement | None, engine: str, context: Context, most: int,
+        baseline: Player | None = None, store: Store | None = None
+    ) -> None:  # fmt: skip
         self._bundle, self._latency, self._engine, self._context = bundle, latency, engine, context
         self._most, self._baseline, self._store = most, baseline, store
         self.outcomes: list[Outcome] = []

@@ -7,11 +7,12 @@ import json
 import math
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from vlatool.bundle.bundle import Bundle
-from vlatool.bundle.manifest import FileRecord, Graph
+from vlatool.bundle.bundle import Bundle, hash_file, write_manifest
+from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.module_bundle import export_command
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, DataError, require
@@ -30,7 +31,7 @@ from vlatool.quantize.streamed.weights_plan import WeightsPlan, make_plan
 from vlatool.runtime.engine import STANDARD_LAYOUT, class_for
 from vlatool.stage.base import Context, Result
 from vlatool.stage.cache import STREAMS
-from vlatool.stage.finish import carry_over, finish, seal_without_golden
+from vlatool.stage.finish import SEED, carry_over, finish, history
 from vlatool.stage.precision_shares import count_shares
 from vlatool.stage.record import SampleSet, made_by
 
@@ -127,8 +128,7 @@ class WeightOnly(WeightOptions):
             messages += uncounted
             graphs[name] = Graph(f"graphs/{name}.onnx", shares, opset)
         if not runs:
-            hashed = {WEIGHTS_FILE: FileRecord(written.sha256, written.bytes)}
-            return Result(seal_without_golden(bundle, out, made_by=recorded, graphs=graphs, hashed=hashed))
+            return Result(_seal(bundle, out, written, recorded, graphs))
         context.progress("running the quantized graphs", None)
         made = finish(bundle, out, made_by=recorded, graphs=graphs, **self.golden_arguments(bundle))
         return Result(made, messages)
@@ -196,3 +196,28 @@ def _summarize(written: RecordFile, file: Path) -> dict[str, Any]:
     identity = sorted(f"{note['tensor']}:{note.get('first', 0)}:{note['sha256']}" for note in written.notes)
     digest = hashlib.sha256("\n".join(identity).encode()).hexdigest()
     return {"weights_sha256": digest, "weight_error": summary}
+
+
+def _seal(bundle: Bundle, out: Path, written: RecordFile, made_by: dict[str, Any], graphs: dict[str, Graph]) -> Bundle:
+    """Write the manifest without running the graphs; the large file was hashed during writing."""
+    files = {WEIGHTS_FILE: FileRecord(written.sha256, written.bytes)}
+    for path in sorted(path for folder in ("assets", "data", "graphs") for path in (out / folder).rglob("*")):
+        name = path.relative_to(out).as_posix()
+        if path.is_file() and name != WEIGHTS_FILE:
+            files[name] = FileRecord(hash_file(path), path.stat().st_size)
+    origin = {key: value for key, value in bundle.manifest.source.items() if key != "arguments"}
+    hashes = {name: record.sha256 for name, record in files.items() if name.startswith("graphs/")}
+    step = {**made_by, "seed": SEED, "input": bundle.hash, "graphs": hashes}
+    manifest: Manifest = replace(
+        bundle.manifest,
+        parent=bundle.hash,
+        made_by=made_by,
+        graphs=graphs,
+        accuracy={},
+        golden="",
+        build=(*history(bundle), step),
+        source=origin,
+        files=dict(sorted(files.items())),
+    )
+    write_manifest(out, manifest)
+    return Bundle(out, manifest)

@@ -134,9 +134,14 @@ def finish(
     Raises:
         GraphError: when the engine refuses a graph or gives an action that is not finite.
     """
-    draft = seal_without_golden(source, out, made_by=made_by, graphs=graphs, changes=changes)
+    changed: dict[str, Any] = {"parent": source.hash, "graphs": dict(graphs), "accuracy": {}, **(changes or {})}
+    changed["made_by"] = _with_engine(made_by, changed.get("engine", source.manifest.engine))
+    origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
+    unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
+    draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
     golden = write_golden(draft, observations, out)
-    bundle = seal(out, replace(draft.manifest, golden=GOLDEN))
+    build = (*history(source), _step(source, draft.manifest))
+    bundle = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
     held = _EngineCheck(source, bundle, observations) if source.manifest.graphs else None
     if held is not None:
         held.write(out / DIFFERENCE, recorded)
@@ -150,29 +155,6 @@ def finish(
         bundle.manifest, findings=(*kept, *new), golden_tolerance=_tolerance(golden.difference, bundle, redrawn),
         golden_chunk_tolerance=0.0 if discrete else _tolerance(golden.of_chunk, bundle, redrawn),
     ))  # fmt: skip
-
-
-def seal_without_golden(
-    source: Bundle,
-    out: Path,
-    *,
-    made_by: Mapping[str, Any],
-    graphs: Mapping[str, Graph],
-    changes: Mapping[str, Any] | None = None,
-    hashed: Mapping[str, FileRecord] | None = None,
-) -> Bundle:
-    """Write the manifest of a bundle whose graphs and carried folders are in ``out`` already; nothing is run.
-
-    Args:
-        hashed: as for ``seal``; all others as for ``finish``.
-    """
-    changed: dict[str, Any] = {"parent": source.hash, "graphs": dict(graphs), "accuracy": {}, **(changes or {})}
-    changed["made_by"] = _with_engine(made_by, changed.get("engine", source.manifest.engine))
-    origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
-    unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
-    draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed), hashed)
-    build = (*history(source), _step(source, draft.manifest))
-    return replace_manifest(draft, replace(draft.manifest, build=build))
 
 
 def _with_engine(made_by: Mapping[str, Any], engine: str) -> dict[str, Any]:
