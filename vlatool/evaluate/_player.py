@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
@@ -16,6 +16,7 @@ from vlatool.stage.base import Context
 from vlatool.workers import PROCESSES
 
 
+@dataclass
 class Player:
     """Plays jobs with a bundle, and tells how it does beside the one that it is paired with.
 
@@ -27,23 +28,24 @@ class Player:
         store: Outcomes of an interrupted run, and of this one; none are stored when None.
     """
 
-    def __init__(
-        self, bundle: Bundle, latency: Measurement | None, engine: str, context: Context, most: int,
-        baseline: Player | None = None, store: Store | None = None
-    ) -> None:  # fmt: skip
-        self._bundle, self._latency, self._engine, self._context = bundle, latency, engine, context
-        self._most, self._baseline, self._store = most, baseline, store
-        self.outcomes: list[Outcome] = []
+    bundle: Bundle
+    latency: Measurement | None
+    engine: str
+    context: Context
+    most: int
+    baseline: Player | None = None
+    store: Store | None = None
+    outcomes: list[Outcome] = field(default_factory=list)
 
     def __call__(self, jobs: list[EpisodesJob]) -> list[Outcome]:
         """Play further episodes; one that is only to be shown was counted before."""
         if jobs[0].show:
-            here = replace(self._context, launcher=PROCESSES, workers=1)  # pictures stay on this machine
-            context, store = (here, None) if jobs[0].film else (self._context, self._store)
-            return run_jobs(self._bundle, with_latency(jobs, self._latency), self._engine, context, store=store)
-        tally = Tally(self._most, self._baseline.outcomes if self._baseline else ())
+            here = replace(self.context, launcher=PROCESSES, workers=1)  # pictures stay on this machine
+            context, store = (here, None) if jobs[0].film else (self.context, self.store)
+            return run_jobs(self.bundle, with_latency(jobs, self.latency), self.engine, context, store=store)
+        tally = Tally(self.most, self.baseline.outcomes if self.baseline else ())
         tally.add(self.outcomes)
-        jobs = with_latency(jobs, self._latency)
-        outcomes = run_jobs(self._bundle, jobs, self._engine, self._context, tally, self._store)
+        jobs = with_latency(jobs, self.latency)
+        outcomes = run_jobs(self.bundle, jobs, self.engine, self.context, tally, self.store)
         self.outcomes += outcomes
         return outcomes

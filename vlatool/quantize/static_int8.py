@@ -1,4 +1,4 @@
-"""Static int8: scales of weights and activations ahead of time."""
+"""Static int8: weights and activations with scales that are fixed ahead of time."""
 
 from __future__ import annotations
 
@@ -39,15 +39,7 @@ from vlatool.quantize.int8.frame_normalization import fold_normalization
 from vlatool.quantize.int8.integer_matmul import use_integer_matmul
 from vlatool.quantize.int8.quantizer_hoisting import hoist_quantizers
 from vlatool.quantize.int8.reductions import keep_reduced_axes
-from vlatool.runtime.engine import (
-    DEFAULT_ENGINE,
-    STANDARD_LAYOUT,
-    Engine,
-    Int8Layout,
-    class_for,
-    engine_class,
-    layouts,
-)
+from vlatool.runtime.engine import DEFAULT_ENGINE, STANDARD_LAYOUT, Engine, Int8Layout, class_for, engine_class, layouts
 from vlatool.stage.base import Context, Result
 from vlatool.stage.record import SampleSet
 
@@ -108,7 +100,7 @@ class StaticInt8(CalibratedQuantization):
 
     @property
     def engine(self) -> str:
-        """Engine of the layout; empty for any engine that runs standard operators, and for the default one."""
+        """Engine of the layout; empty for the default engine, and for a layout of standard operators."""
         name = layouts()[self.layout][1]
         return "" if name == DEFAULT_ENGINE else name
 
@@ -140,15 +132,15 @@ class StaticInt8(CalibratedQuantization):
         return self.unless_given(options)
 
     def summarize(self, bundle: Bundle) -> tuple[str, ...]:
-        """Report that the weights are meant for processors without VNNI."""
+        """Return the note that the weights are meant for processors without VNNI."""
         return (REDUCE_RANGE_NOTE,) if self.reduce_range else ()
 
     def used_packages(self) -> tuple[str, ...]:
-        """Packages of the stage, with the engine of the layout."""
+        """Return the packages of the stage, with the engine of the layout."""
         return (*self.packages, engine_class(self.engine).package) if self.engine else self.packages
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Check that operators and layout fit the options, and that there is calibration data."""
+        """Check that operators, layout and engine support the options, and that there is calibration data."""
         check_ops(self.ops)
         library: type[Engine] = engine_class(self.engine)
         if self.compute not in library.computes:
@@ -201,7 +193,7 @@ class StaticInt8(CalibratedQuantization):
         """Return value -> quantization range (low, high).
 
         Args:
-            unsigned: Values that are uint8 where others are symmetric.
+            unsigned: Names of values that are uint8 when others are symmetric.
         """
         kind = self.style.activations
         symmetric = {name: kind in ("int8", "symmetric") and name not in unsigned for name in statistics}
@@ -221,7 +213,7 @@ class StaticInt8(CalibratedQuantization):
         return layers, values
 
     def _layers_after_split(self, model: Any, layers: list[Layer]) -> list[Layer]:
-        """Return the layers after Gemm became MatMul."""
+        """Return the layers as they are once each Gemm has become a MatMul."""
         if not self.int8_layout.integer:
             return layers
         names = {layer.name for layer in layers}
@@ -230,7 +222,7 @@ class StaticInt8(CalibratedQuantization):
 
 
 def _values_read_by_sums_only(layers: Mapping[str, list[Layer]]) -> dict[str, set[str]]:
-    """Return graph -> values that only sums of two activations read: a sum without a range stays float32."""
+    """Return graph -> values that only sums of two activations read; a sum without a range stays float32."""
     read = {
         name: [{value for layer in chosen if (layer.kind == "Add") is sums for value in layer.activations}
                for sums in (True, False)]
@@ -240,12 +232,12 @@ def _values_read_by_sums_only(layers: Mapping[str, list[Layer]]) -> dict[str, se
 
 
 def _finite_layers(layers: list[Layer], statistics: Mapping[str, Statistics]) -> list[Layer]:
-    """Return the layers with finite activations: a mask of -infinity, or an input that takes it, excludes others."""
+    """Return the layers with finite activations: without those that read a mask or an input with infinity."""
     infinite = {name for name, seen in statistics.items() if not seen.finite}
     return [layer for layer in layers if infinite.isdisjoint(layer.activations)]
 
 
 def _capable_layouts(fits: Callable[[Int8Layout, type[Engine]], bool]) -> str:
-    """Return the names of the layouts that fit, joined by "or"."""
+    """Return the names of the suitable layouts, joined by "or"."""
     names = [name for name, (layout, engine) in layouts().items() if fits(layout, engine_class(engine))]
     return " or ".join(names) or "none"
