@@ -218,3 +218,7 @@ def test_a_stage_without_a_source_says_how_to_begin(source_bundle):
     assert source_of(source_bundle, "export.onnx") is source_bundle
     with pytest.raises(RecipeError, match=r"export.onnx needs a bundle to start from; begin the recipe"):
         source_of(None, "export.onnx")
+
+
+def test_options_that_were_given_stay():
+    assert StaticInt8(layout="ort").unless_given({"layout": "qdq", "attention": True}).options() == {"attention": True}
