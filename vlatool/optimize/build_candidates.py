@@ -19,7 +19,7 @@ def chain(stages: tuple[Transform, ...], source: Bundle, plan: Plan, context: Co
     for stage in stages:
         context.progress(stage.name(), None)
         stage.check(made[-1], plan.profile)
-        made.append(cached_transform(stage, made[-1], plan.cache, context))
+        made.append(cached_transform(stage, made[-1], plan.cache, context).bundle)
     refuse_findings(made[-1], plan.recipe.limits.accept)
     return made
 

@@ -112,13 +112,16 @@ def optimize_here(request: Mapping[str, Any], tell: OnProgress) -> None:
 
 def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     """Run a plan in this process, and write everything into an empty directory."""
-    source = cached_transform(plan.source, None, plan.cache, context)
+    run_notes: list[str] = []
+    context = replace(context, note=run_notes.append)
+    source = cached_transform(plan.source, None, plan.cache, context).bundle
     baseline = chain(plan.export, source, plan, context)[-1]
     _check_metric(plan, baseline, context)
     plan, tried = _searched(plan, baseline, context)
     plan, trials = _pruned(plan, source, baseline, context)
     bundles, failures, trained = _candidates(plan, source, baseline, context)
-    rows, notes = _measured(plan, source, {BASELINE: baseline, **bundles}, context)
+    rows, warnings = _measured(plan, source, {BASELINE: baseline, **bundles}, context)
+    notes = (*warnings, *dict.fromkeys(run_notes))
     rows = {name: with_trainings(row, trained.get(name, ())) for name, row in rows.items()}
     taught = [name for name in trained if trained[name]]
     rows = _told_wrong(plan, rows, {BASELINE: baseline, **bundles}, taught, context)
@@ -217,7 +220,6 @@ def _measured(
     rows = {name: with_derived(row) for name, row in rows.items()}
     rows = relabel_where(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged_actions(bundles[BASELINE], plan.closed_loop, plan.cache, context))
-    warnings = (*warnings, *dict.fromkeys(context.notes))
     if plan.profile:
         predicted = foretold_by_engine(plan.profile, bundles, where)
         rows = {name: replace(row, measurements=(*row.measurements, *predicted[name])) for name, row in rows.items()}

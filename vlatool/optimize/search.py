@@ -161,7 +161,7 @@ class Search:
             bundle = self.baseline
             for stage in transforms(stages):
                 stage.check(bundle, self.profile)
-                bundle = cached_transform(stage, bundle, self.cache, quiet)
+                bundle = cached_transform(stage, bundle, self.cache, quiet).bundle
             refuse_findings(bundle, self.limits.accept)
             twin = self._seen.setdefault(graphs_of(bundle), name)
             if twin != name:  # no product has enough rows to become a convolution, say

@@ -128,7 +128,7 @@ def space_of(
         (stage,) = transforms(({name: options},))
         try:
             stage.check(source, None)
-            return cached_transform(stage, source, cache, context)
+            return cached_transform(stage, source, cache, context).bundle
         except VlatoolError as error:
             if error.exit_code not in NOT_POSSIBLE:
                 raise
