@@ -93,7 +93,7 @@ def test_the_bundle_holds_the_edits_alone(pruned: Bundle):
     assert [name for name in pruned.manifest.files if name.startswith("module/")] == ["module/edits.json"]
     assert [edit.keep for edit in read_edits(pruned)] == [KEPT]
     assert takes_shards(pruned)
-    assert "stay in the shards" in Depth().summarize(pruned)[0]
+    assert "stay in the shards" in stage.describe_modules(pruned)[0]
 
 
 def test_the_modules_are_those_that_are_made_in_memory(whole: Bundle, pruned: Bundle):
