@@ -13,7 +13,8 @@ from dataclasses import replace
 from vlatool.machine.instruction_sets import ENGINE, BoardSet
 from vlatool.measures.latency import LATENCY_P50, OPENVINO_FLOAT32_P50, SPEEDUP
 from vlatool.optimize.choice import choose, chosen_of, speed_words
-from vlatool.optimize.judge import Judged, p50
+from vlatool.optimize.judge import Judged
+from vlatool.optimize.ranking import p50
 from vlatool.optimize.timings import IN_OPENVINO, OWN_SET
 from vlatool.report import Row
 

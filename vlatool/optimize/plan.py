@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from vlatool.stage.base import Stage, Transform
 from vlatool.stage.build import build_stage
 
 BASELINE = "float32"
+Transforms = tuple[Transform, ...]
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class Plan:
     """
 
     source: Source
-    export: tuple[Transform, ...]
-    candidates: dict[str, tuple[Transform, ...]]
+    export: Transforms
+    candidates: Mapping[str, Transforms]
     recipe: Recipe
     profile: Profile | None
     cache: Path
@@ -154,7 +155,7 @@ def _check_pruning(pruning: Pruning, source: Source) -> None:
     require_present("optuna", "search")
 
 
-def transforms(stages: StageList) -> tuple[Transform, ...]:
+def transforms(stages: StageList) -> Transforms:
     """Return the stages of a list of entries, each as the steps that it stands for.
 
     Raises:

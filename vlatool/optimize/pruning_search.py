@@ -29,11 +29,11 @@ from vlatool.optimize.recipe import StageList
 from vlatool.optimize.search import QUICK
 from vlatool.optimize.space import Shape, Space, quantizations, space_of
 from vlatool.optimize.study import Study, Tried
-from vlatool.optimize.training_records import trainings
 from vlatool.report import Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
 from vlatool.stage.cache import STREAMS
+from vlatool.stage.controls import training_rows
 from vlatool.stage.run import cached_measure
 
 SELECTION_SEEDS = 2 * EVALUATION_SEEDS
@@ -50,7 +50,7 @@ class PrunedSearch:
     """Trials of one run.
 
     Args:
-        plan: With the recipe; its candidates are how a pruned policy may be quantized.
+        plan: With the recipe.
         baseline: The whole policy in float32.
     """
 
@@ -59,23 +59,28 @@ class PrunedSearch:
     baseline: Bundle
     context: Context
 
-    def run(self) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
+    def run(self, candidates: Mapping[str, StageList]) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
         """Try as many as the recipe says; return the finalists, fastest first, and a table of all.
+
+        Args:
+            candidates: name -> stages; how a pruned policy may be quantized.
 
         Raises:
             RecipeError: when nothing of the policy can be pruned.
             UsageError: when the study cannot be opened.
         """
         if study := self.plan.recipe.pruning.study:
-            return self._run(study)
+            return self._run(study, candidates)
         directory = self.plan.cache / STREAMS / f"optimize.trials-{self._name().rpartition('-')[2]}"
         with work_directory(directory):  # of this machine, so that an interrupted run goes on
-            return self._run(f"sqlite:///{directory.absolute() / 'trials.db'}")
+            return self._run(f"sqlite:///{directory.absolute() / 'trials.db'}", candidates)
 
-    def _run(self, url: str) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
+    def _run(
+        self, url: str, candidates: Mapping[str, StageList]
+    ) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
         pruning = self.plan.recipe.pruning
         study = Study(url, self._name(), self._allowed, pruning.seed)
-        quantized = study.agree_on(self._quantizations())
+        quantized = study.agree_on(self._quantizations(candidates))
         space = space_of(self.source, pruning, quantized, self.plan.cache, self.context)
         study.begin(space)
         while (asked := study.ask(pruning.trials)) is not None:
@@ -99,10 +104,10 @@ class PrunedSearch:
         digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
         return f"{self.baseline.manifest.name}-{digest}"
 
-    def _quantizations(self) -> dict[str, StageList]:
+    def _quantizations(self, candidates: Mapping[str, StageList]) -> dict[str, StageList]:
         """Return how the whole policy was quantized: name -> stages, the fastest first."""
         speeds: dict[str, float] = {}
-        found = quantizations(self.plan.recipe.candidates)
+        found = quantizations(candidates)
         for name, stages in found.items():
             try:
                 speeds[name] = self._speedup(self._made(stages)[-1])
@@ -123,7 +128,7 @@ class PrunedSearch:
                 raise
             return Tried(shape, note=failure.message)
 
-    def _made(self, stages: StageList) -> list[Bundle]:
+    def _made(self, stages: StageList) -> tuple[Bundle, ...]:
         return candidate(transforms(stages), self.source, self.baseline, self.plan, self.context)
 
     def _speedup(self, bundle: Bundle) -> float:
@@ -238,9 +243,9 @@ def _best_of_each(tried: list[Tried]) -> list[Tried]:
     return list({each.shape: each for each in tried}.values())
 
 
-def _training_s(made: list[Bundle]) -> float:
+def _training_s(made: tuple[Bundle, ...]) -> float:
     """Return the seconds that the trainings of a policy took when it was trained."""
-    return sum(item.value for row in trainings(made) for item in TRAINING_TIME.members(row).values())
+    return sum(item.value for row in training_rows(made) for item in TRAINING_TIME.members(row).values())
 
 
 def _titled(elsewhere: int) -> str:

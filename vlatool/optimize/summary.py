@@ -2,65 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-from vlatool.accuracy.credibility import Credibility
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import pip_install
 from vlatool.machine.host import fingerprint
-from vlatool.machine.instruction_sets import ENGINE, BoardSet, about_onnx_runtime
+from vlatool.machine.instruction_sets import ENGINE, BoardSet
 from vlatool.measures.latency import SPEEDUP
-from vlatool.optimize.choice import chosen_of
-from vlatool.optimize.judge import Judged
+from vlatool.optimize.build_candidates import Candidates, engine_of
+from vlatool.optimize.decision import Decision
+from vlatool.optimize.evidence import Evidence
 from vlatool.optimize.moves import slower_task
-from vlatool.optimize.plan import Plan
-from vlatool.optimize.timings import IN_OPENVINO, engine_of, utc_now
+from vlatool.optimize.plan import BASELINE, Plan
+from vlatool.optimize.timings import IN_OPENVINO, utc_now
 from vlatool.report import ON_BOARD, Report, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 
 
-def report_of(
-    plan: Plan,
-    baseline: Bundle,
-    bundles: Mapping[str, Bundle],
-    judged: list[Judged],
-    failures: Sequence[Row],
-    notes: Sequence[str],
-    trust: Credibility,
-    command: str,
-) -> Report:
-    """Return the report.
-
-    Args:
-        bundles: Name -> bundle of each candidate.
-        judged: The rows, float32 first, one of them chosen.
-    """
-    chosen, where = chosen_of(judged), plan.board_set
-    engine = engine_of(bundles.get(chosen.row.name, baseline))
-    rows = {item.row.name: item.row for item in judged}
-    warnings = [*where.warnings(), *notes, *trust.warnings, *(text for item in judged for text in item.warnings)]
+def summarize(plan: Plan, candidates: Candidates, evidence: Evidence, decision: Decision, command: str) -> Report:
+    """Return the report."""
+    chosen, trust, where = decision.choice, decision.trust, plan.board_set
+    rows = {item.row.name: item.row for item in decision.judged}
+    judged = (text for item in decision.judged for text in item.warnings)
+    warnings = (*evidence.warnings, *trust.warnings, *judged)
     return Report(
         "optimize",
-        f"{baseline.manifest.name} for {plan.board}",
-        verdict_of(judged, trust),
+        f"{candidates.bundles[BASELINE].manifest.name} for {plan.board}",
+        decision.verdict,
         summary=(
             *trust.sentences, *chosen.sentences, *filter(None, [slower_task(chosen.row)]), *filter(None, [trust.floor]),
-            *about_int8(rows, in_int8(bundles), where), *about_onnx_runtime(plan.profile), *where.sentences(),
-            *_needs(engine),
+            *about_int8(rows, in_int8(candidates.bundles), where), *evidence.conditions,
+            *_needs(engine_of(candidates.bundles[chosen.row.name])),
         ),
-        rows=(*rows.values(), *failures),
+        rows=(*rows.values(), *candidates.failures),
         limits=_limits(plan),
         command=command,
         created=utc_now(),
         environment={**fingerprint(), **({ON_BOARD: plan.board} if plan.profile and plan.on_board else {})},
         warnings=tuple(dict.fromkeys(warnings)),
     )  # fmt: skip
-
-
-def verdict_of(judged: list[Judged], trust: Credibility) -> str:
-    """Return ``pass``, ``fail``, or ``inconclusive`` where nothing can be held against the reference."""
-    kept = chosen_of(judged).within and any(item.within for item in judged[1:])
-    return "inconclusive" if trust.fails else "pass" if kept else "fail"
 
 
 def _limits(plan: Plan) -> dict[str, float | str]:

@@ -1,26 +1,13 @@
-"""How the candidates were trained, as the reports beside their stages say."""
+"""How candidates were trained, in their rows."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
 
-from vlatool.bundle.bundle import REPORTS, Bundle
-from vlatool.errors import DataError
 from vlatool.measures import series, tables
 from vlatool.measures.training import TRAINING_TIME
-from vlatool.report import Measurement, Row, read_report
-
-
-def trainings(stages: Iterable[Bundle]) -> tuple[Row, ...]:
-    """Return what the stages of a candidate say of their trainings; those that were not trained say nothing."""
-    rows: list[Row] = []
-    for bundle in stages:
-        try:
-            rows += read_report(bundle.path / REPORTS).rows if (bundle.path / REPORTS).is_dir() else ()
-        except DataError:  # beside the bundle, not of it: nothing else depends on it
-            continue
-    return tuple(rows)
+from vlatool.report import Measurement, Row
 
 
 def with_wrong_instruction(row: Row, told: Measurement | None, reference: Measurement | None) -> Row:

@@ -49,11 +49,12 @@ def run_transform(
     Raises:
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.
     """
-    if not damaged:
-        refuse_replacing(out, force=force, kind=BUNDLE)
     apart = stage.runs_graphs or bool(stage.runs(source))
     if apart and not stage.runs(source):
-        children.prepare(child_imports(stage))  # while this process checks
+        imports = child_imports(stage)
+        children.prepare(imports)  # while this process checks
+    if not damaged:
+        refuse_replacing(out, force=force, kind=BUNDLE)
     stage.check(source, None)
     with write_directory(out, force=force, damaged=damaged) as draft:
         stage.accept(run_in_child(stage, source, draft, context) if apart else stage.run(source, draft, context))
