@@ -27,6 +27,7 @@ Status = Literal["ok", "warn", "missing"]
 
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "ort": ("onnxruntime",),
+    "cuda": ("onnxruntime-gpu",),
     "build": ("torch", "onnx", "onnxscript", "onnx-ir", "safetensors"),
     "openvino": ("openvino",),
     "sim": ("gymnasium", "minigrid"),

@@ -1,4 +1,4 @@
-"""What a claim was found to be, as values: sentences about it are made at the end, by the claim."""
+"""Verdicts on claims, as values: sentences about it are made at the end, by the claim."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONFIDENCE = 1 - 2 * ALPHA
 
 
 class Reason(Enum):
-    """What decides: the number against its limit, or why there is nothing that could."""
+    """Reason of an outcome: the number against its limit, or why there is nothing that decides."""
 
     LIMIT = "the number, held against its limit"
     REFERENCE_FAILS = "the baseline does not do its task"
@@ -47,7 +47,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What an examined claim was found to be.
+    """Verdict on a claim.
 
     Args:
         outcome: pass, fail or inconclusive.

@@ -1,4 +1,4 @@
-"""What a statistical decision, and everything that rests on one, comes to."""
+"""Outcome of a statistical decision, and of everything that rests on one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import Enum
 
 
 class Outcome(str, Enum):
-    """What a claim, or one number of it, was found to be; the worst first."""
+    """Outcome of a claim, or of one of its numbers; the worst first."""
 
     FAIL = "fail"
     INCONCLUSIVE = "inconclusive"

@@ -52,7 +52,7 @@ def test_providers_reach_the_session_in_order_with_their_options(path: Path, mon
 
 
 def test_a_node_that_no_named_provider_runs_is_an_error(path: Path) -> None:
-    with pytest.raises(GraphError, match=r"refuses .*sum.onnx: .*default CPU EP") as caught:
+    with pytest.raises(GraphError, match=r"refuses .*sum.onnx: AzureExecutionProvider does not run Add, Add") as caught:
         engine(("AzureExecutionProvider", {}))(path, 1)
     assert caught.value.fix == "AzureExecutionProvider does not run every node of it: use another engine"
 
@@ -65,6 +65,25 @@ def test_a_provider_that_is_not_there_is_named_with_what_installs_it(path: Path)
         assert caught.value.fix == "pip install onnxruntime-gpu"
     assert not absent.is_installed()
     assert OrtCpuSession.is_installed()
+
+
+def test_nodes_that_a_provider_does_not_run_are_named_a_few_of_many(tmp_path: Path) -> None:
+    nodes = "".join(f"[n{index}] v{index + 1} = Relu(v{index}) " for index in range(5))
+    text = f'<ir_version: 10, opset_import: ["" : 20]> g (float[2] v0) => (float[2] v5) {{ {nodes} }}'
+    onnx.save(onnx.parser.parse_model(text), str(tmp_path / "many.onnx"))
+    with pytest.raises(GraphError, match=r"does not run Relu \(n0\), Relu \(n1\), Relu \(n2\), 2 more"):
+        engine(("AzureExecutionProvider", {}))(tmp_path / "many.onnx", 1)
+
+
+def test_a_provider_that_is_not_loaded_is_the_reason_and_no_node(path: Path, monkeypatch) -> None:
+    """The same error of ONNX Runtime has two causes: here the library of the provider lacks one that it needs."""
+    monkeypatch.setattr(onnxruntime.InferenceSession, "get_providers", lambda _: ["CPUExecutionProvider"])
+    missing = engine(("AzureExecutionProvider", {}))
+    with pytest.raises(GraphError, match=r"it cannot load AzureExecutionProvider on this machine") as caught:
+        missing(path, 1)
+    assert caught.value.fix == "install the driver and the libraries that AzureExecutionProvider needs"
+    with pytest.raises(MissingExtra, match="cannot load AzureExecutionProvider"):
+        missing.execution_providers()
 
 
 def test_a_plug_in_that_cannot_be_loaded_is_named(path: Path, tmp_path: Path) -> None:

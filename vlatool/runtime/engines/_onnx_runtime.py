@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vlatool.errors import GraphError, MissingExtra, require
 from vlatool.machine.engine_calls import REMEDY
 from vlatool.machine.host import gpu_driver, gpus, versions
+from vlatool.runtime import arithmetic
 from vlatool.runtime.engine import Engine, Node, Profiled, computing
 from vlatool.runtime.engines._bound_buffers import HOST, BoundBuffers, port_of
 from vlatool.runtime.engines._ort_profile import OrtProfiled, precision
@@ -25,6 +26,10 @@ CPU = "CPUExecutionProvider"
 NO_CPU_FALLBACK = ("session.disable_cpu_ep_fallback", "1")
 """The option of ONNX Runtime (``onnxruntime_session_options_config_keys.h``) that refuses a graph with nodes that none
 of the named providers runs; left alone it computes them on the processor without a word."""
+SILENT = 4
+"""Severity of a log that holds fatal errors alone: what an exception says is not printed, too."""
+MAX_NODES = 3
+"""Nodes that a message names."""
 CUT_OFF_REWRITES = ["ReluQuantRewrite", "ClipQuantRewrite"]
 Array = NDArray[Any]
 Providers = tuple[tuple[str, Mapping[str, Any]], ...]
@@ -67,9 +72,8 @@ class OnnxRuntimeSession(Engine):
         try:
             self._session = self._open(ort, path if opened is None else opened, threads)
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
-            raise GraphError(
-                f"ONNX Runtime {ort.__version__} refuses {path}: {_first_line(error)}", self._remedy(error)
-            ) from error
+            words, remedy = self._why_refused(ort, path if opened is None else opened, error)
+            raise GraphError(f"ONNX Runtime {ort.__version__} refuses {path}: {words}", remedy) from error
         self._check_providers(path)
         self.path = path
         self.deadline: float | None = None
@@ -124,9 +128,10 @@ class OnnxRuntimeSession(Engine):
         """Return the providers of this engine that can be used.
 
         Raises:
-            MissingExtra: when onnxruntime cannot be imported, or has not got one of them.
+            MissingExtra: when onnxruntime cannot be imported, has not got one of them, or cannot load it.
         """
-        cls.onnxruntime()
+        if unloaded := cls._unloaded(allowing_cpu(cls.onnxruntime(), arithmetic.model(), cls.providers)):
+            raise MissingExtra(f"ONNX Runtime cannot load {', '.join(unloaded)} on this machine.", needs(unloaded))
         return cls._names()
 
     @classmethod
@@ -237,18 +242,59 @@ class OnnxRuntimeSession(Engine):
         opened = [name for name in self._session.get_providers() if name != CPU or CPU in wanted]
         if opened == wanted:
             return
-        absent = ", ".join(name for name in wanted if name not in (*opened, CPU))
+        unloaded = self._unloaded(self._session)
         fix = "install onnxruntime alone: another package of it (onnxruntime-gpu) may be in its place"
         raise GraphError(
             f"{path} was opened on {', '.join(opened) or CPU}; wanted {', '.join(wanted)}.",
-            f"install the driver and the libraries that {absent} needs" if absent else fix,
+            needs(unloaded) if unloaded else fix,
         )
 
     @classmethod
-    def _remedy(cls, error: Exception) -> str:
-        if "fallback to CPU EP has been explicitly disabled" in str(error):
-            return f"{cls._hardware()} does not run every node of it: use another engine"
-        return REMEDY.format(package="onnxruntime")
+    def _unloaded(cls, session: Any) -> list[str]:
+        """Return the providers that a session was to be opened on and was not, the processor's aside."""
+        return [name for name in cls._names() if name not in (*session.get_providers(), CPU)]
+
+    @classmethod
+    def _why_refused(cls, ort: Any, model: Path | bytes, error: Exception) -> tuple[str, str]:
+        """Return why ONNX Runtime refuses a graph, and a remedy; of nodes that only the processor runs, which."""
+        if "fallback to CPU EP has been explicitly disabled" not in str(error):
+            return _first_line(error), REMEDY.format(package="onnxruntime")
+        try:
+            session = allowing_cpu(ort, model, cls.providers)
+        except Exception:
+            return _first_line(error), cls._other_engine()
+        if unloaded := cls._unloaded(session):
+            return f"it cannot load {', '.join(unloaded)} on this machine", needs(unloaded)
+        nodes = nodes_on_cpu(session)
+        about = f"{cls._hardware()} does not run {', '.join(nodes)}" if nodes else _first_line(error)
+        return about, cls._other_engine()
+
+    @classmethod
+    def _other_engine(cls) -> str:
+        return f"{cls._hardware()} does not run every node of it: use another engine"
+
+
+def needs(providers: list[str]) -> str:
+    """Return the remedy where providers cannot be loaded."""
+    return f"install the driver and the libraries that {', '.join(providers)} needs"
+
+
+def allowing_cpu(ort: Any, model: Path | bytes, providers: Providers) -> Any:
+    """Open a graph with nodes on the processor where the providers do not run them, which the session then lists."""
+    options = session_options(ort, 1)
+    options.log_severity_level = SILENT
+    options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")
+    return open_session(ort, model, options, (*providers, *ON_CPU))
+
+
+def nodes_on_cpu(session: Any) -> list[str]:
+    """Return the first nodes of such a session that the processor runs; none before ONNX Runtime 1.24."""
+    if not hasattr(session, "get_provider_graph_assignment_info"):
+        return []
+    graphs = [each for each in session.get_provider_graph_assignment_info() if each.ep_name == CPU]
+    named = ((node.op_type, node.name) for graph in graphs for node in graph.get_nodes())
+    nodes = [f"{operator} ({name})" if name else operator for operator, name in named]
+    return nodes[:MAX_NODES] + ([f"{len(nodes) - MAX_NODES} more"] if len(nodes) > MAX_NODES else [])
 
 
 def session_options(ort: Any, threads: int | None) -> Any:
@@ -281,6 +327,7 @@ def open_session(ort: Any, model: Path | bytes, options: Any, providers: Provide
     """Open a graph on these providers alone, without what would make it another one."""
     content = model if isinstance(model, bytes) else str(model)
     if all(name != CPU for name, _ in providers):
+        options.log_severity_level = SILENT
         options.add_session_config_entry(*NO_CPU_FALLBACK)
     named = [(name, dict(settings)) for name, settings in providers]
     optimizers = {"disabled_optimizers": disabled_optimizers(model)}
