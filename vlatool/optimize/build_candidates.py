@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import NOT_POSSIBLE, RecipeError, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, RecipeError
+from vlatool.hardware.profile import Profile
 from vlatool.optimize.plan import BASELINE, Plan, Transforms
 from vlatool.report import Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
@@ -45,8 +47,13 @@ def engine_of(bundle: Bundle) -> str:
     return bundle.manifest.engine or DEFAULT_ENGINE
 
 
-def chain(stages: Transforms, source: Bundle, plan: Plan, context: Context) -> tuple[Bundle, ...]:
+def chain(
+    stages: Transforms, source: Bundle, board: Profile | None, accept: Iterable[str], cache: Path, context: Context
+) -> tuple[Bundle, ...]:
     """Run stages one after the other; return the source and what each made.
+
+    Args:
+        accept: names of findings that are overruled.
 
     Raises:
         VlatoolError: what a stage raises; GraphError for a finding of the last bundle that is not accepted.
@@ -54,9 +61,9 @@ def chain(stages: Transforms, source: Bundle, plan: Plan, context: Context) -> t
     made = [source]
     for stage in stages:
         context.progress(stage.name(), None)
-        stage.check(made[-1], plan.profile)
-        made.append(cached_transform(stage, made[-1], plan.cache, context))
-    refuse_findings(made[-1], plan.recipe.limits.accept)
+        stage.check(made[-1], board)
+        made.append(cached_transform(stage, made[-1], cache, context))
+    refuse_findings(made[-1], accept)
     return tuple(made)
 
 
@@ -69,8 +76,9 @@ def candidate(stages: Transforms, source: Bundle, baseline: Bundle, plan: Plan, 
     changing = sum(stage.takes_modules for stage in stages)
     made: tuple[Bundle, ...] = (source,) if changing else (baseline,)
     exported = ((*stages[:changing], *plan.export),) if changing else ()
+    accept = plan.recipe.limits.accept
     for part in (*exported, stages[changing:]):
-        made = (*made[:-1], *chain(part, made[-1], plan, context))
+        made = (*made[:-1], *chain(part, made[-1], plan.profile, accept, plan.cache, context))
     return made
 
 
@@ -83,18 +91,17 @@ def build(
         RecipeError: when none can be made; VlatoolError for what no other candidate could avoid.
     """
     made: dict[str, tuple[Bundle, ...]] = {BASELINE: (baseline,)}
-    failures = []
+    trained, failures = [], []
     for name, stages in candidates.items():
         try:
             made[name] = candidate(stages, source, baseline, plan, context)
-        except VlatoolError as error:
-            if error.exit_code not in NOT_POSSIBLE:
-                raise
+        except NOT_POSSIBLE as error:
             failures.append(Row(name, "failed", error.message))
+        else:
+            trained += [name] if any(stage.trains for stage in stages) else []
     if len(made) == 1:
         raise RecipeError(
             "No candidate could be made: " + "; ".join(f"{row.name}: {row.reason}" for row in failures),
             "correct what they say, or name other candidates in a recipe: --recipe FILE",
         )
-    trained = tuple(name for name in made if any(stage.trains for stage in candidates.get(name, ())))
-    return Candidates(made, trained, tuple(failures))
+    return Candidates(made, tuple(trained), tuple(failures))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from vlatool.measures.latency import LATENCY_P50, SPEEDUP
@@ -40,8 +40,13 @@ def choose(
         sentences = _praise(best, judged, best in faster, small, elsewhere) if praised else _foretell(best, judged)
     else:
         best, reason, sentences = _nearest(judged, times, origin, elsewhere)
+    return mark(judged, best, reason, sentences)
+
+
+def mark(judged: list[Judged], best: Judged, reason: str, sentences: tuple[str, ...]) -> list[Judged]:
+    """Return the rows with that of ``best`` marked as chosen, and what is said of it."""
     chosen = replace(best, row=replace(best.row, role="chosen", reason=reason), sentences=sentences)
-    return [chosen if item is best else item for item in judged]
+    return [chosen if item.row.name == best.row.name else item for item in judged]
 
 
 def _times(judged: list[Judged], engine: str) -> tuple[str, dict[str, float]]:
@@ -52,7 +57,7 @@ def _times(judged: list[Judged], engine: str) -> tuple[str, dict[str, float]]:
     return "measured", {item.row.name: p50(item.row) for item in judged}
 
 
-def chosen_of(judged: list[Judged]) -> Judged:
+def chosen_of(judged: Sequence[Judged]) -> Judged:
     """Return the row that is marked as chosen."""
     return next(item for item in judged if item.row.role == "chosen")
 

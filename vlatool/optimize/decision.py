@@ -8,7 +8,7 @@ from typing import Any
 
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.measures import with_derived
-from vlatool.optimize.choice import choose
+from vlatool.optimize.choice import choose, chosen_of
 from vlatool.optimize.choice_apart import choose_apart
 from vlatool.optimize.evidence import Enough
 from vlatool.optimize.judge import Judged, judge
@@ -35,7 +35,7 @@ class Decision:
     @property
     def choice(self) -> Judged:
         """The row that is chosen."""
-        return next(item for item in self.judged if item.row.role == "chosen")
+        return chosen_of(self.judged)
 
     @property
     def verdict(self) -> str:
@@ -45,10 +45,8 @@ class Decision:
 
     def with_tables(self, tables: Tables) -> Decision:
         """Return the decision with tables that belong to the chosen row."""
-        chosen = self.choice
-        return replace(
-            self, judged=tuple(_with_tables(item, tables) if item is chosen else item for item in self.judged)
-        )
+        judged = (_with_tables(item, tables) if item is self.choice else item for item in self.judged)
+        return replace(self, judged=tuple(judged))
 
 
 def decide(plan: Plan, rows: Mapping[str, Row], engines: Mapping[str, str] | None = None) -> Decision:

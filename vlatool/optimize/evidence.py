@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,13 +14,13 @@ from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
 from vlatool.latency_model.predict import predictions
 from vlatool.machine.instruction_sets import ENGINE, about_onnx_runtime
-from vlatool.measures import tables, with_derived
+from vlatool.measures import series, tables, with_derived
 from vlatool.measures.success import SUCCESS, SUCCESS_WRONG_INSTRUCTION
+from vlatool.measures.training import TRAINING_TIME
 from vlatool.optimize.build_candidates import Candidates
 from vlatool.optimize.plan import BASELINE, Plan
 from vlatool.optimize.ranking import in_order
 from vlatool.optimize.timings import IN_OPENVINO, Timing, relabel_where, with_predictions
-from vlatool.optimize.training_records import with_trainings, with_wrong_instruction
 from vlatool.report import Measurement, Report, Row
 from vlatool.stage.base import Context
 from vlatool.stage.controls import reservations, training_rows
@@ -78,8 +78,8 @@ def gather(
     rows = relabel_where({name: with_derived(row) for name, row in rows.items()}, candidates.engines, where)
     rows = with_predictions(rows, predicted)
     for name, found in trainings.items():
-        rows[name] = with_trainings(rows[name], found)
-        rows[name] = with_wrong_instruction(rows[name], misled.get(name), misled.get(BASELINE))
+        rows[name] = _with_trainings(rows[name], found)
+        rows[name] = _with_wrong_instruction(rows[name], misled.get(name), misled.get(BASELINE))
     return Evidence(rows, (*warnings, *records), conditions)
 
 
@@ -138,11 +138,14 @@ def with_episodes(
             reason = f"its episodes were not played: {found} keeps to the limits and comes before it"
             evaluated[row.name] = replace(row, reason=f"{reason} (--every-candidate plays all)")
             continue
-        whose = context.about(row.name)
-        played = own if row is base else cached_measure(loop, bundles[row.name], cache, whose).rows[-1]
-        compared = with_chance(own, controls) if row is base else compare_success(own, played)
-        evaluated[row.name] = joined = _joined(row, compared)
-        found = row.name if enough is not None and row is not base and enough(joined, evaluated[base.name]) else ""
+        if row is base:
+            compared = with_chance(own, controls)
+        else:
+            played = cached_measure(loop, bundles[row.name], cache, context.about(row.name)).rows[-1]
+            compared = compare_success(own, played)
+        evaluated[row.name] = _joined(row, compared)
+        if enough is not None and row is not base and enough(evaluated[row.name], evaluated[base.name]):
+            found = row.name
     return evaluated
 
 
@@ -167,3 +170,30 @@ def _joined(row: Row, played: Row) -> Row:
     if lacking := [*row.details.get(tables.MISSING_VALUES, ()), *played.details.get(tables.MISSING_VALUES, ())]:
         details[tables.MISSING_VALUES] = lacking
     return replace(row, measurements=measurements, raw=raw, details=details)
+
+
+def _with_wrong_instruction(row: Row, told: Measurement | None, reference: Measurement | None) -> Row:
+    """Return the row of a trained candidate with how often it succeeds when it is told the wrong instruction.
+
+    Args:
+        told: The candidate's success; None where it is not known.
+    """
+    if told is None or reference is None:
+        return row
+    said = f"{told.value:.1%} of {told.samples} episodes succeed (float32: {reference.value:.1%})"
+    teachers = {
+        name: [{**record, "with the wrong instruction": said} for record in records]
+        for name, records in row.details.items() if tables.TEACHER.part(name) is not None
+    }  # fmt: skip
+    return replace(row, measurements=(*row.measurements, told), details={**row.details, **teachers})
+
+
+def _with_trainings(row: Row, trained: Iterable[Row]) -> Row:
+    """Return the row of a candidate with losses, rounds and times of its trainings."""
+    for other in trained:
+        raw = {name: values for name, values in other.raw.items() if series.LOSSES.part(name) is not None}
+        details = {name: records for name, records in other.details.items() if tables.ROUNDS.part(name) is not None}
+        took = TRAINING_TIME.members(other).values()
+        row = replace(row, raw={**row.raw, **raw}, details={**row.details, **details},
+                      measurements=(*row.measurements, *took))  # fmt: skip
+    return row

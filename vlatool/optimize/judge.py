@@ -173,11 +173,8 @@ def _recorded_drops(row: Row, baseline: Row) -> tuple[list[Measurement], bool]:
         elif error is not None:
             drops = [(actions.ERROR_INCREASE, error.value, error)]
     note = AGAINST_FLOAT32 if from_float32 else "recorded observations"
-    measured = [
-        drop.measurement(value, where=own.where, samples=own.samples, note=note)
-        for drop, value, own in drops
-        if own.known
-    ]
+    known = [(drop, value, own) for drop, value, own in drops if own.known]
+    measured = [drop.measurement(value, where=own.where, samples=own.samples, note=note) for drop, value, own in known]
     return measured, from_float32 and bool(measured)
 
 

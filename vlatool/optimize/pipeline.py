@@ -8,7 +8,7 @@ that the next ones take, and the plan stays as it was checked.
 3. ``build_candidates.build``: a bundle of each, or why there is none.
 4. ``evidence.gather``: what is measured of each, and predicted for the board.
 5. ``decision.decide``: each held against the limits, one of them chosen, and whether float32 does its task.
-6. ``summary.summarize`` and ``result``: the report, the bundle, and the recipe that makes it again.
+6. ``result``: the report, the bundle, and the recipe that makes it again.
 """
 
 from __future__ import annotations
@@ -33,9 +33,8 @@ from vlatool.optimize.evidence import gather, is_recorded
 from vlatool.optimize.plan import Plan, Transforms, make_plan, transforms
 from vlatool.optimize.pruning_search import PrunedSearch, with_measured
 from vlatool.optimize.recipe import Recipe, StageList
-from vlatool.optimize.result import write_bundle, write_recipe
+from vlatool.optimize.result import summarize, write_bundle, write_recipe
 from vlatool.optimize.search import Search
-from vlatool.optimize.summary import summarize
 from vlatool.render import write_reports
 from vlatool.report import Report, read_report
 from vlatool.stage.base import Context, OnProgress
@@ -48,11 +47,7 @@ EXPLAIN_SECONDS = 20.0
 
 @dataclass(frozen=True)
 class OptimizeJob:
-    """A run in a process of its own.
-
-    Args:
-        fresh: Measure again, even what was measured before.
-    """
+    """A run in a process of its own."""
 
     source: str
     profile: dict[str, Any]
@@ -70,19 +65,16 @@ class Proposals:
     """What is to be built, and what was tried to find it.
 
     Args:
-        candidates: name -> stages.
+        candidates: name -> stages, as a recipe names them.
+        transforms: the same stages, built.
         trials: tables of the trials of pruned policies.
         plans: tables of the plans that the search tried.
     """
 
     candidates: Mapping[str, StageList]
+    transforms: Mapping[str, Transforms]
     trials: Tables
     plans: Tables
-
-    @property
-    def transforms(self) -> dict[str, Transforms]:
-        """Name -> stages, built."""
-        return {name: transforms(stages) for name, stages in self.candidates.items()}
 
 
 def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) -> Report:
@@ -125,7 +117,7 @@ def optimize_here(request: Mapping[str, Any], tell: OnProgress) -> None:
 def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     """Run a plan in this process, and write everything into an empty directory."""
     source = cached_transform(plan.source, None, plan.cache, context)
-    baseline = chain(plan.export, source, plan, context)[-1]
+    baseline = chain(plan.export, source, plan.profile, plan.recipe.limits.accept, plan.cache, context)[-1]
     _check_metric(plan, baseline, context)
     proposals = _proposals(plan, source, baseline, context)
     candidates = build(proposals.transforms, source, baseline, plan, context)
@@ -171,7 +163,7 @@ def _proposals(plan: Plan, source: Bundle, baseline: Bundle, context: Context) -
     if recipe.pruning.trials:
         found, trials = PrunedSearch(plan, source, baseline, context).run(candidates)
         candidates = {**candidates, **found}
-    return Proposals(candidates, trials, plans)
+    return Proposals(candidates, {name: transforms(stages) for name, stages in candidates.items()}, trials, plans)
 
 
 def _explained(chosen: Bundle, baseline: Bundle, context: Context) -> Tables:

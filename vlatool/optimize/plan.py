@@ -96,10 +96,6 @@ class Plan:
 def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
     """Build and check every stage; nothing has run when this returns.
 
-    Args:
-        profile: The board; None for this host.
-        fresh: Measure again, even what was measured before.
-
     Raises:
         VlatoolError: for the first thing that cannot work.
     """
