@@ -113,7 +113,6 @@ class Bundle:
         """Return the content of a recorded file: the very bytes that were verified, read once.
 
         Args:
-            name: name in the manifest.
             allowed: name of the limit on its size.
 
         Raises:

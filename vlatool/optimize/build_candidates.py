@@ -62,7 +62,7 @@ def chain(
     for stage in stages:
         context.progress(stage.name(), None)
         stage.check(made[-1], board)
-        made.append(cached_transform(stage, made[-1], cache, context))
+        made.append(cached_transform(stage, made[-1], cache, context).bundle)
     refuse_findings(made[-1], accept)
     return tuple(made)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -46,12 +46,13 @@ class Evidence:
 
 
 def gather(
-    plan: Plan, source: Bundle, candidates: Candidates, context: Context, enough: Enough | None = None
+    plan: Plan, source: Bundle, candidates: Candidates, context: Context, notes: Sequence[str], enough: Enough | None
 ) -> Evidence:
     """Measure float32 and all candidates, and predict for the board.
 
     Args:
         source: policy, for the time of eager torch.
+        notes: what the stages of the run noted so far; the list that those of this step are added to.
         enough: see ``with_episodes``.
 
     Raises:
@@ -61,7 +62,7 @@ def gather(
     timed, about_times = Timing(plan.recipe.effort, where, cache, context, plan.fresh).rows(source, bundles)
     rows, about_actions = with_recordings(timed, bundles, loop, cache, context)
     rows = with_episodes(rows, bundles, loop, cache, context, enough) if loop else rows
-    warnings = (*where.warnings(), *about_times, *about_actions, *dict.fromkeys(context.notes))
+    warnings = (*where.warnings(), *about_times, *about_actions, *dict.fromkeys(notes))
     board, apart = plan.profile, {IN_OPENVINO: ENGINE} if where.is_confined else {}
     asked = {**bundles, **dict.fromkeys(apart, bundles[BASELINE])}
     misled = {

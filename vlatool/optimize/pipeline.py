@@ -14,7 +14,7 @@ that the next ones take, and the plan stays as it was checked.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -116,12 +116,14 @@ def optimize_here(request: Mapping[str, Any], tell: OnProgress) -> None:
 
 def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     """Run a plan in this process, and write everything into an empty directory."""
-    source = cached_transform(plan.source, None, plan.cache, context)
+    notes: list[str] = []
+    context = replace(context, note=notes.append)
+    source = cached_transform(plan.source, None, plan.cache, context).bundle
     baseline = chain(plan.export, source, plan.profile, plan.recipe.limits.accept, plan.cache, context)[-1]
     _check_metric(plan, baseline, context)
     proposals = _proposals(plan, source, baseline, context)
     candidates = build(proposals.transforms, source, baseline, plan, context)
-    evidence = gather(plan, source, candidates, context, enough_for(plan))
+    evidence = gather(plan, source, candidates, context, notes, enough_for(plan))
     decision = decide(plan, evidence.rows, candidates.engines)
     chosen = candidates.bundles[decision.choice.row.name]
     trials = {title: with_measured(table, evidence.rows) for title, table in proposals.trials.items()}

@@ -17,6 +17,7 @@ from vlatool.optimize.study_storage import check_storage
 from vlatool.sources import Source, source_stage
 from vlatool.stage.base import Stage, Transform
 from vlatool.stage.build import build_stage
+from vlatool.stage.chain import steps_of
 
 BASELINE = "float32"
 Transforms = tuple[Transform, ...]
@@ -170,7 +171,7 @@ def transforms(stages: StageList) -> Transforms:
                 f"The stage {name} measures; a recipe lists stages that make a bundle.",
                 "leave the stage out of the recipe: optimize measures by itself",
             )
-        built += stage.chain()
+        built += steps_of(stage)
     return tuple(built)
 
 

@@ -128,7 +128,7 @@ def space_of(
         (stage,) = transforms(({name: options},))
         try:
             stage.check(source, None)
-            return cached_transform(stage, source, cache, context)
+            return cached_transform(stage, source, cache, context).bundle
         except NOT_POSSIBLE as error:
             refused.append(f"{name}: {error.message}")
             return None

@@ -30,7 +30,7 @@ from toy_robot import write_robot
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import main as vlatool
-from vlatool.cli._run import export_source
+from vlatool.cli._run import with_graphs
 from vlatool.errors import VlatoolError
 from vlatool.gate.claims.accuracy import Accuracy
 from vlatool.gate.config import Gate
@@ -42,7 +42,7 @@ from vlatool.optimize.recipe import Effort, Limits, Recipe
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.report import Measurement, Row
 from vlatool.runtime.golden import load_goldens
-from vlatool.sources import source_stage
+from vlatool.sources import source_bundle, source_stage
 from vlatool.stage.base import Context
 from vlatool.stage.finish import write_golden
 
@@ -93,7 +93,8 @@ def bundles(case: Case, folder: Path, kept: Path) -> dict[str, Bundle]:
     )
     place = kept / hashlib.sha256(code.encode()).hexdigest()[:16]
     if not place.exists():
-        baseline = export_source(source_stage(str(folder)), place / "cache", Context())
+        source = source_bundle(source_stage(str(folder)), place / "cache", Context())
+        baseline = with_graphs(source, place / "cache", Context()).bundle
         (place / "int8").mkdir()
         DynamicInt8().run(baseline, place / "int8", Context())
         shutil.copytree(baseline.path, place / "float32")
