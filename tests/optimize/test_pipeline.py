@@ -76,7 +76,15 @@ def from_torch(policy_template, tmp_path_factory) -> Run:
     """The whole way, all default candidates, once; read only."""
     folder = tmp_path_factory.mktemp("optimized")
     run = optimize(
-        policy_template, folder / "out", folder / "cache", "--max-drop", "100%", "--episodes", "10", "--json"
+        policy_template,
+        folder / "out",
+        folder / "cache",
+        "--max-drop",
+        "100%",
+        "--episodes",
+        "10",
+        "--every-candidate",
+        "--json",
     )
     assert run.code == 0, run.stderr
     return run

@@ -36,7 +36,7 @@ from vlatool.runtime import load
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
-from vlatool.stage.controls import predicted_for
+from vlatool.stage.controls import reservations
 from vlatool.stage.run import run_transform
 
 FINE = {"samples": 4, "multiple": 1}
@@ -321,9 +321,9 @@ def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     assert re.fullmatch(r"predicted, not measured: .* ms or up to 4% less on nuc13", stage.summarize(pruned)[-1])
     assert pruned.manifest.made_by["options"]["board"] == "intel-nuc-13-pro"
     exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context()).bundle
-    (told,) = predicted_for(exported)
+    (told,) = reservations(exported)
     assert told.startswith("prune.latency chose what stays by predictions for intel-nuc-13-pro (target ")
-    assert predicted_for(deep) == ()
+    assert reservations(deep) == ()
     monkeypatch.setattr(latency, "LatencyPredictor", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 

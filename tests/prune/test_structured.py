@@ -32,7 +32,7 @@ from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
-from vlatool.stage.controls import removed_by
+from vlatool.stage.controls import reservations
 from vlatool.stage.run import run_transform
 
 FINE = {"samples": 4, "multiple": 1}
@@ -155,7 +155,7 @@ def test_what_was_asked_and_reached_is_said_and_recorded(pruned: Bundle, source_
     assert 0.09 <= record["reached"] <= 0.15
     assert record["reached"] == round(1 - record["macs"][1] / record["macs"][0], 4)
     assert f"asked for 10.0% less work, reached {record['reached']:.1%} (" in result.messages[0]
-    assert [line.split(",")[0] for line in removed_by(again)] == [
+    assert [line.split(",")[0] for line in reservations(again)] == [
         f"prune.structured: asked for {asked}% less work" for asked in ("30.0", "10.0")
     ]
 

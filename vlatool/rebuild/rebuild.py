@@ -17,7 +17,7 @@ from vlatool.files.ownership import LEDGER
 from vlatool.files.scratch import scratch_directory
 from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
-from vlatool.optimize.pipeline import ROBOT_FOLDERS
+from vlatool.optimize.result import ROBOT_FOLDERS
 from vlatool.rebuild.differences import FileMatch, compare_bundles
 from vlatool.runtime.engine import identities
 from vlatool.sources import is_bundle, source_stage

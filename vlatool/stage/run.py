@@ -52,6 +52,10 @@ def run_transform(
         RecipeError: when other stages are to run first (``vlatool.stage.chain``).
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.
     """
+    apart = stage.runs_graphs or bool(factory_of(source))
+    if apart and not factory_of(source):
+        imports = child_imports(stage)
+        children.prepare(imports)  # while this process checks
     if not damaged:
         refuse_replacing(out, force=force, kind=BUNDLE)
     if first := stage.chain().before:
@@ -59,9 +63,6 @@ def run_transform(
             f"{stage.name()} with these options is several stages: {', '.join((*first, stage.name()))}.",
             "run one after the other what vlatool.stage.chain.steps_of() returns, as the command line does",
         )
-    apart = stage.runs_graphs or bool(factory_of(source))
-    if apart and not factory_of(source):
-        children.prepare(child_imports(stage))  # while this process checks
     if stage.kind() != "sources":
         source_of(source, stage.name())
     stage.check(source, None)

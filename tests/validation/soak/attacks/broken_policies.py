@@ -35,11 +35,10 @@ from vlatool.errors import VlatoolError
 from vlatool.gate.claims.accuracy import Accuracy
 from vlatool.gate.config import Gate
 from vlatool.gate.run import run_gate
-from vlatool.optimize.evidence import with_accuracy
-from vlatool.optimize.pipeline import judged_rows
+from vlatool.optimize.decision import decide
+from vlatool.optimize.evidence import with_episodes, with_recordings
 from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, Recipe
-from vlatool.optimize.summary import verdict_of
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.report import Measurement, Row
 from vlatool.runtime.golden import load_goldens
@@ -139,9 +138,10 @@ def by_optimize(case: Case, folder: Path, made: dict[str, Bundle], cache: Path) 
     )  # fmt: skip
     plan = make_plan(str(folder), None, recipe, cache)
     rows = {"float32": timed("float32", 10.0), "int8": timed("int8", 5.0)}
-    judged, trust = judged_rows(plan, with_accuracy(rows, made, plan.closed_loop, cache, Context()))
-    chosen = next(item for item in judged if item.row.role == "chosen")
-    verdict = verdict_of(judged, trust)
+    loop, context = plan.closed_loop, Context()
+    rows, _ = with_recordings(rows, made, loop, cache, context)
+    decision = decide(plan, with_episodes(rows, made, loop, cache, context) if loop else rows)
+    chosen, verdict, trust = decision.choice, decision.verdict, decision.trust
     if case.candidate and verdict == "pass" and chosen.row.name == "float32":
         return "fail", chosen.row.reason
     return verdict, " ".join((*trust.sentences[:1], *(chosen.sentences if not trust.fails else ())))
