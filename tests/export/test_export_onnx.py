@@ -19,6 +19,7 @@ from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
+from vlatool.stage.run import run_transform
 
 PLAIN_YAML = """\
 name: plain
@@ -231,7 +232,7 @@ def test_a_bundle_of_an_onnx_file_has_nothing_to_export(float_bundle, tmp_path: 
 
 def test_an_export_needs_a_source(tmp_path: Path):
     with pytest.raises(RecipeError, match=r"export.onnx needs a bundle"):
-        ExportOnnx().run(None, tmp_path, Context())
+        run_transform(ExportOnnx(), None, tmp_path / "out", Context())
 
 
 @pytest.mark.parametrize(
