@@ -11,7 +11,7 @@ import typer
 
 from vlatool.bundle.bundle import Bundle, manifest_bytes
 from vlatool.bundle.manifest import Manifest
-from vlatool.bundle.spec import TensorSpec
+from vlatool.bundle.spec import UNKNOWN, TensorSpec
 from vlatool.cli._document import document
 from vlatool.cli._options import BundlePath
 from vlatool.errors import BundleError, GraphError
@@ -76,8 +76,11 @@ def describe(bundle: Bundle) -> list[str]:
     if manifest.description:
         lines.append(f"  {manifest.description}")
     spec = manifest.spec
-    rate = f"{spec.control_hz:g} Hz control, {spec.execute or spec.chunk} of {spec.chunk} actions executed"
-    lines += [f"  rate       {rate}: {spec.inference_hz:g} inferences per second"]
+    executed = f"{spec.execute or spec.chunk} of {spec.chunk} actions executed"
+    known = spec.control_hz is not None
+    ends = f": {spec.inference_hz:g} inferences per second" if known else ""
+    lines += [f"  rate       {f'{spec.control_hz:g} Hz' if known else UNKNOWN} control, {executed}{ends}"]
+    lines += [f"  unknown    {', '.join(spec.unknown())}"] if spec.unknown() else []
     lines += [f"  input      {_tensor(tensor)}" for tensor in spec.inputs]
     lines += [f"  output     {_tensor(tensor)}" for tensor in spec.outputs]
     for name, graph in manifest.graphs.items():
