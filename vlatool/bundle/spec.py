@@ -299,6 +299,13 @@ class PolicySpec:
         return plain
 
 
+def unknown_warning(spec: PolicySpec) -> tuple[str, ...]:
+    """Return a sentence for a report on what nobody said of the robot; none where all is said, or a rate at least."""
+    if spec.control_hz is not None:
+        return ()
+    return (f"unknown, since nobody said it: {', '.join(spec.unknown())}; a policy.yaml says it",)
+
+
 def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
     values = mapping(data, f"The {where}", SpecError)
     known_keys(values, [field.name for field in fields(cls)], f"The {where}", SpecError)

@@ -14,11 +14,13 @@ import typer
 
 from vlatool.bundle.bundle import REPORTS as REPORTS_FOLDER
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import unknown_warning
 from vlatool.cli import _complete
 from vlatool.cli._board_summary import board_summary
 from vlatool.cli._console import crew, file_or_none, progress, refuse_existing, refuse_video, show
 from vlatool.cli._document import document
 from vlatool.cli._options import AsJson, Force, Raw, Workers
+from vlatool.cli._proposal import propose
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.files.printable import one_line, printable
@@ -47,7 +49,7 @@ def _board_flag(about: str) -> inspect.Parameter:
 
 SOURCE = typer.Argument(
     show_default=False,
-    help="a bundle, a policy directory, path.py:make or an .onnx file",
+    help="a bundle, a policy directory, path.py:make, or a file that holds a policy: .onnx, .pt, .pt2, LEAPP",
     autocompletion=_complete.sources,
 )
 SOURCE_FLAG = _flag("source", Annotated[str, SOURCE])
@@ -126,6 +128,7 @@ def transform(
             stage = other
         result = run_transform(stage, bundle, out, context, force=force, reports=reports)
         on_board = board_summary(result, bundle, board, context) if board else None
+    propose(source, result.manifest, out)
     baseline = source if isinstance(found, Bundle) else ""
     precision = {name: graph.precision for name, graph in result.manifest.graphs.items()}
     if as_json:
@@ -262,6 +265,8 @@ def measure(
         report = _measured(stage if board is None else stage.on(board), bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
+    propose(source, bundle.manifest, out)
+    report = replace(report, warnings=(*report.warnings, *unknown_warning(bundle.manifest.spec)))
     show(report, as_json=as_json, out=out, force=force, raw=raw, unfinished=context.unfinished or ())
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from vlatool import registry
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
 from vlatool.errors import SourceError
-from vlatool.module.description import Description
+from vlatool.module.description import Description, file_source
 from vlatool.registry import Claim
 from vlatool.stage.base import Transform
 
@@ -59,6 +59,10 @@ class Source(Transform):
         described = self.describe()
         return described is None or bool(described.graphs)
 
+    def described_by(self, description: Path) -> Self:
+        """Return the same source with the ``policy.yaml`` that names it."""
+        return self.model_copy(update={"policy": description})
+
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Return the same source with the options that the build record of a bundle has for it.
 
@@ -84,8 +88,12 @@ def claimed_source(typed: str | Path) -> Source | None:
     """
     if is_bundle(typed):
         return None
-    source: type[Source] | None = registry.claimant("sources", str(typed), SourceError)
-    return None if source is None else source.of(str(typed))
+    described, named = file_source(Path(typed)) or (None, typed)
+    source: type[Source] | None = registry.claimant("sources", str(named), SourceError)
+    if source is None:
+        return None
+    found = source.of(str(named))
+    return found if described is None else found.described_by(described)
 
 
 def source_of_policy(typed: str | Path) -> Source:

@@ -15,6 +15,7 @@ from typing import Any
 
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import unknown_warning
 from vlatool.errors import NOT_POSSIBLE, DataError, RecipeError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.explain.child_process import explanation_in_child
@@ -217,7 +218,7 @@ def _measured(
     rows = {name: with_derived(row) for name, row in rows.items()}
     rows = relabel_where(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged_actions(bundles[BASELINE], plan.closed_loop, plan.cache, context))
-    warnings = (*warnings, *dict.fromkeys(context.notes))
+    warnings = (*warnings, *unknown_warning(source.manifest.spec), *dict.fromkeys(context.notes))
     if plan.profile:
         predicted = foretold_by_engine(plan.profile, bundles, where)
         rows = {name: replace(row, measurements=(*row.measurements, *predicted[name])) for name, row in rows.items()}

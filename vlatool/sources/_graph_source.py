@@ -50,8 +50,7 @@ SAMPLES = 32
 class GraphSource(Source):
     """A policy that is one graph; the spec comes from a description, or from the graph's inputs and outputs.
 
-    A source of this kind says where the graph comes from (``read``) and, where ONNX Runtime cannot run the file itself,
-    what the graph is compared with (``reference``).
+    A source of this kind says where the graph comes from and what it is compared with (``read``).
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
@@ -92,17 +91,15 @@ class GraphSource(Source):
             return tuple(beside)
         return (*beside, *described.recordings().values(), *described.read_from, *described.assets())
 
-    def read(self, description: Description | None, context: Context) -> Any:
-        """Return the graph as a ``ModelProto`` with its weights.
+    def read(self, description: Description | None, context: Context) -> tuple[Any, Any]:
+        """Return the graph as a ``ModelProto`` with its weights, and what runs the policy itself.
+
+        The latter is an object with ``run(feeds)``; None where ONNX Runtime opens the file.
 
         Raises:
             SourceError: when the file is not what it should be.
         """
         raise NotImplementedError
-
-    def reference(self) -> Any:
-        """Return what ran the policy itself, after ``read``: an object with ``run(feeds)``; None to open the file."""
-        return None
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Read the graph, store it, and run it."""
@@ -110,8 +107,9 @@ class GraphSource(Source):
         description = self.describe()
         if description is not None:
             _check_program(description)
-        model = plain(self.read(description, context))
-        changes = self._prepare(model, description, context)
+        read, reference = self.read(description, context)
+        model = plain(read)
+        changes = replace(self._prepare(model, description, context), reference=reference)
         (out / "graphs").mkdir()
         file = out / "graphs/main.onnx"
         if description is None:
@@ -161,7 +159,7 @@ class GraphSource(Source):
         opset, file = opset_of(model), out / "graphs/main.onnx"
         wanted = self.opset or max(opset, MIN_OPSET if opset else 0)
         save(model, file)
-        before, unbatched = self._before(file, changes.further)
+        before, unbatched = self._before(file, changes)
         if wanted != opset:
             try:
                 save(with_opset(model, wanted), file)
@@ -177,11 +175,11 @@ class GraphSource(Source):
         self._compare(before, unbatched, out, manifest, changes.tolerance)
         return opset
 
-    def _before(self, file: Path, further: list[str]) -> tuple[Any, list[str]]:
+    def _before(self, file: Path, changes: _Changes) -> tuple[Any, list[str]]:
         """Open the file itself, or where ONNX Runtime refuses it what is written of it; and what has no batch axis."""
-        if (reference := self.reference()) is not None:
-            return reference, further
-        for path, unbatched in ((self.model, further), (file, [])):
+        if changes.reference is not None:
+            return changes.reference, changes.further
+        for path, unbatched in ((self.model, changes.further), (file, [])):
             try:
                 with engine_call(engine_class(), f"opened {path.name}"):
                     return engine_class()(path, threads=1), unbatched
@@ -229,10 +227,12 @@ class _Changes:
     Args:
         further: Inputs and outputs that were given a batch axis.
         tolerance: Relative L2 difference that this may make.
+        reference: What runs the policy itself; None where the file does.
     """
 
     further: list[str]
     tolerance: float = TOLERANCE
+    reference: Any = None
 
 
 def _check_program(described: Description) -> None:

@@ -44,6 +44,6 @@ class OnnxFile(GraphSource):
         if not self.model.is_file():
             raise SourceError(f"No such ONNX file: {self.model}.", "check the path")
 
-    def read(self, description: Description | None, context: Context) -> Any:
+    def read(self, description: Description | None, context: Context) -> tuple[Any, Any]:
         """Load the file."""
-        return load_onnx(self.model)
+        return load_onnx(self.model), None
