@@ -48,11 +48,14 @@ def new(
     stage = stage.model_copy(update={"shape": tuple(shape or ()), "control_hz": control_hz})
     stage.check(None, None)
     with progress() as context:
-        manifest = cached_transform(stage, None, cache_directory(), context).manifest
+        bundle = cached_transform(stage, None, cache_directory(), context)
+    manifest = bundle.manifest
     text = proposal(manifest, stage.model.name)
     with write_directory(policy) as draft:
         for path in stage.inputs():
             (shutil.copytree if path.is_dir() else shutil.copyfile)(path, draft / path.name)
+        if (assets := bundle.path / "assets").is_dir():
+            shutil.copytree(assets, draft, dirs_exist_ok=True)
         (draft / "policy.yaml").write_text(text, encoding="utf-8")
     if stage.runs(None):  # the copy of what was trusted
         trust.trust(policy / stage.model.name)

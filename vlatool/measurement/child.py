@@ -17,8 +17,8 @@ from typing import IO, Any, TypeVar
 from vlatool import errors
 from vlatool.errors import GateFailed, GraphError, VlatoolError
 from vlatool.files.messages import from_json, to_json
-from vlatool.machine.processes import die_with_parent, signal_name
-from vlatool.measurement.jobs import Limits
+from vlatool.machine.processes import NO_MEMORY, die_with_parent, signal_name
+from vlatool.measurement.jobs import NO_LIMITS, Limits
 from vlatool.measurement.process_limits import command, ran_out
 
 REINSTALL = "see whether this Python runs vlatool at all: python -m vlatool doctor"
@@ -29,15 +29,6 @@ CRASHES = (
 T = TypeVar("T")
 MAX_LAST_LINE = 240
 """Characters of the last line of a process that a signal ended: the end of an assertion says most."""
-NO_MEMORY = (
-    "MemoryError",
-    "bad_alloc",
-    "ailed to allocate",
-    "out of memory",
-    "annot allocate memory",
-    "Memory allocation",
-)
-"""What Python, C++ and the engines say when a limit is reached; a control group kills instead."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +72,7 @@ MESSAGES: dict[str, type[Message]] = {kind.__name__.lower(): kind for kind in (P
 
 
 def ask(
-    module: str,
-    job: Any,
-    kind: type[T],
-    about: str,
-    timeout: float | None = None,
-    limits: Limits = Limits(),  # noqa: B008
+    module: str, job: Any, kind: type[T], about: str, timeout: float | None = None, limits: Limits = NO_LIMITS
 ) -> T:
     """Run a module of vlatool in a fresh process and return what it answers.
 
@@ -153,11 +139,7 @@ def read_line(text: str, check: Callable[[Any], Any] = lambda value: value) -> M
         return None
 
 
-def error_of(
-    message: Raised,
-    limits: Limits = Limits(),  # noqa: B008
-    otherwise: type[VlatoolError] = GraphError,
-) -> VlatoolError:
+def error_of(message: Raised, limits: Limits = NO_LIMITS, otherwise: type[VlatoolError] = GraphError) -> VlatoolError:
     """Return what a process says that it raised, as ``otherwise`` where that is not an error of vlatool."""
     if limits.memory_mb and any(sign in message.message for sign in NO_MEMORY):
         return too_large(limits)

@@ -91,6 +91,18 @@ class GraphSource(Source):
             return tuple(beside)
         return (*beside, *described.recordings().values(), *described.read_from, *described.assets())
 
+    def shapes(self) -> dict[str, tuple[int | str, ...]]:
+        """Return input -> axes of ``--shape``."""
+        return shapes_from(self.shape)
+
+    def file(self) -> Path:
+        """Return the file that ONNX Runtime opens where nothing else is the reference."""
+        return self.model
+
+    def write_assets(self, described: Description, out: Path) -> None:
+        """Write tokenizers and statistics to ``assets/``, and recorded data to ``data/``."""
+        copy_assets(described, out)
+
     def read(self, description: Description | None, context: Context) -> tuple[Any, Any]:
         """Return the graph as a ``ModelProto`` with its weights, and what runs the policy itself.
 
@@ -115,10 +127,10 @@ class GraphSource(Source):
         if description is None:
             with _named_after(self.model, file):
                 complete_outputs(model, file, _tensors(model.graph.input))
-        described = description or self._described(model)
+        described = description or self.described(model)
         _check_names(model, described.spec)
         refuse_random_file(model, self.model)
-        copy_assets(described, out)
+        self.write_assets(described, out)
         manifest = described.manifest()
         options = {"opset": self.opset, "shape": list(self.shape)}
         given = {name: value for name, value in options.items() if value}
@@ -140,7 +152,7 @@ class GraphSource(Source):
         if gone := as_float32(model):
             context.messages.append(describe_conversion(gone))
         declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
-        fixed = axes_text(fix_axes(model, declared or shapes_from(self.shape), declared is not None, str(self.model)))
+        fixed = axes_text(fix_axes(model, declared or self.shapes(), declared is not None, str(self.model)))
         further = [] if description else add_batch_axes(model, opset_of(model))
         if further:
             axes = f"{', '.join(further)} of the file have no batch axis: one of 1 is put in front"
@@ -179,7 +191,7 @@ class GraphSource(Source):
         """Open the file itself, or where ONNX Runtime refuses it what is written of it; and what has no batch axis."""
         if changes.reference is not None:
             return changes.reference, changes.further
-        for path, unbatched in ((self.model, changes.further), (file, [])):
+        for path, unbatched in ((self.file(), changes.further), (file, [])):
             try:
                 with engine_call(engine_class(), f"opened {path.name}"):
                     return engine_class()(path, threads=1), unbatched
@@ -188,7 +200,8 @@ class GraphSource(Source):
                     raise
         raise AssertionError
 
-    def _described(self, model: Any) -> Description:
+    def described(self, model: Any) -> Description:
+        """Describe the policy by its graph, where nobody wrote a description."""
         inputs, outputs = _tensors(model.graph.input), _tensors(model.graph.output)
         rows = math.prod(axis for axis in outputs[0].shape[:-1] if isinstance(axis, int)) if outputs else 1
         spec = PolicySpec(inputs, outputs, self.control_hz, chunk=rows, execute=1 if rows > 1 else 0)

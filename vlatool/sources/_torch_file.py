@@ -104,6 +104,10 @@ class TorchFile(GraphSource):
         """Return the module as a ``ModelProto``, its inputs and outputs named."""
         raise NotImplementedError
 
+    def shapes(self) -> dict[str, tuple[int | str, ...]]:
+        """Return input -> axes of ``--shape``, which may say dtypes, too."""
+        return {name: axes for name, (axes, _) in declared_from(self.shape).items()}
+
     def _declared(self, description: Description | None) -> dict[str, tuple[tuple[int | str, ...], str]]:
         if description is None:
             return declared_from(self.shape)

@@ -17,6 +17,7 @@ from vlatool.sources._torch_file import Opened, TorchFile, example, free_axes, i
 
 OPSET = 20
 """Highest one of the exporter that takes TorchScript."""
+MAPPINGS = ("Dict(str, Tensor)", "Dict[str, Tensor]")
 BUILD_IT = "export the Python module that was scripted: torch.export.save writes a .pt2, torch.onnx.export a .onnx"
 
 
@@ -97,7 +98,7 @@ class TorchScript(TorchFile):
             if not argument.has_default_value()
         }
         for name, kind in takes.items():
-            if kind not in ("Tensor", "Dict(str, Tensor)") or list(takes.values()).count("Dict(str, Tensor)") > 1:
+            if kind not in ("Tensor", *MAPPINGS) or sum(each in MAPPINGS for each in takes.values()) > 1:
                 raise SourceError(
                     f"forward() in {self.model} takes '{name}' of the type {kind}; allowed: tensors, and one dict of "
                     "tensors by name.",
