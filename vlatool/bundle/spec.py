@@ -292,7 +292,6 @@ class PolicySpec:
         """Return a mapping that ``from_dict`` turns back into an equal spec."""
         plain: dict[str, Any] = to_json(self, defaults=False)
         return plain
-<<<<<<< HEAD
 
 
 def unknown_warning(spec: PolicySpec) -> tuple[str, ...]:
@@ -300,21 +299,3 @@ def unknown_warning(spec: PolicySpec) -> tuple[str, ...]:
     if spec.control_hz is not None:
         return ()
     return (f"unknown, since nobody said it: {', '.join(spec.unknown())}; a policy.yaml says it",)
-
-
-def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
-    values = mapping(data, f"The {where}", SpecError)
-    known_keys(values, [field.name for field in fields(cls)], f"The {where}", SpecError)
-    return values
-
-
-def _plain(value: Any) -> dict[str, Any]:
-    """Return the non-default fields of a dataclass, tuples as lists (required fields always)."""
-    plain = {}
-    for field in fields(value):
-        item = getattr(value, field.name)
-        if item != field.default:
-            plain[field.name] = list(item) if isinstance(item, tuple) else item
-    return plain
-=======
->>>>>>> main
