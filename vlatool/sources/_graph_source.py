@@ -53,6 +53,8 @@ class GraphSource(Source):
     A source of this kind says where the graph comes from and what it is compared with (``read``).
     """
 
+    where_made: ClassVar[str] = WHERE_MADE
+    """What helps against a graph that ONNX Runtime refuses."""
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
     runs_graphs: ClassVar[bool] = True
 
@@ -125,7 +127,7 @@ class GraphSource(Source):
         (out / "graphs").mkdir()
         file = out / "graphs/main.onnx"
         if description is None:
-            with _named_after(self.model, file):
+            with _named_after(self, file):
                 complete_outputs(model, file, _tensors(model.graph.input))
         described = description or self.described(model)
         _check_names(model, described.spec)
@@ -135,7 +137,7 @@ class GraphSource(Source):
         options = {"opset": self.opset, "shape": list(self.shape)}
         given = {name: value for name, value in options.items() if value}
         made_by = {**self.made_by(), "options": {"model": self.model.name, **given}}
-        with _named_after(self.model, file):
+        with _named_after(self, file):
             opset = self._store(model, out, manifest, changes, context)
             observations = observations_for(Bundle(out, manifest), 2)
             graphs = {"main": Graph("graphs/main.onnx", count_shares(file, context), opset)}
@@ -203,7 +205,10 @@ class GraphSource(Source):
     def described(self, model: Any) -> Description:
         """Describe the policy by its graph, where nobody wrote a description."""
         inputs, outputs = _tensors(model.graph.input), _tensors(model.graph.output)
-        rows = math.prod(axis for axis in outputs[0].shape[:-1] if isinstance(axis, int)) if outputs else 1
+        if not inputs or not outputs:
+            lacks = "takes no inputs" if not inputs else "gives no outputs"
+            raise SourceError(f"{self.model} {lacks}; a policy acts on what it sees.", self.where_made)
+        rows = math.prod(axis for axis in outputs[0].shape[:-1] if isinstance(axis, int))
         spec = PolicySpec(inputs, outputs, self.control_hz, chunk=rows, execute=1 if rows > 1 else 0)
         return Description(self.model.parent, self.model.stem, "0.0.0", spec)
 
@@ -288,12 +293,12 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
 
 
 @contextlib.contextmanager
-def _named_after(model: Path, copy: Path) -> Iterator[None]:
+def _named_after(source: GraphSource, copy: Path) -> Iterator[None]:
     """Report what is wrong with a copy by the user's own file: the copy is gone by the time they read it."""
     try:
         yield
     except InputError as error:
-        error.message = error.message.replace(str(copy), str(model))
+        error.message = error.message.replace(str(copy), str(source.model))
         if error.fix == REMEDY.format(package=engine_class().package):  # it was not made by vlatool
-            error.fix = WHERE_MADE
+            error.fix = source.where_made
         raise

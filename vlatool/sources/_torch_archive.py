@@ -14,6 +14,8 @@ from vlatool.files.printable import one_line
 
 OWN_MODULES = ("torch", "collections", "numpy")
 """First parts of the names that a pickle of tensors alone refers to."""
+PLAIN_TYPES = ("set", "frozenset", "dict", "list", "tuple", "int", "float", "bool", "str", "bytes", "slice", "range")
+"""Names of Python's own that it may refer to as well."""
 MAX_PICKLE_BYTES = 64 << 20
 MAX_GROWTH = 4
 """How many times its own size an archive may unpack to: torch stores without compression, apart from texts of code."""
@@ -61,7 +63,7 @@ def kind_of(path: Path) -> Kind:
 
 def pickled(path: Path) -> SourceError:
     """Return the error for a pickle: what is in it, as its bytes say; it is never opened."""
-    objects = sorted(name for name in _objects(path) if name.partition(".")[0] not in OWN_MODULES)
+    objects = sorted(name for name in _objects(path) if not _is_plain(name))
     if not objects:
         return SourceError(f"{path} holds weights alone (a state_dict, say), and no network to run.", MODULE_AGAIN)
     return SourceError(
@@ -69,6 +71,11 @@ def pickled(path: Path) -> SourceError:
         "not.",
         MODULE_AGAIN,
     )
+
+
+def _is_plain(name: str) -> bool:
+    module, _, word = name.rpartition(".")
+    return name.partition(".")[0] in OWN_MODULES or (module in ("builtins", "__builtin__") and word in PLAIN_TYPES)
 
 
 def _names(path: Path) -> list[str] | None:

@@ -26,6 +26,7 @@ from vlatool.user_code import trust
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
+BUILD_IT = "export the Python module that was saved: torch.export.save writes a .pt2, torch.onnx.export a .onnx"
 DYNAMIC_LENGTH = 3
 """Length of a free axis in the example that a module is exported with."""
 
@@ -58,6 +59,7 @@ class TorchFile(GraphSource):
 
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
     imports: ClassVar[tuple[str, ...]] = IMPORTS
+    where_made: ClassVar[str] = BUILD_IT
     holds: ClassVar[Kind]
     """What the file must be."""
 

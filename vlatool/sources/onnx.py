@@ -11,6 +11,7 @@ from vlatool.module.description import FILE, Description
 from vlatool.registry import Claim
 from vlatool.sources._graph_source import GraphSource
 from vlatool.sources._onnx_files import load_onnx, refuse_bare
+from vlatool.sources._onnx_operators import refuse_operators
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -45,5 +46,7 @@ class OnnxFile(GraphSource):
             raise SourceError(f"No such ONNX file: {self.model}.", "check the path")
 
     def read(self, description: Description | None, context: Context) -> tuple[Any, Any]:
-        """Load the file."""
-        return load_onnx(self.model), None
+        """Load the file, whose operators must be known."""
+        model = load_onnx(self.model)
+        refuse_operators(model, self.model)
+        return model, None

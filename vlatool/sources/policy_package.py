@@ -171,7 +171,8 @@ class PolicyPackage(GraphSource):
             yield from self._of_component(_mapping(component)) if component else ()
         if about := _mapping(data.get("normalization")):
             for key, end in (("input_features", "input"), ("output_features", "output")):
-                yield from self._features(about.get("type"), about.get("artifact"), about.get(key) or [], end)
+                if features := about.get(key):
+                    yield from self._features(about.get("type"), about.get("artifact"), features, end)
 
     def _of_component(self, component: Mapping[str, Any]) -> Iterator[Normalised]:
         options = {**component, **_mapping(component.get("init_args"))}
@@ -198,9 +199,14 @@ class PolicyPackage(GraphSource):
         if problem := path_problem(str(artifact)):
             raise SourceError(f"{where} names the statistics {artifact!r}: {problem}.", "export the package again")
         stored = read_tensors(self.model / str(artifact))
-        names = [str(name) for name in features] or sorted({_split(key)[0] for key in stored})
+        names = [str(name) for name in features] or sorted({_split(key)[0] for key in stored} & self._ends(end))
         for name in names:
             yield name, (MODES[mode], end, self._statistics(name, MODES[mode], end, stored, str(artifact)))
+
+    def _ends(self, end: str) -> set[str]:
+        """Return the names of the graph's inputs, or of its outputs."""
+        graph = load_onnx(self._file()).graph
+        return {value.name for value in (graph.input if end == "input" else graph.output)}
 
     def _statistics(
         self, name: str, mode: str, end: str, stored: Mapping[str, NDArray[Any]], artifact: str

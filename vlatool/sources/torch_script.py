@@ -13,12 +13,21 @@ from vlatool.files.printable import message_of, one_line
 from vlatool.module.to_onnx import quiet_exporter, raise_interrupt
 from vlatool.registry import Claim
 from vlatool.sources._torch_archive import Kind
-from vlatool.sources._torch_file import Opened, TorchFile, example, free_axes, is_file_of, named_leaves, rename_ends
+from vlatool.sources._torch_file import (
+    BUILD_IT,
+    Opened,
+    TorchFile,
+    example,
+    free_axes,
+    is_file_of,
+    named_leaves,
+    rename_ends,
+)
 
+ENDINGS = (".pt", ".pth", ".ckpt", ".ts", ".torchscript", ".jit")
 OPSET = 20
 """Highest one of the exporter that takes TorchScript."""
 MAPPINGS = ("Dict(str, Tensor)", "Dict[str, Tensor]")
-BUILD_IT = "export the Python module that was scripted: torch.export.save writes a .pt2, torch.onnx.export a .onnx"
 
 
 class TorchScript(TorchFile):
@@ -30,7 +39,7 @@ class TorchScript(TorchFile):
     @classmethod
     def claims(cls, typed: str) -> Claim:
         """Claim files with the endings of torch."""
-        return Claim.CERTAIN if is_file_of(Path(typed), (".pt", ".pth", ".ts", ".torchscript", ".jit")) else Claim.NONE
+        return Claim.CERTAIN if is_file_of(Path(typed), ENDINGS) else Claim.NONE
 
     def opened(self, declared: Mapping[str, tuple[tuple[int | str, ...], str]]) -> Opened:
         """Open the file; a traced module says the shapes of its inputs, a scripted one does not."""
