@@ -272,7 +272,7 @@ SCRIPTS = [
         lambda at: at.trusted(at.script(), *SHAPES, "--shape", "robot=1,3")),
     Row("a growing list", "export the Python module that was saved", 3,
         lambda at: at.trusted(of_torch(Growing())(at), "--shape", "state=1,3")),
-    Row("a shape that depends on values", "", 3,
+    Row("a shape that depends on values", "gives 'action' as float32 [2]; the spec declares float32 [1]", 3,
         lambda at: at.trusted(of_torch(Selected())(at), "--shape", "state=1,3")),
     Row("noise of its own", "draws random numbers", 3,
         lambda at: at.trusted(of_torch(Noisy())(at), "--shape", "state=1,3")),
@@ -304,7 +304,8 @@ GRAPHS = [
         [N("Identity", ["state"], ["action"])], (), (V("state", F, [1, 0]),), (V("action", F, [1, 0]),))))),
     Row("free axes", "has the free axes width in its shape ... --shape state=1,width", 3, lambda at: at.export(at.onnx(
         model([N("Relu", ["state"], ["action"])], (), (V("state", F, [1, "width"]),), (V("action", F, None),))))),
-    Row("weights that are NaN", "", 3, lambda at: at.export(at.onnx(model([N("MatMul", ["state", "W"], ["action"])], [
+    Row("weights that are NaN", "'action' of net.onnx holds NaN or infinity", 3,
+        lambda at: at.export(at.onnx(model([N("MatMul", ["state", "W"], ["action"])], [
         onnx.numpy_helper.from_array(np.full((16, 6), np.nan, np.float32), "W")])))),
 ]  # fmt: skip
 OTHERS = [
@@ -336,7 +337,8 @@ OTHERS = [
         lambda at: at.export(at.folder(config_dot_json='{"model_type": "llama"}', model_dot_safetensors=b""))),
     Row("a package of another format", "a package of another tool, of the format 'policy_bundle'", 3,
         lambda at: at.export(at.folder(manifest_dot_json='{"format": "policy_bundle"}'))),
-    Row("a package that is no JSON", "", 3, lambda at: at.export(at.folder(manifest_dot_json='{"format": '))),
+    Row("a package that is no JSON", "has no manifest.sha256", 3,
+        lambda at: at.export(at.folder(manifest_dot_json='{"format": '))),
     Row("a policy.yaml that names a file that is gone", "'net.onnx' is no Python function, and no file", 3,
         lambda at: at.export(at.folder(
         policy_dot_yaml="name: a\nsource: net.onnx\nspec: {inputs: [{name: a, shape: [1, 2]}], "

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle, seal
@@ -55,6 +56,8 @@ class GraphSource(Source):
 
     where_made: ClassVar[str] = WHERE_MADE
     """What helps against a graph that ONNX Runtime refuses."""
+    where_differs: ClassVar[str] = "leave --opset out, or export the file again where it was made"
+    """What helps against a graph that computes something else than the file."""
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
     runs_graphs: ClassVar[bool] = True
 
@@ -222,19 +225,24 @@ class GraphSource(Source):
             after = engine_class()(out / "graphs/main.onnx", threads=1)
         programs = [Program(manifest.program, {"main": session}, SEED) for session in (before, after)]
         encode = ObservationEncoder(manifest.spec, out / "assets")
-        for observation in observations_for(seal(out, manifest), SAMPLES):
+        for number, observation in enumerate(observations_for(seal(out, manifest), SAMPLES)):
             feeds = encode(observation)
             as_before = {name: value[0] if name in unbatched else value for name, value in feeds.items()}
             expected, got = (
                 program.run(inputs) for program, inputs in zip(programs, (as_before, dict(feeds)), strict=True)
             )
             for tensor in manifest.spec.outputs:
+                if not np.isfinite(expected[tensor.name]).all():
+                    raise SourceError(
+                        f"'{tensor.name}' of {self.model.name} holds NaN or infinity on observation {number}.",
+                        "look for weights that are not finite, and for shapes or dtypes for which it was not made",
+                    )
                 error = relative_error(got[tensor.name], expected[tensor.name])
                 if not error <= tolerance:
                     raise SourceError(
-                        f"Converted, '{tensor.name}' of the ONNX file is another one: relative L2 error {error:.3g}, "
-                        f"allowed {tolerance:g}.",
-                        "leave --opset out, or export the file again where it was made",
+                        f"Converted, '{tensor.name}' of {self.model.name} is another one on observation {number}: "
+                        f"relative L2 error {error:.3g}, allowed {tolerance:g}.",
+                        self.where_differs,
                     )
 
 

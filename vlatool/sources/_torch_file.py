@@ -60,6 +60,10 @@ class TorchFile(GraphSource):
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
     imports: ClassVar[tuple[str, ...]] = IMPORTS
     where_made: ClassVar[str] = BUILD_IT
+    where_differs: ClassVar[str] = (
+        "look for what forward() keeps from call to call: let it take and return that, and keep it in the program of a "
+        f"policy.yaml; else {BUILD_IT}"
+    )
     holds: ClassVar[Kind]
     """What the file must be."""
 
