@@ -173,7 +173,7 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "no pipeline": (lambda data: data.update(pipeline=None), "has no 'pipeline'"),
     "flows that are no lists": (
         lambda data: data["pipeline"].update(feedback_flow={"a": "b"}),
-        "no mapping of outputs",
+        "not a mapping of outputs",
     ),
     "initial values that are gone": (
         lambda data: data["pipeline"].update(initial_values="gone.safetensors"),

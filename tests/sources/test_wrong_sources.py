@@ -339,7 +339,7 @@ OTHERS = [
         lambda at: at.export(at.folder(manifest_dot_json='{"format": "policy_bundle"}'))),
     Row("a package that is no JSON", "has no manifest.sha256", 3,
         lambda at: at.export(at.folder(manifest_dot_json='{"format": '))),
-    Row("a policy.yaml that names a file that is gone", "'net.onnx' is no Python function, and no file", 3,
+    Row("a policy.yaml that names a file that is gone", "'net.onnx' is neither a Python function nor a file", 3,
         lambda at: at.export(at.folder(
         policy_dot_yaml="name: a\nsource: net.onnx\nspec: {inputs: [{name: a, shape: [1, 2]}], "
         "outputs: [{name: b, shape: [1, 2]}], control_hz: unknown}\n"))),

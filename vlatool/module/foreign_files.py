@@ -33,7 +33,7 @@ class Foreign(NamedTuple):
 
 PICKLE = Foreign("a pickle, which may run any code when it is opened; it was not", BUILD)
 KERAS = Foreign("a Keras model", CONVERT.replace("{option}", "--keras"))
-COMPILED = Foreign("an engine that TensorRT compiled for one card", ORIGINAL)
+TENSORRT = Foreign("an engine that TensorRT compiled for one card", ORIGINAL)
 PADDLE = Foreign(
     "a Paddle model", "convert it: pip install paddle2onnx; paddle2onnx --model_dir DIR --save_file policy.onnx"
 )
@@ -43,7 +43,7 @@ RECORDING = Foreign("a recording and no policy", "name the policy; recordings go
 SUFFIXES = {
     ".safetensors": Foreign("a file of weights alone, without a network", BUILD),
     ".gguf": Foreign("a model of llama.cpp", ORIGINAL), ".ggml": Foreign("a model of llama.cpp", ORIGINAL),
-    ".engine": COMPILED, ".plan": COMPILED, ".trt": COMPILED,
+    ".engine": TENSORRT, ".plan": TENSORRT, ".trt": TENSORRT,
     ".tflite": Foreign("a TensorFlow Lite model", CONVERT.replace("{option}", "--tflite")),
     ".h5": KERAS, ".keras": KERAS,
     ".pb": Foreign("a frozen TensorFlow graph", CONVERT.replace("{option}", "--graphdef")),

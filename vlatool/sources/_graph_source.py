@@ -132,7 +132,7 @@ class GraphSource(Source):
         if description is None:
             with _named_after(self, file):
                 complete_outputs(model, file, _tensors(model.graph.input))
-        described = description or self.described(model)
+        described = description or self.description_of(model)
         _check_names(model, described.spec)
         refuse_random_file(model, self.model)
         self.write_assets(described, out)
@@ -205,7 +205,7 @@ class GraphSource(Source):
                     raise
         raise AssertionError
 
-    def described(self, model: Any) -> Description:
+    def description_of(self, model: Any) -> Description:
         """Describe the policy by its graph, where nobody wrote a description."""
         inputs, outputs = _tensors(model.graph.input), _tensors(model.graph.output)
         if not inputs or not outputs:

@@ -10,7 +10,15 @@ from vlatool.errors import SourceError, require
 from vlatool.files.printable import one_line
 from vlatool.graph.nodes import inner_nodes
 
-KNOWN = ("", "ai.onnx", "ai.onnx.ml", "com.microsoft", "com.microsoft.nchwc", "com.ms.internal.nhwc", "ai.onnx.preview")
+KNOWN_DOMAINS = (
+    "",
+    "ai.onnx",
+    "ai.onnx.ml",
+    "com.microsoft",
+    "com.microsoft.nchwc",
+    "com.ms.internal.nhwc",
+    "ai.onnx.preview",
+)
 """Domains whose operators ONNX Runtime has."""
 OF_ONNX_RUNTIME = (
     "SimplifiedLayerNormalization", "Affine", "ParametricSoftplus", "ScaledTanh", "ImageScaler", "Crop", "DynamicSlice",
@@ -68,6 +76,6 @@ def _nodes(model: Any) -> Iterator[Any]:
 def _is_known(node: Any) -> bool:
     """Return whether ONNX Runtime may have an operator: of its own domains it says itself which it lacks."""
     if node.domain not in ("", "ai.onnx", "ai.onnx.ml"):
-        return node.domain in KNOWN
+        return node.domain in KNOWN_DOMAINS
     domain = node.domain if node.domain == "ai.onnx.ml" else ""
     return node.op_type in OF_ONNX_RUNTIME or bool(require("onnx", "build").defs.has(node.op_type, domain))

@@ -16,7 +16,7 @@ from vlatool.runtime.engine import engine_class
 from vlatool.sources._onnx_axes import opset_of, with_opset
 from vlatool.sources._onnx_files import load_onnx
 
-BEGUN = "begun"
+BEGUN_FLAG = "begun"
 """Memory that is zero until the first inference, where a memory begins with other values than zero."""
 
 
@@ -40,7 +40,7 @@ class Pipeline:
     outputs: Mapping[str, str]
     initial: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
-    def merged(self) -> Any:
+    def merge(self) -> Any:
         """Return one ``ModelProto``: inputs and outputs by their names outside, then those of the memories.
 
         Raises:
@@ -66,10 +66,10 @@ class Pipeline:
         return helper.make_model(graph, opset_imports=list(domains.values()), ir_version=ir_version)
 
     @property
-    def kept(self) -> dict[str, str]:
+    def feedback(self) -> dict[str, str]:
         """Memory as an input of the merged graph -> as an output of it."""
-        kept = {target: f"{target}/next" for target in self.memories}
-        return kept | ({BEGUN: f"{BEGUN}/next"} if self.initial else {})
+        feedback = {target: f"{target}/next" for target in self.memories}
+        return feedback | ({BEGUN_FLAG: f"{BEGUN_FLAG}/next"} if self.initial else {})
 
     def _check(self, taken: Mapping[str, Any], given: Mapping[str, Any]) -> None:
         for what, names, known in (
@@ -98,20 +98,22 @@ class Pipeline:
             graph.output.append(_named(given[source], name))
         for target, source in self.memories.items():
             graph.input.append(taken[target])
-            graph.node.append(helper.make_node("Identity", [source], [self.kept[target]], f"{target}/keep"))
-            graph.output.append(_named(given[source], self.kept[target]))
+            graph.node.append(helper.make_node("Identity", [source], [self.feedback[target]], f"{target}/keep"))
+            graph.output.append(_named(given[source], self.feedback[target]))
             if target in self.initial:
                 rename_reads(graph, target, f"{target}/held")
                 graph.initializer.append(numpy_helper.from_array(self.initial[target], f"{target}/initial"))
-                held = [f"{BEGUN}/true", target, f"{target}/initial"]
+                held = [f"{BEGUN_FLAG}/true", target, f"{target}/initial"]
                 first.append(helper.make_node("Where", held, [f"{target}/held"], f"{target}/begin"))
         if self.initial:
             one = require("onnx", "build").TensorProto.FLOAT
-            graph.input.append(helper.make_tensor_value_info(BEGUN, one, [1]))
-            graph.output.append(helper.make_tensor_value_info(self.kept[BEGUN], one, [1]))
-            cast = helper.make_node("Cast", [BEGUN], [f"{BEGUN}/true"], f"{BEGUN}/Cast", to=9)
-            graph.initializer.append(numpy_helper.from_array(np.ones(1, np.float32), f"{BEGUN}/one"))
-            nexts = helper.make_node("Max", [BEGUN, f"{BEGUN}/one"], [self.kept[BEGUN]], f"{BEGUN}/Max")
+            graph.input.append(helper.make_tensor_value_info(BEGUN_FLAG, one, [1]))
+            graph.output.append(helper.make_tensor_value_info(self.feedback[BEGUN_FLAG], one, [1]))
+            cast = helper.make_node("Cast", [BEGUN_FLAG], [f"{BEGUN_FLAG}/true"], f"{BEGUN_FLAG}/Cast", to=9)
+            graph.initializer.append(numpy_helper.from_array(np.ones(1, np.float32), f"{BEGUN_FLAG}/one"))
+            nexts = helper.make_node(
+                "Max", [BEGUN_FLAG, f"{BEGUN_FLAG}/one"], [self.feedback[BEGUN_FLAG]], f"{BEGUN_FLAG}/Max"
+            )
             nodes = [cast, *first, *graph.node, nexts]
             del graph.node[:]
             graph.node.extend(nodes)
@@ -134,7 +136,7 @@ class Chain:
     def run(self, feeds: Mapping[str, Any]) -> dict[str, Any]:
         """Run the graphs one after the other on numpy arrays."""
         pipeline, values = self._pipeline, dict[str, Any]()
-        begun = not pipeline.initial or bool(np.any(feeds[BEGUN]))
+        begun = not pipeline.initial or bool(np.any(feeds[BEGUN_FLAG]))
         for target in pipeline.memories:
             fresh = not begun and target in pipeline.initial
             values[target] = pipeline.initial[target] if fresh else feeds[target]
@@ -145,8 +147,8 @@ class Chain:
             shaped = {key.partition("/")[2]: self._shaped(key, value) for key, value in taken.items()}
             values |= {f"{name}/{word}": value for word, value in session.run(shaped).items()}
         given = {name: values[source] for source, name in pipeline.outputs.items()}
-        given |= {pipeline.kept[target]: values[source] for target, source in pipeline.memories.items()}
-        return given | ({pipeline.kept[BEGUN]: np.ones(1, np.float32)} if pipeline.initial else {})
+        given |= {pipeline.feedback[target]: values[source] for target, source in pipeline.memories.items()}
+        return given | ({pipeline.feedback[BEGUN_FLAG]: np.ones(1, np.float32)} if pipeline.initial else {})
 
     def _shaped(self, key: str, value: Any) -> Any:
         """Return a value with the axes of the file: a batch axis may have been put in front of it."""

@@ -61,7 +61,7 @@ def kind_of(path: Path) -> Kind:
     )
 
 
-def pickled(path: Path) -> SourceError:
+def pickle_error(path: Path) -> SourceError:
     """Return the error for a pickle: what is in it, as its bytes say; it is never opened."""
     objects = sorted(name for name in _objects(path) if not _is_plain(name))
     if not objects:

@@ -19,7 +19,7 @@ from vlatool.module.description import Description
 from vlatool.module.to_onnx import IMPORTS
 from vlatool.sources._graph_source import GraphSource
 from vlatool.sources._onnx_axes import shapes_from
-from vlatool.sources._torch_archive import Kind, kind_of, pickled
+from vlatool.sources._torch_archive import Kind, kind_of, pickle_error
 from vlatool.stage.base import Context
 from vlatool.user_code import trust
 
@@ -32,7 +32,7 @@ DYNAMIC_LENGTH = 3
 
 
 @dataclass(frozen=True)
-class Opened:
+class OpenedModule:
     """A module of a file.
 
     Args:
@@ -75,7 +75,7 @@ class TorchFile(GraphSource):
         """The file is what it should be, as its bytes say; it is trusted; and torch is installed."""
         found = kind_of(self.model)
         if found is Kind.PICKLE:
-            raise pickled(self.model)
+            raise pickle_error(self.model)
         if found is not self.holds:
             remedy = "save the program with torch.export.save" if found is Kind.COMPILED else "name it FILE" + (
                 ".pt2" if found is Kind.PROGRAM else ".pt"
@@ -90,15 +90,15 @@ class TorchFile(GraphSource):
         trust.require_file(self.model)
         torch = require("torch", "build")
         context.progress(f"opening {self.model.name} in torch", None)
-        opened = self.opened(self._declared(description))
+        opened = self.open_module(self._declared(description))
         with torch.no_grad():
             outputs = named_leaves(self._run(opened))
         wanted = [tensor.name for tensor in description.spec.outputs] if description else []
         context.progress(f"exporting {self.model.name}", None)
-        model = self.exported(opened, list(outputs))
+        model = self.export_module(opened, list(outputs))
         return model, Session(opened, _names(list(outputs), wanted))
 
-    def opened(self, declared: Mapping[str, tuple[tuple[int | str, ...], str]]) -> Opened:
+    def open_module(self, declared: Mapping[str, tuple[tuple[int | str, ...], str]]) -> OpenedModule:
         """Open the file in torch.
 
         Args:
@@ -106,7 +106,7 @@ class TorchFile(GraphSource):
         """
         raise NotImplementedError
 
-    def exported(self, opened: Opened, outputs: Sequence[str]) -> Any:
+    def export_module(self, opened: OpenedModule, outputs: Sequence[str]) -> Any:
         """Return the module as a ``ModelProto``, its inputs and outputs named."""
         raise NotImplementedError
 
@@ -119,7 +119,7 @@ class TorchFile(GraphSource):
             return declared_from(self.shape)
         return {tensor.name: (tensor.shape, tensor.dtype) for tensor in description.spec.inputs}
 
-    def _run(self, opened: Opened) -> Any:
+    def _run(self, opened: OpenedModule) -> Any:
         try:
             return opened(*opened.inputs.values())
         except Exception as error:  # the seam: the code of a file may raise anything
@@ -138,7 +138,7 @@ class Session:
         outputs: leaf of what it returns -> name of the output.
     """
 
-    opened: Opened
+    opened: OpenedModule
     outputs: Mapping[str, str]
 
     def run(self, feeds: Mapping[str, Any]) -> dict[str, Any]:
@@ -290,5 +290,5 @@ def _last_line(error: BaseException) -> str:
 
 
 def is_file_of(path: Path, suffixes: Sequence[str]) -> bool:
-    """Return whether a path has one of these endings and is no directory."""
+    """Return whether a path has one of these endings and is not a directory."""
     return path.suffix in suffixes and not path.is_dir()

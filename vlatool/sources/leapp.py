@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 PARTS = ("models", "pipeline", "system information")
 """Keys of the YAML file, at the beginning of lines."""
 MAX_BYTES = 256 << 10
-AGAIN = "export the bundle again where it was made, and copy its whole directory"
+EXPORT_AGAIN = "export the bundle again where it was made, and copy its whole directory"
 MODES = {"position": "absolute", "pose": "absolute", "orientation": "absolute", "velocity": "velocity"}
 """Last word of the kind of a target -> how a controller applies it."""
 
@@ -75,13 +75,13 @@ class LeappBundle(GraphSource):
         """Join the graphs; the reference is each graph in a session of its own."""
         pipeline = self._pipeline()
         with engine_call(engine_class(), f"opened the graphs of {self.model.name}"):
-            return pipeline.merged(), Chain(pipeline)
+            return pipeline.merge(), Chain(pipeline)
 
-    def described(self, model: Any) -> Description:
+    def description_of(self, model: Any) -> Description:
         """Describe the policy by its graphs and by what the YAML file says of kinds, names and the rate."""
         pipeline, data = self._pipeline(), self._data()
-        plain = super().described(model)
-        memories = {**pipeline.kept}
+        plain = super().description_of(model)
+        memories = {**pipeline.feedback}
         about = {**self._about(pipeline.inputs, "inputs"), **self._about(pipeline.outputs, "outputs")}
         tensors = {tensor.name: _enriched(tensor, about.get(tensor.name, {})) for tensor in plain.spec.inputs}
         given = {tensor.name: _enriched(tensor, about.get(tensor.name, {})) for tensor in plain.spec.outputs}
@@ -98,7 +98,7 @@ class LeappBundle(GraphSource):
         data = read_mapping(self.model, str(self.model), SourceError)
         for key in PARTS[:2]:
             if not isinstance(data.get(key), Mapping):
-                raise SourceError(f"{self.model} has no '{key}'; a LEAPP bundle has {', '.join(PARTS)}.", AGAIN)
+                raise SourceError(f"{self.model} has no '{key}'; a LEAPP bundle has {', '.join(PARTS)}.", EXPORT_AGAIN)
         return dict(data)
 
     def _about(self, ends: Mapping[str, str], key: str) -> dict[str, Mapping[str, Any]]:
@@ -125,7 +125,7 @@ class LeappBundle(GraphSource):
 
     def _file(self, name: str, model: Any) -> Path:
         if not isinstance(model, Mapping) or not all(isinstance(model.get(key), list) for key in ("inputs", "outputs")):
-            raise SourceError(f"{self.model} describes the graph '{name}' without inputs and outputs.", AGAIN)
+            raise SourceError(f"{self.model} describes the graph '{name}' without inputs and outputs.", EXPORT_AGAIN)
         about = model.get("parameters")
         about = about if isinstance(about, Mapping) else {}
         backend, relative = about.get("backend", "none"), str(about.get("model_path", ""))
@@ -141,25 +141,29 @@ class LeappBundle(GraphSource):
                 "export the policy without them",
             )
         if problem := path_problem(relative):
-            raise SourceError(f"{self.model} names the file {relative!r} of '{name}': {problem}.", AGAIN)
+            raise SourceError(f"{self.model} names the file {relative!r} of '{name}': {problem}.", EXPORT_AGAIN)
         file = self.model.parent / relative
         if not file.is_file():
-            raise SourceError(f"{self.model} names {relative}, which is not beside it.", AGAIN)
+            raise SourceError(f"{self.model} names {relative}, which is not beside it.", EXPORT_AGAIN)
         if about.get("sha256sum") and hash_file(file) != about["sha256sum"]:
-            raise SourceError(f"{file} is not the file that {self.model.name} describes: its SHA-256 differs.", AGAIN)
+            raise SourceError(
+                f"{file} is not the file that {self.model.name} describes: its SHA-256 differs.", EXPORT_AGAIN
+            )
         return file
 
     def _targets(self, pipeline: Mapping[str, Any], key: str) -> dict[str, str]:
         flows = pipeline.get(key) or {}
         if not isinstance(flows, Mapping) or not all(isinstance(targets, list) for targets in flows.values()):
-            raise SourceError(f"{self.model} has '{key}' that is no mapping of outputs to lists of inputs.", AGAIN)
+            raise SourceError(
+                f"{self.model} has '{key}' that is not a mapping of outputs to lists of inputs.", EXPORT_AGAIN
+            )
         return {str(target): str(source) for source, targets in flows.items() for target in targets}
 
     def _ends(self, pipeline: Mapping[str, Any], key: str) -> dict[str, str]:
         """Return ``GRAPH/NAME`` -> its name outside: the name alone where no other graph has it."""
         ends = pipeline.get(key)
         if not isinstance(ends, Mapping) or not any(ends.values()):
-            raise SourceError(f"{self.model} names no {key} of the pipeline.", AGAIN)
+            raise SourceError(f"{self.model} names no {key} of the pipeline.", EXPORT_AGAIN)
         pairs = [(str(graph), str(name)) for graph, names in ends.items() for name in names or ()]
         names = [name for _, name in pairs]
         return {f"{graph}/{name}": name if names.count(name) == 1 else f"{graph}.{name}" for graph, name in pairs}
@@ -170,10 +174,12 @@ class LeappBundle(GraphSource):
         if not named:
             return {}
         if problem := path_problem(str(named)):
-            raise SourceError(f"{self.model} names the file {named!r}: {problem}.", AGAIN)
+            raise SourceError(f"{self.model} names the file {named!r}: {problem}.", EXPORT_AGAIN)
         values = read_tensors(self.model.parent / str(named))
         for name in values.keys() - memories.keys():
-            raise SourceError(f"{named} holds '{name}', which is no memory; {suggest(name, list(memories))}.", AGAIN)
+            raise SourceError(
+                f"{named} holds '{name}', which is not a memory; {suggest(name, list(memories))}.", EXPORT_AGAIN
+            )
         return {name: value for name, value in values.items() if np.any(value)}
 
 

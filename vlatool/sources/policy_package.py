@@ -86,9 +86,9 @@ class PolicyPackage(GraphSource):
         """Return the ONNX file, which ONNX Runtime opens."""
         return self._file()
 
-    def described(self, model: Any) -> Description:
+    def description_of(self, model: Any) -> Description:
         """Describe the policy by its graph, and by what the manifest says of statistics, names and the chunk."""
-        plain, data = super().described(model), self._data()
+        plain, data = super().description_of(model), self._data()
         normalised = dict(self._normalised())
         known = {tensor.name for tensor in (*plain.spec.inputs, *plain.spec.outputs)}
         for name in normalised:

@@ -13,7 +13,7 @@ from vlatool.module.folding import fold_weights
 from vlatool.module.to_onnx import OPSET, exported_by_torch, name_by_module, strip_notes
 from vlatool.registry import Claim
 from vlatool.sources._torch_archive import Kind
-from vlatool.sources._torch_file import Opened, TorchFile, example, is_file_of, path_names, rename_ends
+from vlatool.sources._torch_file import OpenedModule, TorchFile, example, is_file_of, path_names, rename_ends
 
 
 class TorchProgram(TorchFile):
@@ -27,7 +27,7 @@ class TorchProgram(TorchFile):
         """Claim .pt2 files."""
         return Claim.CERTAIN if is_file_of(Path(typed), (".pt2",)) else Claim.NONE
 
-    def opened(self, declared: Mapping[str, tuple[tuple[int | str, ...], str]]) -> Opened:
+    def open_module(self, declared: Mapping[str, tuple[tuple[int | str, ...], str]]) -> OpenedModule:
         """Open the file; it says names, shapes and dtypes, and which axes are free."""
         torch = require("torch", "build")
         try:
@@ -59,9 +59,9 @@ class TorchProgram(TorchFile):
             for name, index in zip(names, places, strict=True)
         }
         free = {name: {at: axis for at, axis in enumerate(axes[name]) if isinstance(axis, str)} for name in names}
-        return Opened(program.module(), run, inputs, free, program)
+        return OpenedModule(program.module(), run, inputs, free, program)
 
-    def exported(self, opened: Opened, outputs: Sequence[str]) -> Any:
+    def export_module(self, opened: OpenedModule, outputs: Sequence[str]) -> Any:
         """Translate it with torch's exporter, as a module of a policy is."""
         ir = require("onnx_ir", "build")
         step = ProgramStep(self.model.name, {}, {})
@@ -78,7 +78,7 @@ class TorchProgram(TorchFile):
         numbers = [leaf for leaf in leaves if isinstance(leaf, str) and not isinstance(values.get(leaf), torch.Tensor)]
         if numbers:
             raise SourceError(
-                f"{self.model} takes numbers that are no tensors: {', '.join(map(str, numbers))}.",
+                f"{self.model} takes numbers that are not tensors: {', '.join(map(str, numbers))}.",
                 "let forward() take tensors, and export it again",
             )
 

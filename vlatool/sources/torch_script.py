@@ -15,7 +15,7 @@ from vlatool.registry import Claim
 from vlatool.sources._torch_archive import Kind
 from vlatool.sources._torch_file import (
     BUILD_IT,
-    Opened,
+    OpenedModule,
     TorchFile,
     example,
     free_axes,
@@ -41,7 +41,7 @@ class TorchScript(TorchFile):
         """Claim files with the endings of torch."""
         return Claim.CERTAIN if is_file_of(Path(typed), ENDINGS) else Claim.NONE
 
-    def opened(self, declared: Mapping[str, tuple[tuple[int | str, ...], str]]) -> Opened:
+    def open_module(self, declared: Mapping[str, tuple[tuple[int | str, ...], str]]) -> OpenedModule:
         """Open the file; a traced module says the shapes of its inputs, a scripted one does not."""
         torch = require("torch", "build")
         try:
@@ -61,9 +61,9 @@ class TorchScript(TorchFile):
             return called(*({name: given[name] for name in inner} if name in mapped else given[name] for name in takes))
 
         inputs = {name: example(*shapes[name]) for name in (*names, *inner)}
-        return Opened(module, run, inputs, {name: free_axes(shapes[name][0]) for name in inputs})
+        return OpenedModule(module, run, inputs, {name: free_axes(shapes[name][0]) for name in inputs})
 
-    def exported(self, opened: Opened, outputs: Sequence[str]) -> Any:
+    def export_module(self, opened: OpenedModule, outputs: Sequence[str]) -> Any:
         """Export it with the exporter of torch that takes TorchScript, control flow included."""
         torch, onnx = require("torch", "build"), require("onnx", "build")
         inputs = [f"in{number}" for number in range(len(opened.inputs))]
