@@ -42,6 +42,10 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+OTHER_BRANCH = (
+    "one branch of that If is made for inputs of other lengths: give those for which all of its branches are made "
+    "(--shape), or cut the branch that the robot needs out of the file (onnx.utils.extract_model)"
+)
 TOLERANCE = 1e-3
 """Largest relative L2 difference between a file and what it was converted to."""
 SAMPLES = 32
@@ -157,8 +161,11 @@ class GraphSource(Source):
         if gone := as_float32(model):
             context.messages.append(describe_conversion(gone))
         declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
-        fixed = axes_text(fix_axes(model, declared or self.shapes(), declared is not None, str(self.model)))
-        further = [] if description else add_batch_axes(model, opset_of(model))
+        unbatched = _without_batch(model, declared or {})
+        fixed = axes_text(
+            fix_axes(model, {**(declared or self.shapes()), **unbatched}, declared is not None, str(self.model))
+        )
+        further = add_batch_axes(model, opset_of(model)) if unbatched or not description else []
         if further:
             axes = f"{', '.join(further)} of the file have no batch axis: one of 1 is put in front"
             fixed = f"{fixed}; {axes}" if fixed else axes
@@ -272,6 +279,16 @@ def _check_program(described: Description) -> None:
         )
 
 
+def _without_batch(model: Any, declared: Mapping[str, tuple[int | str, ...]]) -> dict[str, tuple[int | str, ...]]:
+    """Return the inputs that a description gives a batch axis of 1 which the file lacks, without it."""
+    ranks = {value.name: len(value.type.tensor_type.shape.dim) for value in model.graph.input}
+    return {
+        name: shape[1:]
+        for name, shape in declared.items()
+        if shape[:1] == (1,) and len(shape) == ranks.get(name, 0) + 1
+    }
+
+
 def _tensors(values: Iterable[Any]) -> tuple[TensorSpec, ...]:
     return tuple(_tensor(value) for value in values)
 
@@ -308,5 +325,5 @@ def _named_after(source: GraphSource, copy: Path) -> Iterator[None]:
     except InputError as error:
         error.message = error.message.replace(str(copy), str(source.model))
         if error.fix == REMEDY.format(package=engine_class().package):  # it was not made by vlatool
-            error.fix = source.where_made
+            error.fix = OTHER_BRANCH if "Op (If)" in error.message else source.where_made
         raise
