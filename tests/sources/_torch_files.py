@@ -107,7 +107,7 @@ def bundle_of(path: Path, out: Path, **options: Any) -> Bundle:
     """Run the source of a path as a command does."""
     stage = source_stage(str(path))
     stage = stage.model_copy(update=options)
-    return run_transform(stage, None, out, Context())
+    return run_transform(stage, None, out, Context()).bundle
 
 
 def assert_same(bundle: Bundle, expected: Any, count: int = 50, allowed: float = 1e-4) -> None:

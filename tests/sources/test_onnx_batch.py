@@ -17,7 +17,7 @@ def bundle_of(folder: Path, text: str, said: list[str] | None = None) -> Bundle:
     onnx.save(onnx.parser.parse_model(HEAD + text), folder / "a.onnx")
     (folder / "out").mkdir()
     tell = Context((lambda words, _share: said.append(words)) if said is not None else Context().progress)
-    return OnnxFile(model=folder / "a.onnx").run(None, folder / "out", tell)
+    return OnnxFile(model=folder / "a.onnx").run(None, folder / "out", tell).bundle
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_such_a_file_is_converted_to_another_opset(tmp_path: Path):
     text = "g (float[3,5] x, float[5] z) => (float[3,5] y) { y = Add(x, z) }"
     onnx.save(onnx.parser.parse_model(HEAD + text), tmp_path / "a.onnx")
     (tmp_path / "out").mkdir()
-    made = OnnxFile(model=tmp_path / "a.onnx", opset=18).run(None, tmp_path / "out", Context())
+    made = OnnxFile(model=tmp_path / "a.onnx", opset=18).run(None, tmp_path / "out", Context()).bundle
     assert made.manifest.graphs["main"].opset == 18
 
 
@@ -82,7 +82,7 @@ def test_a_description_of_a_file_without_batch_axes(tmp_path: Path) -> None:
     )
     (tmp_path / "out").mkdir()
     source = OnnxFile(model=tmp_path / "net.onnx", policy=tmp_path / "policy.yaml")
-    bundle = source.run(None, tmp_path / "out", Context())
+    bundle = source.run(None, tmp_path / "out", Context()).bundle
     state = np.random.default_rng(0).normal(size=(2, 1, 4)).astype(np.float32)
     outputs = load(bundle.path, threads=1).infer({"state": state}).outputs
     np.testing.assert_array_equal(outputs["action"][0], np.maximum(state, 0))

@@ -48,7 +48,7 @@ def new(
     stage = stage.model_copy(update={"shape": tuple(shape or ()), "control_hz": control_hz})
     stage.check(None, None)
     with progress() as context:
-        bundle = cached_transform(stage, None, cache_directory(), context)
+        bundle = cached_transform(stage, None, cache_directory(), context).bundle
     manifest = bundle.manifest
     text = proposal(manifest, stage.model.name)
     with write_directory(policy) as draft:
@@ -57,7 +57,7 @@ def new(
         if (assets := bundle.path / "assets").is_dir():
             shutil.copytree(assets, draft, dirs_exist_ok=True)
         (draft / "policy.yaml").write_text(text, encoding="utf-8")
-    if stage.runs(None):  # the copy of what was trusted
+    if stage.holds_code:  # the copy of what was trusted
         trust.trust(policy / stage.model.name)
     if as_json:
         document({"policy": str(policy), "source": source, "unknown": list(manifest.spec.unknown())})

@@ -15,7 +15,7 @@ from vlatool.errors import SourceError
 from vlatool.module.description import Description, file_source
 from vlatool.module.foreign_files import foreign, foreign_format
 from vlatool.registry import Claim
-from vlatool.stage.base import Transform
+from vlatool.stage.base import Stage, Transform
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -61,6 +61,10 @@ class Source(Transform):
         """Return the same source with the ``policy.yaml`` that names it."""
         return self.model_copy(update={"policy": description})
 
+    def trust_code(self) -> Self:
+        """Allow the policy's code to run in this process: the user typed its folder."""
+        return self
+
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Return the same source with the options that the build record of a bundle has for it.
 
@@ -94,6 +98,13 @@ def claimed_source(typed: str | Path) -> Source | None:
         return None
     found = source.of(str(named))
     return found if described is None else found.described_by(described)
+
+
+def trust_policies(stage: Stage) -> None:
+    """Let the code of the policies that options of a stage name run in this process: the user typed them."""
+    for policy in (getattr(stage, name) for name in stage.policies):
+        if policy and (source := claimed_source(policy)):
+            source.trust_code()
 
 
 def source_of_policy(typed: str | Path) -> Source:

@@ -34,9 +34,10 @@ from vlatool.sources._onnx_batch import add_batch_axes
 from vlatool.sources._onnx_ends import complete_outputs, refuse_types
 from vlatool.sources._onnx_files import WHERE_MADE
 from vlatool.sources._onnx_plain import plain
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, Result
 from vlatool.stage.finish import SEED, finish
 from vlatool.stage.precision_shares import count_shares
+from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -58,12 +59,13 @@ class GraphSource(Source):
     A source of this kind says where the graph comes from and what it is compared with (``read``).
     """
 
+    holds_code: ClassVar[bool] = False
+    """Whether the file may hold code, so that it is opened only where it was trusted by name."""
     where_made: ClassVar[str] = WHERE_MADE
     """What helps against a graph that ONNX Runtime refuses."""
     where_differs: ClassVar[str] = "leave --opset out, or export the file again where it was made"
     """What helps against a graph that computes something else than the file."""
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
-    runs_graphs: ClassVar[bool] = True
 
     model: Path = Field(description="the file, or the directory, that holds the policy")
     policy: Path | None = Field(
@@ -122,9 +124,8 @@ class GraphSource(Source):
         """
         raise NotImplementedError
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Result:
         """Read the graph, store it, and run it."""
-        self.check(None, None)
         description = self.describe()
         if description is not None:
             _check_program(description)
@@ -143,12 +144,14 @@ class GraphSource(Source):
         manifest = described.manifest()
         options = {"opset": self.opset, "shape": list(self.shape)}
         given = {name: value for name, value in options.items() if value}
-        made_by = {**self.made_by(), "options": {"model": self.model.name, **given}}
+        recorded = {**made_by(self), "options": {"model": self.model.name, **given}}
         with _named_after(self, file):
-            opset = self._store(model, out, manifest, changes, context)
+            opset, stored = self._store(model, out, manifest, changes)
             observations = observations_for(Bundle(out, manifest), 2)
-            graphs = {"main": Graph("graphs/main.onnx", count_shares(file, context), opset)}
-            return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
+            shares, uncounted = count_shares(file)
+            graphs = {"main": Graph("graphs/main.onnx", shares, opset)}
+            made = finish(Bundle(out, manifest), out, made_by=recorded, graphs=graphs, observations=observations)
+            return Result(made, (*changes.messages, *stored, *uncounted))
 
     def _prepare(self, model: Any, description: Description | None, context: Context) -> _Changes:
         """Bring types and axes into the form that stages take, in place."""
@@ -158,8 +161,7 @@ class GraphSource(Source):
                 f"--shape is given, and {self.policy} says the shapes of all inputs.",
                 "leave --shape out, or change them there",
             )
-        if gone := as_float32(model):
-            context.messages.append(describe_conversion(gone))
+        gone = as_float32(model)
         declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
         unbatched = _without_batch(model, declared or {})
         fixed = axes_text(
@@ -171,10 +173,11 @@ class GraphSource(Source):
             fixed = f"{fixed}; {axes}" if fixed else axes
         if fixed:
             context.progress(fixed, None)
-        return _Changes(further, max(TOLERANCE, *(ROUNDING.get(kind, 0) for kind in gone), 0))
+        tolerance = max(TOLERANCE, *(ROUNDING.get(kind, 0) for kind in gone), 0)
+        return _Changes(further, tolerance, (describe_conversion(gone),) if gone else ())
 
-    def _store(self, model: Any, out: Path, manifest: Manifest, changes: _Changes, context: Context) -> int:
-        """Write the graph, in the opset that is asked for or that stages need; return its opset.
+    def _store(self, model: Any, out: Path, manifest: Manifest, changes: _Changes) -> tuple[int, tuple[str, ...]]:
+        """Write the graph, in the opset that is asked for or that stages need; return its opset, and what was done.
 
         Raises:
             GraphError: when ONNX Runtime refuses it.
@@ -184,20 +187,20 @@ class GraphSource(Source):
         wanted = self.opset or max(opset, MIN_OPSET if opset else 0)
         save(model, file)
         before, unbatched = self._before(file, changes)
+        stays: tuple[str, ...] = ()
         if wanted != opset:
             try:
                 save(with_opset(model, wanted), file)
                 self._compare(before, unbatched, out, manifest, changes.tolerance)
-                context.messages.append(f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations")
-                return wanted
+                return wanted, (f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations",)
             except InputError as error:
                 if self.opset:
                     raise
                 words = f"opset {opset} stays, in which nothing can be quantized to int8 ({MIN_OPSET} or later): "
-                context.messages.append(f"{words}{error.message}")
+                stays = (f"{words}{error.message}",)
                 save(model, file)
         self._compare(before, unbatched, out, manifest, changes.tolerance)
-        return opset
+        return opset, stays
 
     def _before(self, file: Path, changes: _Changes) -> tuple[Any, list[str]]:
         """Open the file itself, or where ONNX Runtime refuses it what is written of it; and what has no batch axis."""
@@ -260,11 +263,13 @@ class _Changes:
     Args:
         further: Inputs and outputs that were given a batch axis.
         tolerance: Relative L2 difference that this may make.
+        messages: Sentences on it.
         reference: What runs the policy itself; None where the file does.
     """
 
     further: list[str]
     tolerance: float = TOLERANCE
+    messages: tuple[str, ...] = ()
     reference: Any = None
 
 

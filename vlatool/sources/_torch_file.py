@@ -59,6 +59,7 @@ class TorchFile(GraphSource):
 
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
     imports: ClassVar[tuple[str, ...]] = IMPORTS
+    holds_code: ClassVar[bool] = True
     where_made: ClassVar[str] = BUILD_IT
     where_differs: ClassVar[str] = (
         "look for what forward() keeps from call to call: let it take and return that, and keep it in the program of a "
@@ -66,10 +67,6 @@ class TorchFile(GraphSource):
     )
     holds: ClassVar[Kind]
     """What the file must be."""
-
-    def runs(self, source: Bundle | None) -> str:
-        """The code in the file."""
-        return self.model.name
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The file is what it should be, as its bytes say; it is trusted; and torch is installed."""
