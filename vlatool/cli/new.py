@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from vlatool.bundle.spec import UNKNOWN
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document
@@ -43,6 +44,9 @@ def new(
 
     refuse_existing(policy, False, source, kind="")
     stage = source_stage(source)
+    if (converted := stage.converted_directory()) is not None:
+        _copy(converted, policy, control_hz, as_json, source)
+        return
     if stage.describe() is not None or not isinstance(stage, GraphSource):
         raise UsageError(f"{source} has a policy.yaml already.", "name it as it is: vlatool optimize SOURCE -o BUNDLE")
     stage = stage.model_copy(update={"shape": tuple(shape or ()), "control_hz": control_hz})
@@ -61,6 +65,24 @@ def new(
         trust.trust(policy / stage.model.name)
     if as_json:
         document({"policy": str(policy), "source": source, "unknown": list(manifest.spec.unknown())})
+        return
+    typer.echo(text, nl=False)
+    typer.echo(f"{policy}: complete policy.yaml, then: vlatool optimize {policy} -o BUNDLE")
+
+
+def _copy(converted: Path, policy: Path, control_hz: float | None, as_json: bool, source: str) -> None:
+    """Write the directory that a checkpoint was converted into, with the rate that was given."""
+    from vlatool.module.description import FILE, read_description
+
+    with write_directory(policy) as draft:
+        shutil.copytree(converted, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*", "__pycache__"))
+        text = (draft / FILE).read_text(encoding="utf-8")
+        if control_hz is not None:
+            text = text.replace(f"control_hz: {UNKNOWN}", f"control_hz: {control_hz:g}")
+            (draft / FILE).write_text(text, encoding="utf-8")
+    if as_json:
+        unknown = list(read_description(policy).spec.unknown())
+        document({"policy": str(policy), "source": source, "unknown": unknown})
         return
     typer.echo(text, nl=False)
     typer.echo(f"{policy}: complete policy.yaml, then: vlatool optimize {policy} -o BUNDLE")
