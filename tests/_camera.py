@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _shared import once
 from _tiny import ENVIRONMENT_PY, POLICY_PY, POLICY_YAML, observations, with_expert, write_policy
 
 IMAGE = """{frame: bgr, like: opencv, range: [-1, 1], camera: [16, 20], steps: [
@@ -38,3 +39,31 @@ def write_camera_policy(folder: Path) -> Path:
         recorded = observations(count, seed) | {"image": frames(count, seed)}
         np.savez(folder / f"{name}.npz", **with_expert(recorded, folder))
     return folder
+
+
+def camera_source() -> Any:
+    """Its source bundle; read only."""
+    from vlatool.sources.torch_module import TorchModule
+    from vlatool.user_code import trust
+
+    policy = once("camera", write_camera_policy)
+    trust.allow(policy)
+    return _bundle("camera-source", TorchModule(policy=policy), None)
+
+
+def camera_bundle() -> Any:
+    """The policy as exported, float32; read only."""
+    from vlatool.export.onnx import ExportOnnx
+
+    return _bundle("camera-float", ExportOnnx(), camera_source())
+
+
+def _bundle(name: str, stage: Any, source: Any) -> Any:
+    from vlatool.bundle.bundle import Bundle
+    from vlatool.stage.base import Context
+
+    def make(folder: Path) -> None:
+        (folder / "bundle").mkdir(parents=True)
+        stage.run(source, folder / "bundle", Context())
+
+    return Bundle.open(once(name, make) / "bundle")

@@ -5,43 +5,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from _camera import frames, write_camera_policy
-from _shared import once
+from _camera import camera_bundle, camera_source, frames
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Drawer, random_observations, read_recording, recorded_observations, synthetic_observations
 from vlatool.data._calibration_checks import calibration_checks
 from vlatool.errors import DataError
 from vlatool.evaluate.recorded import Recorded
-from vlatool.export.onnx import ExportOnnx
 from vlatool.module.feeds import recorded_inputs
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.runtime.golden import load_goldens
-from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
-from vlatool.user_code import trust
 
 
 @pytest.fixture(scope="session")
 def source() -> Bundle:
-    policy = once("camera", write_camera_policy)
-    trust.allow(policy)
-
-    def make(folder: Path) -> None:
-        (folder / "bundle").mkdir(parents=True)
-        TorchModule(policy=policy).run(None, folder / "bundle", Context())
-
-    return Bundle.open(once("camera-source", make) / "bundle")
+    made: Bundle = camera_source()
+    return made
 
 
 @pytest.fixture(scope="session")
-def exported(source: Bundle) -> Bundle:
-    def make(folder: Path) -> None:
-        (folder / "bundle").mkdir(parents=True)
-        ExportOnnx().run(source, folder / "bundle", Context())
-
-    return Bundle.open(once("camera-float", make) / "bundle")
+def exported() -> Bundle:
+    made: Bundle = camera_bundle()
+    return made
 
 
 def seen(frame: Any) -> Any:

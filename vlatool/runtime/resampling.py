@@ -66,11 +66,11 @@ class _Scratch(threading.local):
     """Memory that each thread uses again for the next picture: what is new to a process costs it more than the work."""
 
     def __init__(self) -> None:
-        self._arrays: dict[str, Planes] = {}
+        self._arrays: dict[str, Array] = {}
 
-    def __call__(self, name: str, *shape: int) -> Planes:
+    def __call__(self, name: str, *shape: int, dtype: type[np.generic] = np.float32) -> Array:
         if name not in self._arrays or self._arrays[name].shape != shape:
-            self._arrays[name] = np.empty(shape, np.float32)
+            self._arrays[name] = np.empty(shape, dtype)
         return self._arrays[name]
 
 
@@ -231,13 +231,17 @@ def _pil(kind: str, n: int, m: int) -> tuple[Taps, int]:
 
 
 def _pil_order(library: str, axes: Sequence[tuple[int, int]]) -> bool:
-    """Return whether PIL resizes the rows first: from version 13 on, where they shrink more than the columns."""
+    """Return whether PIL resizes the rows first: from version 13 on, where it takes away many more of them."""
     (height, rows), (width, columns) = axes
-    return library == "pil13" and rows < height and rows * width < columns * height
+    return library == "pil13" and height - rows > max(0, 2 * (width - columns))
 
 
 def _torch_uint8(kind: str, antialias: bool, n: int, m: int) -> tuple[Taps, int]:
     index, weights = _growing(kind, n, m) if antialias else _fixed(kind, n, m)
+    for tap in range(1, weights.shape[1]):  # what counts again beyond an edge is one weight before it is rounded
+        again = index[:, tap] == index[:, tap - 1]
+        weights[again, tap] += weights[again, tap - 1]
+        weights[again, tap - 1] = 0
     bits = 0
     while bits < 22 and 0.5 + weights.max() * (1 << (bits + 1)) < 1 << 15:
         bits += 1
@@ -329,18 +333,27 @@ class _OpenCvLinear:
         self._columns = _FloatPass((index, _eleven_bits(part)))
         first, part = _positions(height, rows, area)
         pairs = np.clip(np.stack([first, first + 1]), 0, height - 1)
-        self._needed = np.unique(pairs)
-        self._pairs = np.searchsorted(self._needed, pairs)
+        needed = np.unique(pairs)
+        self._needed = needed if 2 * len(needed) < height else None  # to choose rows costs more than a few too many
+        self._pairs = pairs if self._needed is None else np.searchsorted(needed, pairs)
         self._weights = _eleven_bits(part).T[:, :, None, None].astype(np.int32)
         self._scratch = _Scratch()
 
     def __call__(self, picture: Array) -> Array:
-        scratch, rows, channels = self._scratch, len(self._needed), picture.shape[2]
-        planes = _planes(picture[self._needed], scratch("planes", channels, rows, picture.shape[1]))
+        picture = picture if self._needed is None else picture[self._needed]
+        scratch, (rows, columns, channels) = self._scratch, picture.shape
+        planes = _planes(picture, scratch("planes", channels, rows, columns))
         sums = self._columns(planes, scratch("half", self._columns.size, channels, rows), scratch)
         sums *= 1 / 16
-        shifted = sums.transpose(2, 0, 1).astype(np.int32, "C")
-        below, above = (shifted[at] * weight >> 16 for at, weight in zip(self._pairs, self._weights, strict=True))
+        shifted = scratch("shifted", rows, self._columns.size, channels, dtype=np.int32)
+        shifted[...] = sums.transpose(2, 0, 1)
+        shape = (self._pairs.shape[1], *shifted.shape[1:])
+        pair = [scratch(name, *shape, dtype=np.int32) for name in ("below", "above")]
+        for part, at, weight in zip(pair, self._pairs, self._weights, strict=True):
+            np.take(shifted, at, axis=0, out=part, mode="clip")
+            part *= weight
+            part >>= 16
+        below, above = pair
         below += above
         below += 2
         below >>= 2
