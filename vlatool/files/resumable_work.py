@@ -88,9 +88,6 @@ class Store:
     """Finished parts of a run: key -> JSON value, each in a file that is written atomically.
 
     Several runs may use it at a time. Where it cannot be written, the run goes on without it, and ``problem`` says why.
-
-    Args:
-        folder: folder of the files.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -42,10 +42,8 @@ class OutputAgreement:
 
     Args:
         kind: kind of the observations (``data.Drawn.kind``).
-        output: its name.
         correlation: over observations and elements, each by the baseline's spread: 1 gives the same everywhere, 0 is
             what a constant reaches, -1 is its opposite.
-        samples: observations.
     """
 
     kind: str

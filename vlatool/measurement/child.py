@@ -82,7 +82,6 @@ def ask(
         kind: type of its answer.
         about: subject of the question, for errors.
         timeout: seconds; endless when None.
-        limits: limits of the process.
 
     Raises:
         VlatoolError: what the process raised, of the same class; GraphError when it ended in another way or answered
@@ -129,7 +128,6 @@ def read_line(text: str, check: Callable[[Any], Any] = lambda value: value) -> M
     """Return the message of a line; None for what an engine prints, and for a line that was not written to its end.
 
     Args:
-        text: line of text.
         check: function called with its JSON values, and returns those that are read.
     """
     try:

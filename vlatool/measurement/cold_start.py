@@ -63,7 +63,6 @@ def cold_start(
 
     Args:
         bundle, engine, threads: bundle to load, with which engine and threads.
-        limits, timeout: limits and timeout of the process.
         observations: file of observations (``save_drawn``) to infer on after the golden one.
 
     Raises:

@@ -67,7 +67,6 @@ class WorkerJob:
     """What the agent asks of the worker.
 
     Args:
-        job: job of the benchmark.
         named: folders whose code the user lets run (``trust.named_folders``).
     """
 

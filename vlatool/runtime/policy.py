@@ -309,7 +309,6 @@ def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
     """Refuse a bundle in which a stage found something wrong.
 
     Args:
-        bundle: Open bundle.
         accept: Names of accepted findings.
 
     Raises:

@@ -374,7 +374,6 @@ def exact_drop(
 
     Args:
         lost, won, pairs: Counts; pairs from 1.
-        confidence: Confidence of the interval.
         size: Independent pairs that they are worth (``starts.independent``); all of them when None.
 
     Example:
