@@ -1,8 +1,11 @@
 """What a spec may say of an image, what it may not, and in which version of the manifest it stands."""
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from vlatool.bundle.image import Image, ImageStep
 from vlatool.bundle.manifest import Manifest
@@ -115,6 +118,13 @@ def test_an_impossible_image_is_refused_with_the_reason(image: Any, words: str):
 def test_an_input_that_no_image_can_be_is_refused(more: dict[str, Any], words: str):
     with pytest.raises(SpecError, match=words):
         TensorSpec.from_dict({"name": "top", "shape": [1, 3, 224, 224], "dtype": "float32", **more})
+
+
+def test_the_examples_of_the_guide_are_inputs():
+    text = (Path(__file__).parents[2] / "docs/guides/your-own-policy.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```yaml\n(- name: .*?)```", text, re.DOTALL)
+    inputs = [TensorSpec.from_dict(entry) for block in blocks for entry in yaml.safe_load(block)]
+    assert [each.observation.shape for each in inputs] == [(1, 480, 640, 3)] * 2
 
 
 def test_an_output_is_no_image():
