@@ -89,7 +89,7 @@ class Manifest:
         description: one sentence.
         license: SPDX identifier of the policy's licence.
         engine: engine that the graphs were made for; ONNX Runtime on the CPU when empty.
-        schema: version of this format: 2 when an input has an ``image``, else 1.
+        schema: version of this format: 2 with an ``image``, an ``epsilon`` or ``quantile10``, else 1.
     """
 
     name: str
@@ -154,8 +154,8 @@ class Manifest:
         values["spec"] = PolicySpec.from_dict(values["spec"])
         if values["spec"].schema > values["schema"]:
             raise BundleError(
-                f"The manifest has the schema {values['schema']}, but an input with an 'image', which begins with "
-                f"{values['spec'].schema}."
+                f"The manifest has the schema {values['schema']}, but an 'image', 'epsilon' or 'quantile10', which "
+                f"begin with {values['spec'].schema}."
             )
         values["graphs"] = {name: _graph(name, graph) for name, graph in values.get("graphs", {}).items()}
         values["program"] = program_from(values.get("program", []))

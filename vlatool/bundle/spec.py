@@ -11,22 +11,23 @@ from vlatool.bundle.image import Image
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values, to_json
-from vlatool.files.validate import integer, path_problem, short_repr, text
+from vlatool.files.validate import finite_number, integer, path_problem, short_repr, text
 
 DTYPES = (
     "float32", "float16", "int64", "int32", "uint8", "bool", "float64", "int8", "int16", "uint16", "uint32", "uint64",
 )  # fmt: skip
 KINDS = ("tensor", "text", "discrete")
-NORMALISATIONS = ("none", "mean_std", "min_max", "quantiles")
-STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99")}
+STATISTICS_OF = {
+    "none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99"),
+    "quantile10": ("q10", "q90"),
+}  # fmt: skip
+NORMALISATIONS = tuple(STATISTICS_OF)
 MODES = ("", "delta", "absolute", "velocity", "relative")
 MAX_INDICES = 2**18
 """Most labels that are generated for a discrete output without labels: more than any token vocabulary has."""
 
 
 MAX_HZ = 100_000
-IMAGES = 2
-"""The version of the manifest from which on inputs have an ``image``."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class TensorSpec:
         labels: names of the elements of the last axis; the indices for a discrete output without names.
         mode: way in which a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
         normalisation: mapping from physical values to the graph's values, and back for outputs: ``none``, ``mean_std``,
-            ``min_max`` or ``quantiles``.
+            ``min_max``, ``quantiles`` or ``quantile10``.
         statistics: ``file#key`` of the statistics that the normalisation needs; file relative to the assets.
         tokenizer: file of the tokenizer, relative to the assets (``kind: text``).
         max_tokens: number of ids that the tokenizer pads or cuts to (``kind: text``).
@@ -51,6 +52,8 @@ class TensorSpec:
             a depth image; in any other input they are refused.
         image: what a camera frame becomes before the network: the observation then holds a raw frame, uint8 (H, W, C)
             or (H, W) of any size; None for an input that is given as the graph sees it.
+        epsilon: added to a std on the way in, and put for a range of 0, as LeRobot does with 1e-8: an element that
+            never moved in training then has statistics, too. 0 refuses it.
     """
 
     name: str
@@ -66,6 +69,7 @@ class TensorSpec:
     max_tokens: int = 0
     finite: bool = True
     image: Image | None = None
+    epsilon: float = 0.0
 
     def __post_init__(self) -> None:
         self._check_words()
@@ -75,6 +79,12 @@ class TensorSpec:
             raise SpecError(
                 f"'{self.name}' is normalised by {self.normalisation}, but 'statistics' is '{self.statistics}'.",
                 "name the statistics as FILE#KEY, for example statistics.json#proprio",
+            )
+        epsilon = finite_number(self.epsilon, f"The epsilon of '{self.name}'", SpecError)
+        if not 0 <= epsilon < 1 or (epsilon and self.normalisation == "none"):
+            raise SpecError(
+                f"'{self.name}' has epsilon {epsilon:g} and normalisation {self.normalisation}; allowed: 0 to 1, and "
+                "above 0 with a normalisation."
             )
         for file in self.assets():
             if reason := path_problem(file):
@@ -178,6 +188,11 @@ class TensorSpec:
         return replace(self, shape=shape, dtype="uint8", image=None, unit="", labels=())
 
     @property
+    def schema(self) -> int:
+        """The first version of the manifest that has all that this tensor says."""
+        return 2 if self.image or self.epsilon or self.normalisation == "quantile10" else 1
+
+    @property
     def frame(self) -> str:
         """Order of the channels of the frames that observations have, empty where they have none."""
         return self.image.frame if self.image else ""
@@ -273,7 +288,7 @@ class PolicySpec:
     @property
     def schema(self) -> int:
         """The first version of the manifest that has all that this spec says."""
-        return IMAGES if any(tensor.image for tensor in self.inputs) else 1
+        return max(tensor.schema for tensor in (*self.inputs, *self.outputs))
 
     @property
     def action(self) -> TensorSpec:
