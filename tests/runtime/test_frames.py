@@ -1,5 +1,6 @@
 """Frames -> what the network sees, against the arithmetic of the libraries, and frames that are none."""
 
+import importlib
 import sys
 from typing import Any
 
@@ -86,6 +87,16 @@ def test_a_colour_is_the_grey_of_pil():
     raw = frame(24, 32, 3)
     got = encode({"frame": "bgr", "channels": "grey"}, raw[:, :, ::-1], (1, 1, 24, 32), "uint8")
     assert np.array_equal(got[0, 0], np.asarray(pil.fromarray(raw).convert("L")))
+
+
+def test_an_opacity_is_untouched_where_the_size_stays():
+    pil = pytest.importorskip("PIL.Image")
+    raw, version = frame(48, 32, 4), int(importlib.import_module("PIL").__version__.partition(".")[0])
+    for size in ((48, 32), (24, 32), (20, 50)):
+        image = {"frame": "rgba", "channels": "rgba", "layout": "hwc", "like": "pil13" if version > 12 else "pil",
+                 "steps": [{"op": "resize", "size": list(size), "filter": "bicubic"}]}  # fmt: skip
+        wanted = np.asarray(pil.fromarray(raw).resize(size[::-1], pil.BICUBIC))
+        assert np.array_equal(encode(image, raw, (1, *size, 4), "uint8")[0], wanted)
 
 
 def test_a_border_has_the_colour_that_it_is_given():

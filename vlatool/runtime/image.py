@@ -163,8 +163,10 @@ def _step(step: ImageStep, image: Image, before: tuple[int, int]) -> Step:
         return lambda picture: picture[top : top + rows, left : left + columns]
     if step.op == "pad":
         return partial(_pad, step=step, corner=step.border(before))
-    resize = resampler(image.like, step.filter, step.antialias, before, step.size_after(before, image.like))
-    if ORDERS[image.channels] == 4 and image.like.startswith("pil") and step.filter != "nearest":
+    after = step.size_after(before, image.like)
+    resize = resampler(image.like, step.filter, step.antialias, before, after)
+    opaque = ORDERS[image.channels] < 4 or step.filter == "nearest" or before == after
+    if image.like.startswith("pil") and not opaque:
         return lambda picture: _unmultiplied(resize(_premultiplied(picture)))
     return resize
 

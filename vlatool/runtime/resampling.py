@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 Planes = NDArray[np.float32]
 Taps = tuple[NDArray[np.int64], Floats]
 """Indices (n, taps) of the elements that each result is a sum of, and their weights (n, taps)."""
-BLOCK = 16
+BLOCK = 8
 """Results of an axis that one product of matrices gives."""
 EXACT = 1 << 24
 """Integers below are exact in float32."""
