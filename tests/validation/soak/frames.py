@@ -15,7 +15,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -215,9 +215,8 @@ def draw(like: str, random: np.random.Generator) -> Case:
         image = Image(order, channels, "hwc", like, steps, camera=(height, width))
         try:
             size = image.size_after((height, width))
-            if 1 in Image(order, channels, "hwc", like, steps[: 1 + (steps[0].op == "crop")]).size_after(
-                (height, width)
-            ):
+            resized = replace(image, steps=steps[: 1 + (steps[0].op == "crop")]).size_after((height, width))
+            if 1 in resized:
                 continue
         except ValueError:  # a crop that is larger than the frame
             continue
