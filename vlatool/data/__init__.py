@@ -18,11 +18,16 @@ from vlatool.data._random_observations import Drawer as Drawer
 from vlatool.data._random_observations import Drawn as Drawn
 from vlatool.data._random_observations import read_drawn as read_drawn
 from vlatool.data._random_observations import save_drawn as save_drawn
+from vlatool.data._reader import MAP_HELP as MAP_HELP
+from vlatool.data._reader import NamedRecording as NamedRecording
 from vlatool.data._reader import Reader as Reader
+from vlatool.data._reader import named_recording as named_recording
 from vlatool.data._reader import read_recording as read_recording
+from vlatool.data._reader import reader_of as reader_of
 from vlatool.data._recording import Moment as Moment
 from vlatool.data._recording import Recording as Recording
 from vlatool.data._recording import build_recording as build_recording
+from vlatool.data._sampling import sampled_rows as sampled_rows
 from vlatool.data._selections import PURPOSES as PURPOSES
 from vlatool.data._selections import calibration_recording as calibration_recording
 from vlatool.data._selections import carries_evaluation as carries_evaluation
@@ -30,6 +35,8 @@ from vlatool.data._selections import carry_recording as carry_recording
 from vlatool.data._selections import evaluation_recording as evaluation_recording
 from vlatool.data._selections import is_of_recording as is_of_recording
 from vlatool.data._selections import recordings_of as recordings_of
+from vlatool.data._steps import StepReader as StepReader
+from vlatool.data._steps import Steps as Steps
 from vlatool.data._training_observations import BEGINS as BEGINS
 from vlatool.data._training_observations import MAX_PLAYED as MAX_PLAYED
 from vlatool.data._training_observations import OBSERVATIONS_FILE as OBSERVATIONS_FILE

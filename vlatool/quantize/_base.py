@@ -17,7 +17,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.module_bundle import no_graph_error
-from vlatool.data import calibration_recording, observations_for
+from vlatool.data import NamedRecording, calibration_recording, named_recording, observations_for
 from vlatool.errors import BundleError, RecipeError, fix_for, suggest
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import foreign_errors, load, read, save, split_phases
@@ -135,9 +135,9 @@ class Quantization(Transform):
         )  # fmt: skip
 
     @property
-    def recording(self) -> Path | None:
+    def recording(self) -> NamedRecording | None:
         """Recording of the golden observations; the bundle's own when None."""
-        return getattr(self, "calibration", None)
+        return named_recording(getattr(self, "calibration", None), getattr(self, "map", ()))
 
     def golden_observations(self, bundle: Bundle) -> list[dict[str, Any]]:
         """Return observations to compare the new bundle with the old one on; the first become golden.

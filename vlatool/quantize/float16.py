@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Moment, calibration_recording, synthetic_observations
+from vlatool.data import MAP_HELP, Moment, calibration_recording, synthetic_observations
 from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import check_opset
@@ -49,6 +49,7 @@ class Float16(Quantization):
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
 
     calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
+    map: tuple[str, ...] = Field((), description=MAP_HELP)
     samples: int = Field(16, ge=1, description="samples on which values beyond float16 are looked for")
 
     def inputs(self) -> tuple[Path, ...]:
@@ -67,7 +68,7 @@ class Float16(Quantization):
             candidates += [node.name for node in model.graph.node]
         selected = self.select_nodes(candidates, bundle)
         samples = SampleSet()
-        recording = calibration_recording(bundle, self.calibration)
+        recording = calibration_recording(bundle, self.recording)
 
         def observations(samples: SampleSet) -> Iterable[Moment | Mapping[str, Any]]:
             if recording is None:

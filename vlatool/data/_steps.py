@@ -1,0 +1,174 @@
+"""Datasets of one step a row: what their readers have in common, and how a recording for a policy is made of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.data._reader import Reader
+from vlatool.data._recording import Recording, Values, build_recording
+from vlatool.data._windows import with_windows
+from vlatool.errors import DataError, fix_for, suggest
+from vlatool.files.limits import check_limit
+from vlatool.files.rows import in_memory
+
+Array = NDArray[Any]
+PART = re.compile(r"(?P<name>.+?)(?:\[(?P<first>\d{1,9})?(?P<colon>:)?(?P<end>\d{1,9})?\])?")
+SEPARATORS = re.compile(r"[./]")
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What a dataset holds, a row for each step of its episodes, which follow each other.
+
+    Args:
+        columns: Name -> (N, ...): pictures as recorded, uint8 (height, width, channels); vectors; texts as unicode.
+        episodes: (N,) int64, the episode of each row.
+        times: (N,) float64 seconds; None where the format has none.
+        action: Column of the actions, one for each row; empty where there is none.
+        hz: Rate that the dataset names; 0 where it names none.
+        tasks: (N,) number of the task of each row; None where the dataset names none.
+        notes: Sentences on what is unusual.
+    """
+
+    path: Path
+    columns: Mapping[str, Values]
+    episodes: Array
+    times: Array | None = None
+    action: str = ""
+    hz: float = 0.0
+    tasks: Array | None = None
+    notes: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        """Refuse columns of different lengths, and none at all."""
+        count = len(self.episodes)
+        if not count:
+            raise DataError(f"{self.path} holds no samples.", "record an episode of one step or more")
+        check_limit("recorded_steps", count, str(self.path), DataError)
+        lengths = {name: len(values) for name, values in self.columns.items() if len(values) != count}
+        if lengths:
+            raise DataError(
+                f"{self.path} has different numbers of samples: {lengths}; its episodes have {count} steps.",
+                "each column needs one row a step",
+            )
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def column(self, named: str) -> Values:
+        """Return a column, a part of one (``state[0:7]``, ``state[3]``), or several one after the other (``a+b``).
+
+        Raises:
+            DataError: when there is none of that name, or parts are taken of what is not a vector.
+        """
+        if named in self.columns:
+            return self.columns[named]
+        parts = [self._part(text.strip()) for text in named.split("+")]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+    def _part(self, text: str) -> Array:
+        match = PART.fullmatch(text)
+        name = match["name"] if match else text
+        if match is None or name not in self.columns:
+            raise DataError(f"{self.path} has no '{name}'; {suggest(name, self.columns)}.", fix_for(name, self.columns))
+        values = self.columns[name]
+        if values.ndim > 2 or values.dtype.kind not in "iufb":
+            raise DataError(
+                f"'{text}' is taken of '{name}' in {self.path}, which is {values.dtype} {list(values.shape)}.",
+                "take parts of vectors of numbers alone",
+            )
+        vector = in_memory(values).reshape(len(values), -1)
+        part = vector[:, _slice(match)]
+        if not part.shape[1]:
+            raise DataError(
+                f"'{text}' takes no element of '{name}' in {self.path}, which has {vector.shape[1]}.",
+                f"write {name}[FIRST:END], with END no more than {vector.shape[1]}",
+            )
+        return part
+
+
+def _slice(match: re.Match[str]) -> slice:
+    first, end = (int(match[name]) if match[name] else None for name in ("first", "end"))
+    if not match["colon"] and first is not None:
+        return slice(first, first + 1)
+    return slice(first, end)
+
+
+class StepReader(Reader):
+    """Reads datasets of one step a row; bundles carry a sample of them."""
+
+    carries_sample: ClassVar[bool] = True
+
+    def steps(self, path: Path) -> Steps:
+        """Return what a dataset holds; pictures are decoded when they are read.
+
+        Raises:
+            DataError: when it is corrupt.
+            MissingExtra: when the library of the format is not installed.
+        """
+        raise NotImplementedError
+
+    def open(self, path: Path, spec: PolicySpec, names: Mapping[str, str]) -> Recording:
+        """Open a recording; see ``recording_of``.
+
+        Raises:
+            DataError: when it is corrupt, or does not fit the spec.
+            MissingExtra: when the library of the format is not installed.
+        """
+        return recording_of(self.steps(path), spec, names)
+
+
+def recording_of(steps: Steps, spec: PolicySpec, names: Mapping[str, str]) -> Recording:
+    """Return the recording for a policy: its inputs by name, and the actions that follow each step.
+
+    An input is the column that ``names`` says, else that of its name, else the only one whose name ends with it
+    (``observation.state`` for ``state``); an instruction is the only text.
+
+    Raises:
+        DataError: when an input is not there, or does not fit the spec.
+    """
+    known = {*(tensor.name for tensor in spec.inputs), spec.action.name, "action"}
+    if unknown := sorted({*names} - known):
+        raise DataError(
+            f"A name is mapped that the policy does not have: '{unknown[0]}'; {suggest(unknown[0], known)}.",
+            fix_for(unknown[0], known),
+        )
+    arrays: dict[str, Values] = {tensor.name: _input(steps, tensor, names) for tensor in spec.inputs}
+    action = names.get(spec.action.name) or names.get("action") or steps.action
+    if action:
+        arrays["action"] = in_memory(steps.column(action))
+    arrays["episode"] = steps.episodes
+    return with_windows(build_recording(steps.path, arrays, spec, {}, steps.times))
+
+
+def _input(steps: Steps, tensor: TensorSpec, names: Mapping[str, str]) -> Values:
+    if tensor.name in names or tensor.name in steps.columns:
+        return steps.column(names.get(tensor.name, tensor.name))
+    texts = [name for name, values in steps.columns.items() if values.dtype.kind == "U"]
+    alike = [name for name in steps.columns if _last(name) == _last(tensor.name)]
+    found = texts if tensor.kind == "text" and len(texts) == 1 else alike
+    if len(found) != 1:
+        problem = f"has several for '{tensor.name}'" if found else f"has no '{tensor.name}'"
+        raise DataError(
+            f"{steps.path} {problem}; {suggest(tensor.name, found or steps.columns)}.",
+            f"say which one it is: --map {tensor.name}=NAME, or map: {{{tensor.name}: NAME}} in policy.yaml",
+        )
+    return steps.columns[found[0]]
+
+
+def _last(name: str) -> str:
+    """Return the last part of a name.
+
+    Example:
+        >>> _last("observation.images.top"), _last("obs/agentview_image")
+        ('top', 'agentview_image')
+    """
+    return SEPARATORS.split(name)[-1]
