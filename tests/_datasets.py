@@ -1,0 +1,148 @@
+"""Small datasets, written by the library of each format in the layout of the tool that records it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HZ = 10
+LENGTHS = (6, 9, 4)
+COUNT = sum(LENGTHS)
+EPISODES = np.repeat(np.arange(len(LENGTHS)), LENGTHS)
+FRAMES = np.concatenate([np.arange(length) for length in LENGTHS])
+STATE = np.stack([np.arange(COUNT), -np.arange(COUNT), EPISODES], 1).astype(np.float32)
+ACTION = np.stack([np.arange(COUNT) / 2, np.arange(COUNT) * 3], 1).astype(np.float32)
+TASKS = ("pick the cube", "place the cube")
+HEIGHT, WIDTH = 48, 64
+
+
+def picture(row: int, shift: int = 0) -> Any:
+    """A picture whose grey value says which row it is of: lossy codecs keep that."""
+    pixels = np.full((HEIGHT, WIDTH, 3), 20 + 10 * row, np.uint8)
+    pixels[:, WIDTH // 2 :] = 230 - 10 * row + shift
+    return pixels
+
+
+def row_of(pixels: Any) -> int:
+    """The row that a picture is of."""
+    return round((float(np.median(pixels[:, : WIDTH // 2 - 8])) - 20) / 10)
+
+
+def write_video(path: Path, rows: Sequence[int], codec: str = "libx264", gop: int = 4) -> None:
+    import av
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=HZ)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.codec_context.gop_size = gop
+        for row in rows:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(row), format="rgb24")))
+        container.mux(stream.encode())
+
+
+def png(pixels: Any) -> bytes:
+    import io
+
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def _features(kind: str) -> dict[str, Any]:
+    camera = {"dtype": kind, "shape": [HEIGHT, WIDTH, 3], "names": ["height", "width", "channels"]}
+    one = {"dtype": "int64", "shape": [1], "names": None}
+    return {
+        "observation.images.top": camera, "observation.images.wrist": camera,
+        "observation.state": {"dtype": "float32", "shape": [3], "names": ["a", "b", "c"]},
+        "action": {"dtype": "float32", "shape": [2], "names": ["x", "y"]},
+        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+        **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), one),
+    }  # fmt: skip
+
+
+def _table(rows: Any, kind: str) -> Any:
+    import pyarrow as pa
+
+    columns = {
+        "observation.state": pa.array(list(STATE[rows]), pa.list_(pa.float32(), 3)),
+        "action": pa.array(list(ACTION[rows]), pa.list_(pa.float32())),
+        "timestamp": pa.array((FRAMES[rows] / HZ).astype(np.float32)),
+        "frame_index": FRAMES[rows], "episode_index": EPISODES[rows], "index": rows, "task_index": EPISODES[rows] % 2,
+    }  # fmt: skip
+    if kind == "image":
+        cell = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        for camera in ("observation.images.top", "observation.images.wrist"):
+            columns[camera] = pa.array([{"bytes": png(picture(row)), "path": "x.png"} for row in rows.tolist()], cell)
+    return pa.table(columns)
+
+
+def _info(folder: Path, version: str, kind: str, **paths: Any) -> None:
+    info = {
+        "codebase_version": version, "robot_type": "arm", "total_episodes": len(LENGTHS), "total_frames": COUNT,
+        "total_tasks": 2, "chunks_size": 1000, "fps": HZ, "features": _features(kind), **paths,
+    }  # fmt: skip
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta/info.json").write_text(json.dumps(info))
+
+
+def lerobot_v3(folder: Path, kind: str = "video", codec: str = "libx264") -> Path:
+    """Two parquet files; the top camera's videos are two, those of the wrist camera one."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = "{0}/chunk-{{chunk_index:03d}}/file-{{file_index:03d}}.{1}"
+    videos = path.format("videos/{video_key}", "mp4")
+    _info(
+        folder, "v3.0", kind, data_path=path.format("data", "parquet"), video_path=videos if kind == "video" else None
+    )
+    places = {"data": [0, 1, 1], "top": [0, 0, 1], "wrist": [0, 0, 0]}
+    starts = {"top": [0.0, 0.6, 0.0], "wrist": [0.0, 0.6, 1.5]}
+    columns: dict[str, Any] = {
+        "episode_index": np.arange(3), "length": LENGTHS, "tasks": [[TASKS[at % 2]] for at in range(3)],
+        "data/chunk_index": [0] * 3, "data/file_index": places["data"],
+    }  # fmt: skip
+    for camera in ("top", "wrist") if kind == "video" else ():
+        name = f"videos/observation.images.{camera}"
+        columns |= {f"{name}/chunk_index": [0] * 3, f"{name}/file_index": places[camera]}
+        columns[f"{name}/from_timestamp"] = starts[camera]
+        for number in {*places[camera]}:
+            rows = np.flatnonzero(np.isin(EPISODES, np.flatnonzero(np.array(places[camera]) == number)))
+            write_video(folder / f"{name}/chunk-000/file-{number:03d}.mp4", rows.tolist(), codec)
+    for number in (0, 1):
+        rows = np.flatnonzero(np.isin(EPISODES, np.flatnonzero(np.array(places["data"]) == number)))
+        file = folder / f"data/chunk-000/file-{number:03d}.parquet"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(_table(rows, kind), file, row_group_size=5)
+    (folder / "meta/episodes/chunk-000").mkdir(parents=True)
+    pq.write_table(pa.table(columns), folder / "meta/episodes/chunk-000/file-000.parquet")
+    tasks = pa.table({"task_index": [1, 0], "__index_level_0__": [TASKS[1], TASKS[0]]})
+    pq.write_table(tasks, folder / "meta/tasks.parquet")
+    return folder
+
+
+def lerobot_v2(folder: Path, kind: str = "video") -> Path:
+    """A parquet file, and a video of each camera, for each episode."""
+    import pyarrow.parquet as pq
+
+    name = "chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+    _info(folder, "v2.1", kind, video_path=f"videos/{name}")
+    entries = [{"episode_index": at, "tasks": [TASKS[at % 2]], "length": LENGTHS[at]} for at in range(3)]
+    (folder / "meta/episodes.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    tasks = [{"task_index": at, "task": text} for at, text in enumerate(TASKS)]
+    (folder / "meta/tasks.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in tasks))
+    for episode in range(3):
+        rows = np.flatnonzero(episode == EPISODES)
+        file = folder / f"data/chunk-000/episode_{episode:06d}.parquet"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(_table(rows, kind), file)
+        for camera in ("top", "wrist") if kind == "video" else ():
+            video = folder / f"videos/chunk-000/observation.images.{camera}/episode_{episode:06d}.mp4"
+            write_video(video, rows.tolist())
+    return folder
