@@ -146,3 +146,91 @@ def lerobot_v2(folder: Path, kind: str = "video") -> Path:
             video = folder / f"videos/chunk-000/observation.images.{camera}/episode_{episode:06d}.mp4"
             write_video(video, rows.tolist())
     return folder
+
+
+def jpeg(pixels: Any) -> bytes:
+    import io
+
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "JPEG", quality=95)
+    return stream.getvalue()
+
+
+def aloha(folder: Path, *, compress: bool = False) -> Path:
+    """A file for each episode, written as ALOHA does; its JPEG are what OpenCV makes of an array of RGB."""
+    import h5py
+
+    folder.mkdir(parents=True)
+    for episode, length in enumerate(LENGTHS):
+        rows = np.flatnonzero(episode == EPISODES)
+        with h5py.File(folder / f"episode_{episode}.hdf5", "w", rdcc_nbytes=1024**2 * 2) as file:
+            file.attrs.update(sim=False, compress=compress)
+            images = file.create_group("observations").create_group("images")
+            for camera in ("cam_high", "cam_wrist"):
+                pixels = [picture(row) for row in rows.tolist()]
+                if compress:
+                    coded = [np.frombuffer(jpeg(each[:, :, ::-1]), np.uint8) for each in pixels]
+                    size = max(map(len, coded)) + 30
+                    padded = np.stack([np.pad(each, (0, size - len(each))) for each in coded])
+                    images.create_dataset(camera, data=padded, chunks=(1, size))
+                else:
+                    images.create_dataset(camera, data=np.stack(pixels), chunks=(1, HEIGHT, WIDTH, 3))
+            if compress:
+                file.create_dataset("compress_len", data=np.zeros((2, length)))
+            file["observations"].create_dataset("qpos", data=STATE[rows])
+            file["observations"].create_dataset("qvel", data=STATE[rows] * 0)
+            file.create_dataset("action", data=ACTION[rows])
+    return folder
+
+
+def robomimic(file: Path) -> Path:
+    """All episodes in one file, written as robomimic does; the names of its demos do not sort as text."""
+    import h5py
+
+    with h5py.File(file, "w") as opened:
+        data = opened.create_group("data")
+        data.attrs.update(total=COUNT, env_args="{}")
+        for episode, number in enumerate((2, 9, 10)):
+            rows = np.flatnonzero(episode == EPISODES)
+            demo = data.create_group(f"demo_{number}")
+            demo.attrs["num_samples"] = len(rows)
+            for group in ("obs", "next_obs"):
+                pixels = np.stack([picture(row) for row in rows.tolist()])
+                demo.create_dataset(f"{group}/agentview_image", data=pixels, compression="gzip")
+                demo.create_dataset(f"{group}/robot0_eef_pos", data=STATE[rows].astype(np.float64))
+            demo.create_dataset("actions", data=ACTION[rows].astype(np.float64))
+            demo.create_dataset("dones", data=np.zeros(len(rows), np.int64))
+        opened.create_dataset("mask/train", data=np.array([b"demo_2", b"demo_9"]))
+    return file
+
+
+def diffusion_zarr(path: Path, version: int = 2, *, zipped: bool = False) -> Path:
+    """A replay buffer as Diffusion Policy writes it, by the zarr library; its first row is all zeros, as written."""
+    import zarr
+
+    store = zarr.storage.ZipStore(str(path), mode="w") if zipped else zarr.storage.LocalStore(str(path))
+    settings = {"config": {"write_empty_chunks": True}}
+    root = zarr.open_group(store, mode="w", zarr_format=version)
+    data, meta = root.create_group("data"), root.create_group("meta")
+    pictures = np.stack([picture(row) for row in range(COUNT)])
+    for name, values, chunk in (("img", pictures, 7), ("state", STATE, 5), ("action", ACTION, 8)):
+        data.create_array(name, data=values, chunks=(chunk, *values.shape[1:]), **settings)
+    meta.create_array("episode_ends", data=np.cumsum(LENGTHS), **settings)
+    store.close()
+    return path
+
+
+def image_folder(folder: Path) -> Path:
+    """A CSV file and PNG pictures."""
+    folder.mkdir(parents=True)
+    lines = ["episode,timestamp,cam,state.0,state.1,state.2,action[0],action[1],task"]
+    for row in range(COUNT):
+        (folder / "cam").mkdir(exist_ok=True)
+        (folder / f"cam/{row}.png").write_bytes(png(picture(row)))
+        numbers = [*STATE[row].tolist(), *ACTION[row].tolist()]
+        cells = [EPISODES[row], FRAMES[row] / HZ, f"cam/{row}.png", *numbers, f'"{TASKS[EPISODES[row] % 2]}, now"']
+        lines.append(",".join(map(str, cells)))
+    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    return folder
