@@ -234,3 +234,45 @@ def image_folder(folder: Path) -> Path:
         lines.append(",".join(map(str, cells)))
     (folder / "log.csv").write_text("\n".join(lines) + "\n")
     return folder
+
+
+def _tensor(dtype: str, *sizes: int) -> dict[str, Any]:
+    shape = {"dimensions": [str(size) for size in sizes]}
+    return {"pythonClassName": "x.Tensor", "tensor": {"shape": shape, "dtype": dtype, "encoding": "none"}}
+
+
+def _dictionary(**features: Any) -> dict[str, Any]:
+    return {"pythonClassName": "x.FeaturesDict", "featuresDict": {"features": features}}
+
+
+def rlds(folder: Path) -> Path:
+    """Two files of TFRecord, written by the package tfrecord in the layout of TensorFlow Datasets."""
+    from tfrecord.writer import TFRecordWriter
+
+    folder.mkdir(parents=True)
+    image = {"pythonClassName": "x.Image", "image": {"shape": {"dimensions": ["48", "64", "3"]}, "dtype": "uint8",
+                                                     "encodingFormat": "png"}}  # fmt: skip
+    text = {"pythonClassName": "x.Text", "text": {}}
+    step = _dictionary(
+        observation=_dictionary(image=image, state=_tensor("float32", 3)), action=_tensor("float32", 2),
+        is_first=_tensor("bool"), count=_tensor("int64"), language_instruction=text,
+    )  # fmt: skip
+    features = _dictionary(steps={"pythonClassName": "x.Dataset", "sequence": {"feature": step}},
+                           episode_metadata=_dictionary(file_path=text))  # fmt: skip
+    (folder / "features.json").write_text(json.dumps(features))
+    for shard, episodes in enumerate(((0, 1), (2,))):
+        writer = TFRecordWriter(str(folder / f"data-train.tfrecord-0000{shard}-of-00002"))
+        for episode in episodes:
+            rows = np.flatnonzero(episode == EPISODES)
+            coded = [png(picture(row)) for row in rows.tolist()]
+            words = [TASKS[episode % 2].encode()] * len(rows)
+            writer.write({
+                "steps/observation/image": (coded, "byte"), "steps/language_instruction": (words, "byte"),
+                "steps/observation/state": (STATE[rows].ravel().tolist(), "float"),
+                "steps/action": (ACTION[rows].ravel().tolist(), "float"),
+                "steps/is_first": ([int(at == 0) for at in range(len(rows))], "int"),
+                "steps/count": ((rows * 1000 - 5).tolist(), "int"),
+                "episode_metadata/file_path": (b"x", "byte"),
+            })  # fmt: skip
+        writer.close()
+    return folder

@@ -34,6 +34,7 @@ KINDS = {
     "zarr 3": Kind(lambda path: datasets.diffusion_zarr(path, 3), "img", "state", "action", "zarr"),
     "zarr zip": Kind(lambda path: datasets.diffusion_zarr(path.with_suffix(".zarr.zip"), zipped=True), "img", "state",
                      "action", "zarr"),
+    "rlds": Kind(datasets.rlds, "observation/image", "observation/state", "action", "tfrecord"),
     "folder": Kind(datasets.image_folder, "cam", "state", "action", "PIL"),
     "csv": Kind(lambda path: datasets.image_folder(path) / "log.csv", "cam", "state", "action", "PIL"),
 }  # fmt: skip
@@ -74,3 +75,11 @@ def test_a_csv_names_task_and_time(tmp_path: Path):
     np.testing.assert_allclose(steps.times, datasets.FRAMES / datasets.HZ)
     assert steps.columns["task"][7] == "place the cube, now"
     assert steps.tasks.tolist() == (datasets.EPISODES % 2).tolist()
+
+
+def test_an_episode_of_rlds_has_a_text_and_numbers_for_each_step(tmp_path: Path):
+    pytest.importorskip("tfrecord", reason="it is written with tfrecord (extra dev)")
+    columns = reader_of(datasets.rlds(tmp_path / "a")).steps(tmp_path / "a").columns
+    assert columns["count"].tolist() == [row * 1000 - 5 for row in range(datasets.COUNT)]
+    assert columns["is_first"].tolist() == (datasets.FRAMES == 0).tolist()
+    assert columns["language_instruction"][[0, 7]].tolist() == [*datasets.TASKS]
