@@ -276,3 +276,58 @@ def rlds(folder: Path) -> Path:
             })  # fmt: skip
         writer.close()
     return folder
+
+
+def rosbag(path: Path, kind: str = "mcap", encoding: str = "rgb8", *, gap: bool = False) -> Path:
+    """One bag: two cameras at 10 Hz, one of them compressed, joints at 50 Hz, commands at 20 Hz; headers have times.
+
+    Args:
+        kind: ``mcap`` or ``sqlite3`` of ROS 2, or ``ros1``.
+        gap: whether joints are silent for a second.
+    """
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    first = kind == "ros1"
+    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
+    types = store.types
+    plugins = {"mcap": rosbag2.StoragePlugin.MCAP, "sqlite3": rosbag2.StoragePlugin.SQLITE3}
+    writer: Any = rosbag1.Writer(path) if first else rosbag2.Writer(path, version=9, storage_plugin=plugins[kind])
+    sent: list[tuple[float, str, str, Any]] = []
+
+    def header(time: float) -> Any:
+        stamp = types["builtin_interfaces/msg/Time"](sec=100 + int(time), nanosec=round(time % 1 * 1e9))
+        return types["std_msgs/msg/Header"](**({"seq": 0} if first else {}), stamp=stamp, frame_id="x")
+
+    for row in range(COUNT):
+        time, pixels = row / HZ, picture(row)
+        if encoding == "bgr8":
+            pixels = pixels[:, :, ::-1]
+        lines = np.zeros((HEIGHT, WIDTH * 3 + 5), np.uint8)
+        lines[:, : WIDTH * 3] = pixels.reshape(HEIGHT, -1)
+        sent.append((time, "/cam/raw", "sensor_msgs/msg/Image", types["sensor_msgs/msg/Image"](
+            header=header(time), height=HEIGHT, width=WIDTH, encoding=encoding, is_bigendian=0,
+            step=lines.shape[1], data=lines.ravel())))  # fmt: skip
+        sent.append((time, "/cam/jpeg", "sensor_msgs/msg/CompressedImage", types["sensor_msgs/msg/CompressedImage"](
+            header=header(time + 0.004), format="png", data=np.frombuffer(png(picture(row)), np.uint8))))  # fmt: skip
+    for tick in range(COUNT * 5):
+        time = tick / 50
+        if not gap or not 0.5 < time < 1.5:
+            values = {name: np.array([time, -time, 1.0]) for name in ("position", "velocity")}
+            joints = types["sensor_msgs/msg/JointState"](
+                header=header(time), name=["a", "b", "c"], effort=np.zeros(0), **values
+            )
+            sent.append((time + 0.03, "/joint_states", "sensor_msgs/msg/JointState", joints))
+    for tick in range(COUNT * 2):
+        vector = types["geometry_msgs/msg/Vector3"]
+        message = types["geometry_msgs/msg/Twist"](
+            linear=vector(x=tick / 20, y=2.0, z=0.0), angular=vector(x=0.0, y=0.0, z=1.0)
+        )
+        sent.append((tick / 20, "/arm/cmd", "geometry_msgs/msg/Twist", message))
+    with writer:
+        names = {topic: name for _, topic, name, _ in sent}
+        topics = {topic: writer.add_connection(topic, name, typestore=store) for topic, name in names.items()}
+        serialize = store.serialize_ros1 if first else store.serialize_cdr
+        for time, topic, name, message in sorted(sent, key=lambda each: each[0]):
+            writer.write(topics[topic], round((100 + time) * 1e9), bytes(serialize(message, name)))
+    return path
