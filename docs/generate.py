@@ -127,7 +127,7 @@ def fields_page(title: str, classes: list[Any]) -> str:
                 default = f"`{field.default!r}`"
             elif field.default_factory is not dataclasses.MISSING:
                 default = f"`{field.default_factory()!r}`"
-            kind_of = str(field.type).replace("|", "or")
+            kind_of = str(field.type).replace("|", "or").replace("Number", "float")
             rows.append(f"| `{field.name}` | {kind_of} | {default} | {meanings.get(field.name, '')} |")
         parts.append(f"## {kind.__name__}\n\n{text}\n\n" + "\n".join(rows) + "\n")
     return "\n".join(parts)

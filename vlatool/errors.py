@@ -3,21 +3,21 @@
 VlatoolError                 70  our bug, unless a subclass says otherwise
 ├── UsageError                2  an invalid command line or call
 ├── InputError                3  an input is bad
-│   ├── BundleError              a bundle directory: missing, corrupt, half, too new
+│   ├── BundleError              a bundle directory: missing, corrupt, incomplete, too new
 │   ├── SpecError                a policy spec: names, shapes, dtypes, statistics
 │   ├── SourceError              a policy source: factory, weights, ONNX file
 │   ├── DataError                calibration / evaluation data or an observation
 │   ├── GraphError               a graph that an engine refuses, or that computes wrong values
 │   ├── ProfileError             a hardware profile
 │   ├── RecipeError              a recipe or stage options
-│   ├── OutputError              the place to write to: exists, read-only, full
-│   ├── TargetError              the machine that something should run on: unreachable, or it ends
+│   ├── OutputError              the output: exists already, read-only, disk full
+│   ├── TargetError              the machine to run on: unreachable, or the run ends early
 │   ├── InstallationError        two distributions of vlatool in one environment
 │   └── PluginError              another package that adds something to vlatool
-├── MissingExtra              4  an optional dependency is absent; names the extra
+├── MissingExtra              4  an optional dependency is missing; names the extra
 ├── GateFailed                1  measured, and outside the limits
 ├── Inconclusive              5  measured, and the samples cannot decide
-└── FallsShort                5  what can be made is clearly less than what was asked for
+└── FallsShort                5  the best possible result is clearly below what was requested
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from typing import ClassVar
 
 PACKAGE = Path(__file__).parent
 DISTRIBUTION = "vlatool" if (PACKAGE / "cli").is_dir() else "vlatool-runtime"
-"""Name of this distribution for pip: all of vlatool, or only what a robot needs, without a command line."""
+"""Name of this distribution for pip: all of vlatool, or the part that a robot needs, without a command line."""
 
 
 class VlatoolError(Exception):
@@ -46,7 +46,7 @@ class VlatoolError(Exception):
 
     exit_code = 70
     remedy: ClassVar[str] = ""
-    """Fix for errors of this class that name none of their own; empty where each error has its own."""
+    """Fix for errors of this class without a fix of their own; empty if each has its own."""
 
     def __init__(self, message: str, fix: str = "") -> None:
         super().__init__(message)
@@ -55,6 +55,16 @@ class VlatoolError(Exception):
 
     def __str__(self) -> str:
         return f"{self.message}\n  fix: {self.fix}" if self.fix else self.message
+
+    @classmethod
+    def unknown(cls, problem: str, name: str, known: Iterable[str]) -> VlatoolError:
+        """Return the error for an unknown name: the message lists the known names, the fix is the most similar one.
+
+        Args:
+            problem: what is wrong, without the full stop.
+        """
+        names = list(known)
+        return cls(f"{problem}; {suggest(name, names)}.", fix_for(name, names))
 
     def __reduce__(self) -> tuple[type[VlatoolError], tuple[str, str]]:
         """Pickle message and fix, so that an error passes between processes unchanged."""
@@ -80,7 +90,7 @@ class BundleError(InputError):
 
 
 class SpecError(InputError):
-    """A policy spec names something impossible, or statistics do not fit it."""
+    """A policy spec has an impossible value, or statistics do not fit it."""
 
     remedy = "correct it in policy.yaml; where a bundle says it, make the bundle again"
 
@@ -106,29 +116,29 @@ class RecipeError(InputError):
 
 
 class OutputError(InputError):
-    """The place to write to exists already, is read-only or is full."""
+    """The output exists already, is read-only, or its disk is full."""
 
 
 class TargetError(InputError):
-    """The machines that something should run on cannot be reached or used, or what runs there ends."""
+    """The machine to run on cannot be reached or used, or the run there ends early."""
 
 
 class InstallationError(InputError):
-    """Two distributions of vlatool are installed in one environment, each with files of the other."""
+    """Two distributions of vlatool, which share files, are installed in one environment."""
 
 
 class PluginError(InputError):
-    """Another package that adds something to vlatool cannot be imported, or fails."""
+    """Another package that extends vlatool cannot be imported, or fails."""
 
 
 class MissingExtra(VlatoolError):
-    """An optional dependency is absent."""
+    """An optional dependency is missing."""
 
     exit_code = 4
 
 
 class GateFailed(VlatoolError):
-    """The measurement is outside the limits that were asked for."""
+    """The measurement is outside the requested limits."""
 
     exit_code = 1
 
@@ -140,17 +150,17 @@ class Inconclusive(VlatoolError):
 
 
 class FallsShort(VlatoolError):
-    """What can be made is clearly less than what was asked for."""
+    """The best possible result is clearly below what was requested."""
 
     exit_code = 5
 
 
 NOT_POSSIBLE = (3, 4, 5)
-"""Exit codes of errors that rule out one candidate; a search goes on with the others."""
+"""Exit codes of errors that rule out one candidate; a search continues with the others."""
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """Return a part of a sentence that lists the known names, after the most similar one.
+    """Return a phrase that lists the known names, after the most similar one.
 
     Example:
         >>> suggest("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
@@ -178,7 +188,7 @@ def fix_for(name: str, known: Iterable[str]) -> str:
 
 
 def _closest(name: str, names: list[str]) -> str:
-    """Return the most similar name, empty where none is similar."""
+    """Return the most similar name; empty if none is similar."""
     return next(iter(difflib.get_close_matches(name, names, n=1)), "")
 
 
@@ -193,7 +203,7 @@ def pip_install(extra: str, distribution: str = DISTRIBUTION) -> str:
 
 
 def refuse_two_distributions(packages: Path = PACKAGE.parent) -> None:
-    """Refuse to run where both vlatool and vlatool-runtime are installed: they own the same files.
+    """Refuse to run if both vlatool and vlatool-runtime are installed, because they share files.
 
     Args:
         packages: folder that vlatool is installed in.
@@ -223,7 +233,7 @@ def require_present(module: str, extra: str) -> None:
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import a module; where that fails, name the extra that provides it.
+    """Import a module, or raise an error that names the extra that provides it.
 
     Raises:
         MissingExtra: when the module is not installed.

@@ -1,9 +1,9 @@
-"""(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or one of another package; imports only what is named.
+"""(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or one of another package; imports only what is requested.
 
-One entry, one file, found by its file name: there is no list to edit. A file whose name starts with ``_`` and a
-sub-package are shared by the folder and are not entries. Another package adds an entry by an entry point of the group
-``vlatool.<kind>`` (``vlatool.quantize``, ``vlatool.engines``, ...) that names a module or a class in it; vlatool's own
-come first.
+Each entry is one file, found by its file name, so there is no list to edit. Files whose names start with ``_`` and
+sub-packages are shared by the folder and are not entries. Another package adds an entry with an entry point of the
+group ``vlatool.<kind>`` (``vlatool.quantize``, ``vlatool.engines``, ...) that names a module or a class in it;
+vlatool's own entries take precedence.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from importlib import metadata
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import PluginError, UsageError, VlatoolError, fix_for, suggest
+from vlatool.errors import PluginError, UsageError, VlatoolError
 
 PACKAGE_OF_KIND = {
     "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
@@ -29,7 +29,7 @@ PACKAGE_OF_KIND = {
     "hints": "vlatool.training.hints", "motion": "vlatool.motion.metrics",
     "videos": "vlatool.render.videos", "control": "vlatool.runtime.control",
     "claims": "vlatool.gate.claims"}  # fmt: skip
-"""Kind -> the package that holds its files, where that has another name."""
+"""Kind -> package of its files, for kinds whose package has a different name."""
 NOUNS = {
     "quantize": "quantization method", "prune": "pruning method", "distill": "distillation method",
     "evaluate": "evaluation", "export": "export target", "sources": "kind of source", "data": "format of recordings",
@@ -41,9 +41,9 @@ _PLUGIN_CLASSES: dict[type, str] = {}
 
 
 class Claim(IntEnum):
-    """How sure an entry is that it reads what a person names.
+    """How sure an entry is that it can read what the user names.
 
-    ``claims`` of an entry looks at names and first bytes alone: it is asked about every path that a shell completes.
+    ``claims`` of an entry looks only at names and first bytes: it is called for every path that a shell completes.
     """
 
     NONE = 0
@@ -52,7 +52,7 @@ class Claim(IntEnum):
 
 
 def package_of(kind: str) -> str:
-    """Return the package that holds the files of ``kind`` (``"engines"`` live in the runtime)."""
+    """Return the package with the files of a kind (those of ``"engines"`` are in the runtime)."""
     return PACKAGE_OF_KIND.get(kind, f"vlatool.{kind}")
 
 
@@ -62,7 +62,7 @@ def noun_of(kind: str) -> str:
 
 
 def names(kind: str) -> list[str]:
-    """List the entries of a kind by file name, importing none of them, and those of other packages.
+    """Return the names of a kind's entries, including those of other packages, without importing any.
 
     Example:
         >>> "static_int8" in names("quantize")
@@ -83,32 +83,30 @@ def module(kind: str, name: str) -> ModuleType:
     """Import the module of an entry.
 
     Raises:
-        UsageError: for an unknown entry; suggests the nearest one.
+        UsageError: for an unknown entry; suggests the most similar one.
         PluginError: when it is another package's and cannot be imported.
     """
     own_name = name.replace("-", "_")
     if own_name in _builtin_names(kind):
         return importlib.import_module(f"{package_of(kind)}.{own_name}")
     if own_name not in plugins(kind):
-        raise UsageError(
-            f"Unknown {noun_of(kind)} '{name}'; {suggest(own_name, names(kind))}.", fix_for(own_name, names(kind))
-        )
+        raise UsageError.unknown(f"Unknown {noun_of(kind)} '{name}'", own_name, names(kind))
     entry = plugins(kind)[own_name]
     try:
         return importlib.import_module(entry.module)
     except VlatoolError:
         raise
-    except Exception as error:  # the seam: another package's code may raise anything
+    except Exception as error:  # another package's code may raise anything
         raise _plugin_error(entry, f"cannot be imported: {type(error).__name__}: {error}") from error
 
 
 def load(kind: str, name: str) -> type:
-    """Return the only public class that the file of an entry defines, or the one that an entry point names.
+    """Return the only public class in the file of an entry, or the class that an entry point names.
 
     Raises:
         UsageError: for an unknown entry.
-        PluginError: when it is another package's and not such a class.
-        TypeError: when the file defines no public class, or several (a fault of the file).
+        PluginError: when it is another package's and has no such class.
+        TypeError: when a file of vlatool's own does not define exactly one public class.
     """
     source = module(kind, name)
     own_name = name.replace("-", "_")
@@ -126,19 +124,19 @@ def load(kind: str, name: str) -> type:
 
 
 def loadable(kind: str) -> Iterator[tuple[str, Any]]:
-    """Yield the name and the class of each entry, without those that cannot be imported, which ``doctor`` names."""
+    """Yield the name and the class of each entry that can be imported; ``doctor`` lists the others."""
     for name in names(kind):
         with contextlib.suppress(PluginError):
             yield name, load(kind, name)
 
 
 def is_certain(kind: str, named: Any) -> bool:
-    """Return whether an entry is certain to read what a person names."""
+    """Return whether any entry is certain that it can read what the user names."""
     return any(entry.claims(named) is Claim.CERTAIN for _, entry in loadable(kind))
 
 
 def claimant(kind: str, named: Any, error: type[VlatoolError]) -> Any:
-    """Return the entry that reads what a person names: the one that is certain, else the one that may; None if none.
+    """Return the entry for what the user names: the one that is certain, else the one that answers maybe, else None.
 
     Raises:
         VlatoolError: (of the type ``error``) when several are equally sure.
@@ -156,7 +154,7 @@ def claimant(kind: str, named: Any, error: type[VlatoolError]) -> Any:
 
 
 def requirements(kind: str) -> str:
-    """Return what each entry of a kind needs to read something, for messages: ``onnx (a .onnx file)``."""
+    """Return what each entry of a kind reads, for messages: ``onnx (a .onnx file)``."""
     entries = dict(loadable(kind))
     broken = [f"{name} (cannot be imported, vlatool doctor says why)" for name in names(kind) if name not in entries]
     return "; ".join([_requirements(entries), *broken])
@@ -167,10 +165,10 @@ def _requirements(entries: Mapping[str, Any]) -> str:
 
 
 def values(kind: str, *classes: type) -> list[Any]:
-    """Return the values of some classes that the files of a kind hold, those of vlatool's own files first.
+    """Return all instances of some classes in the files of a kind, those in vlatool's own files first.
 
     Raises:
-        PluginError: when the file of another package cannot be imported, or holds none.
+        PluginError: when a file of another package cannot be imported, or has none.
     """
     found: list[Any] = []
     for name in (*_builtin_names(kind), *plugins(kind)):
@@ -182,7 +180,7 @@ def values(kind: str, *classes: type) -> list[Any]:
 
 
 def entry_of(entry_class: type) -> str:
-    """Return ``kind.name`` of a class that ``load`` returned, or that is in a file of its kind."""
+    """Return ``kind.name`` of a class that ``load`` returned or that is defined in a file of its kind."""
     return _PLUGIN_CLASSES.get(entry_class) or ".".join(entry_class.__module__.split(".")[-2:])
 
 
@@ -196,7 +194,7 @@ def all_plugins() -> dict[str, list[str]]:
 
 
 def plugin_of(module_name: str) -> str:
-    """Return the other package that a module is from (``acme 1.2``); empty if it does not extend vlatool.
+    """Return the other package to which a module belongs (``acme 1.2``); empty if it does not extend vlatool.
 
     Args:
         module_name: name of any module of that package.
@@ -208,7 +206,7 @@ def plugin_of(module_name: str) -> str:
 
 
 def package_at_fault(error: BaseException) -> str:
-    """Return the other package that an exception came from: the last one before vlatool's own or a library's frames."""
+    """Return the other package that caused an exception: the owner of the innermost frame that is not a library's."""
     frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
     owners = [(name.partition(".")[0] == "vlatool", plugin_of(name)) for name in frames]
     return next((other for own, other in reversed(owners) if own or other), "")

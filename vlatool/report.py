@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Protocol
 
 from vlatool.errors import DataError
+from vlatool.files.messages import Number, from_json, to_json
 
 SCHEMA = 1
 REPORT = "report.json"
@@ -44,14 +45,14 @@ class Measurement:
     """
 
     name: str
-    value: float
+    value: Number
     unit: str
     origin: str = "measured"
     where: str = "this host"
     samples: int = 0
-    low: float | None = None
-    high: float | None = None
-    confidence: float = 0.95
+    low: Number | None = None
+    high: Number | None = None
+    confidence: Number = 0.95
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -93,7 +94,7 @@ class Row:
     role: str = "subject"
     reason: str = ""
     measurements: tuple[Measurement, ...] = ()
-    raw: Mapping[str, list[float]] = field(default_factory=dict)
+    raw: Mapping[str, list[Number]] = field(default_factory=dict)
     details: Mapping[str, list[dict[str, Any]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -177,7 +178,7 @@ class Report:
 
     def to_json(self) -> str:
         """Return JSON; NaN is written as null."""
-        return json.dumps(without_nan(asdict(self)), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        return json.dumps(without_nan(to_json(self)), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> Report:
@@ -193,12 +194,7 @@ class Report:
                     f"The report has the schema {data['schema']}; this vlatool reads up to {SCHEMA}.", "upgrade vlatool"
                 )
             known = {item.name for item in fields(cls)}
-            values = {key: data[key] for key in data if key in known}
-            values["rows"] = tuple(_row(row) for row in data.get("rows", ()))
-            values["summary"] = tuple(data.get("summary", ()))
-            values["warnings"] = tuple(data.get("warnings", ()))
-            values["findings"] = tuple(Finding(**item) for item in data.get("findings", ()))
-            return cls(**values)
+            return from_json(cls, {key: item for key, item in data.items() if key in known}, "report")
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise DataError(
                 f"This is not a vlatool report: {error}.", "name a report.json that vlatool wrote, or measure again"
@@ -221,22 +217,6 @@ def read_report(path: Path) -> Report:
                     "check that the file is there and readable, or measure again",
                 ) from error
     raise DataError(f"No report at {path}.", "name a report.json, or a directory that holds one")
-
-
-def _row(data: Mapping[str, Any]) -> Row:
-    measurements = [
-        Measurement(**{**item, "value": math.nan if item["value"] is None else item["value"]})
-        for item in data.get("measurements", ())
-    ]
-    raw = {name: _series(values) for name, values in data.get("raw", {}).items()}
-    return Row(**{**data, "measurements": tuple(measurements), "raw": raw})
-
-
-def _series(values: Any) -> Any:
-    """Return samples with NaN where JSON has null."""
-    if not isinstance(values, list) or None not in values:
-        return values
-    return [math.nan if value is None else value for value in values]
 
 
 def without_nan(value: Any) -> Any:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import random
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from pathlib import Path
 from types import NoneType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import pytest
 
-from vlatool.files.messages import from_json, to_json
+from vlatool.errors import SpecError
+from vlatool.files.messages import Number, field_values, from_json, to_json
 
 ROUNDS = 40
 MODULES = (
@@ -126,3 +129,55 @@ def test_a_tuple_of_other_lengths_is_refused():
     assert from_json(tuple[float, ...], [1, 2.5]) == (1.0, 2.5)
     with pytest.raises(ValueError, match=r"'series\[1\]' is None, not a number"):
         from_json(tuple[float, ...], [1, None], "series")
+
+
+@dataclass(frozen=True)
+class Inner:
+    name: str
+    axes: tuple[int | str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: tuple[Inner, ...]
+    unit: str | tuple[str, ...] = ""
+    file: Path | None = None
+    values: dict[str, list[Number]] = field(default_factory=dict)
+    scale: Number = 1.0
+
+
+def test_what_has_its_default_is_left_out_where_asked_at_any_depth():
+    outer = Outer((Inner("a"), Inner("", (1, "n"))), scale=2.0)
+    assert to_json(outer, defaults=False) == {"inner": [{"name": "a"}, {"name": "", "axes": [1, "n"]}], "scale": 2.0}
+    assert to_json(Outer(())) == {"inner": [], "unit": "", "file": None, "values": {}, "scale": 1.0}
+    assert to_json(Outer((), values={}), defaults=False) == {"inner": []}
+
+
+def test_a_path_is_text():
+    outer = Outer((), file=Path("a/b"))
+    assert to_json(outer, defaults=False) == {"inner": [], "file": "a/b"}
+    assert from_json(Outer, {"inner": [], "file": "a/b"}) == outer
+    with pytest.raises(ValueError, match=r"'message\.file' is 3, not text"):
+        from_json(Outer, {"inner": [], "file": 3})
+
+
+def test_null_is_nan_for_a_number_of_a_report_and_a_whole_number_stays_one():
+    read = from_json(Outer, {"inner": [], "scale": 3, "values": {"a": [1, 2.5], "b": [1, None]}})
+    assert (type(read.scale), read.values["a"], type(read.values["a"])) == (int, [1, 2.5], list)
+    assert math.isnan(read.values["b"][1])
+    assert math.isnan(from_json(Outer, {"inner": [], "scale": None}).scale)
+    for wrong in ("1", True, [1]):
+        with pytest.raises(ValueError, match=r"'report\.scale' is .*, not a number"):
+            from_json(Outer, {"inner": [], "scale": wrong}, "report")
+    with pytest.raises(ValueError, match=r"'report\.values\.a' is 1\.5, not a list"):
+        from_json(Outer, {"inner": [], "values": {"a": 1.5}}, "report")
+
+
+def test_a_dataclass_that_checks_itself_gets_tuples_for_lists_and_no_unknown_field():
+    values = field_values(Outer, {"inner": [1], "unit": ["m", "s"], "values": {"a": [1]}}, "The spec", SpecError)
+    assert values == {"inner": (1,), "unit": ("m", "s"), "values": {"a": [1]}}
+    assert field_values(Outer, {"unit": "m"}, "The spec", SpecError) == {"unit": "m"}
+    with pytest.raises(SpecError, match="The spec has the unknown key 'units'; did you mean 'unit'"):
+        field_values(Outer, {"units": "m"}, "The spec", SpecError)
+    with pytest.raises(SpecError, match="The spec must be a mapping; got 3"):
+        field_values(Outer, 3, "The spec", SpecError)

@@ -362,7 +362,7 @@ def test_its_gate_claim_is_in_a_new_gate_file_and_examined_where_it_is_named(
     assert "\nbounded: null  # Few of the candidate's actions" in (tmp_path / "new/gate.yaml").read_text()
     wrong = run(*gated(float_bundle, tmp_path, bounded={"bound": -1, "share": 1}))
     assert wrong.returncode == 3
-    for problem in ("bounded.bound: Input should be greater than or equal to 0", "bounded.share: Extra inputs"):
+    for problem in ("bounded.bound: Input should be greater than or equal to 0", "bounded.share: is not a known"):
         assert problem in wrong.stderr
     report = json.loads(ok(run(*gated(float_bundle, tmp_path, size={}), "--json")))
     assert [line["claim"] for line in report["rows"][1]["details"]["claims"]] == ["size"]

@@ -14,7 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
-from vlatool.prune._selection import Selection, protected_parts
+from vlatool.prune._selection import Selection
 from vlatool.prune.depth import PROTECTED_WORDS, Depth, evenly_spaced
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
@@ -87,7 +87,7 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
     chosen = Depth(samples=2, include=("action_expert",)).change(modules, source_bundle, Context()).edits
     assert len(chosen[0].keep) == 2
     parts = {"action_head": ["trunk2", "trunk2.*"], "fusion": ["trunk3"]}
-    of_parts = Selection((), (), PROTECTED_WORDS, protected_parts(parts, PROTECTED_WORDS))
+    of_parts = Selection.protecting(PROTECTED_WORDS, parts)
     assert of_parts.protects("trunk2")
     assert of_parts.protects("trunk2.blocks")
     assert not of_parts.protects("trunk3")

@@ -87,7 +87,7 @@ def test_a_group_is_all_its_layers_together(quantized, float_bundle, observation
     ranges = ranges_of(float_bundle, stage, Context())
     with Switchboard(float_bundle, stage, ranges) as board:
         everything = list(board.shares)
-        whole, one = board.errors([everything, everything[:1]], observations, Context(), ordered=False)
+        whole, one = board.errors([everything, everything[:1]], observations, Context())
     pairs = zip(outputs(quantized(stage), observations), outputs(float_bundle, observations), strict=True)
     assert whole.error == pytest.approx(np.mean([relative_error(*pair) for pair in pairs]), rel=0.02)
     assert whole.error > one.error

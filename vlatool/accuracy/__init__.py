@@ -1,1 +1,1 @@
-"""How well a policy does: losses, success, pairs, and whether the reference can be believed."""
+"""Accuracy of a policy: losses, success, paired episodes, and the credibility of the reference."""

@@ -1,4 +1,4 @@
-"""Whether the policy that everything is held against does its task at all, better than who does not look."""
+"""Credibility of the reference: whether it does its task better than actions that ignore the observation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Trust(str, Enum):
 
 
 class Ground(Enum):
-    """What decides about the reference, or why nothing does; the value is the text about it."""
+    """Ground of the verdict on the reference, or of the lack of one; the value is the text about it."""
 
     UNASKED = ""
     NOTHING_RIGHT = (
@@ -76,14 +76,14 @@ IN_EPISODES = (Ground.NEVER_SUCCEEDS, Ground.NOT_ABOVE_CHANCE)
 
 @dataclass(frozen=True)
 class Credibility:
-    """What is known of the reference.
+    """Verdict on the reference, and its grounds.
 
     Args:
         verdict: credible, fails, or unknown.
         own: number that decides; None where there is none.
-        chance: what it is compared with, for success rates.
-        table: what was compared with which floor.
-        reservations: what else was found, and does not decide.
+        chance: success rate by chance, where success rates decide.
+        table: comparisons with floors.
+        reservations: further findings, which do not decide.
     """
 
     verdict: Trust = Trust.UNKNOWN
@@ -101,7 +101,7 @@ class Credibility:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What was found and what to look at, when it fails."""
+        """The finding, and what to look at, when the reference fails."""
         if not self.fails:
             return ()
         few = self.own and self.chance and max(self.own.samples, self.chance.samples) < MIN_EPISODES
@@ -111,13 +111,13 @@ class Credibility:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a reader should know although it does not decide."""
+        """Reservations that a reader should know although they do not decide."""
         own = (self._words,) if self.verdict is Trust.UNKNOWN and self.ground is not Ground.UNASKED else ()
         return (*(text for other in self.reservations for text in (*other.warnings, *other.sentences[:1])), *own)
 
     @property
     def floor(self) -> str:
-        """What was compared with which floor, in a sentence, when it is credible."""
+        """The floor that the reference was compared with, in a sentence, when it is credible."""
         return self._words if self.verdict is Trust.CREDIBLE else ""
 
     @property
@@ -131,8 +131,8 @@ def credibility(row: Row, name: str = "the reference") -> Credibility:
     """Judge the reference by its episodes where there are some, else by the expert's recorded actions.
 
     Args:
-        row: With ``success`` and ``success_chance`` (the better control on some of the same seeds), or ``skill_expert``
-            and ``variation``, as the stages of ``vlatool.evaluate`` measure them.
+        row: row with ``success`` and ``success_chance`` (the better control on some of the same seeds), or with
+            ``skill_expert`` and ``variation``, as the stages of ``vlatool.evaluate`` measure them.
     """
     recorded, played = (replace(judged, name=name) for judged in (_recorded(row), _played(row)))
     table = (*recorded.table, *played.table)
@@ -164,8 +164,8 @@ def lower_bound(own: Measurement, chance: Measurement) -> float:
     """Return the lower bound, at 95 %, of the difference of two success rates (Newcombe 1998, method 10).
 
     Args:
-        own, chance: With their Wilson intervals, which allow for episodes that begin alike; those of ``samples``
-            independent episodes where there is none.
+        own, chance: success rates with their Wilson intervals, which allow for episodes that begin alike; without one,
+            those of ``samples`` independent episodes are used.
     """
     low = wilson(round(own.value * own.samples), own.samples)[0] if own.low is None else own.low
     high = wilson(round(chance.value * chance.samples), chance.samples)[1] if chance.high is None else chance.high

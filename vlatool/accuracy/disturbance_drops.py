@@ -1,4 +1,4 @@
-"""What disturbances cost: the same episodes of a variant and of what it is held against, under each of them."""
+"""Cost of disturbances: the same episodes of a variant and of its baseline under each of them."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def with_disturbed(
     """Return the row with how it does under each disturbance, the worst kind first, and its strengths in their order.
 
     Args:
-        row: Of the variant, undisturbed.
+        row: row of the variant, undisturbed.
         played: Disturbance -> episodes of the variant.
-        reference: The same of what it is held against; None where there is nothing.
+        reference: the same of the baseline; None without one.
     """
     records, raw = [], dict[str, list[float]]()
     wins = count = 0
@@ -61,8 +61,8 @@ def without_effect(name: str, played: Mapping[Disturbance, Played], undisturbed:
     """Yield a warning for each disturbance that changed nothing, so that what is kept under it shows nothing.
 
     Args:
-        played: Disturbance -> its episodes, of one seed after the other.
-        undisturbed: Those of the same seeds without any.
+        played: disturbance -> its episodes, seed by seed.
+        undisturbed: episodes of the same seeds without a disturbance.
     """
     for (kind, strength), outcomes in played.items():
         if strength and list(map(_course, outcomes)) == list(map(_course, undisturbed)):
@@ -97,8 +97,8 @@ def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measur
     """Return disturbance -> how many more episodes fail than of the baseline, each with an interval.
 
     Args:
-        row: Of ``with_disturbed``; those that have no reference are left out.
-        confidence: Of all intervals together (Bonferroni).
+        row: row from ``with_disturbed``; disturbances that have no reference are left out.
+        confidence: coverage of all intervals together (Bonferroni).
     """
     drops = {}
     kinds = [

@@ -1,4 +1,4 @@
-"""Why the episodes of two policies leave nothing to be claimed: a value, and its words."""
+"""Reasons for which the episodes of two policies decide nothing, as values with their words."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MIN_KNOWN_SHARE = 0.9
 
 
 class Cause(Enum):
-    """What makes episodes decide nothing; the value is the text about it."""
+    """Reason for which episodes decide nothing; the value is the text about it."""
 
     RARELY_KNOWN = f"known of both in {{count}} of {{of}} common successes, and it takes {MIN_KNOWN_SHARE:.0%}"
     MISSING_MORE_OFTEN = "missing in {count} common successes where the baseline has it, the other way round in {of}"
@@ -25,7 +25,7 @@ class Cause(Enum):
 
 @dataclass(frozen=True)
 class Doubt:
-    """Why episodes decide nothing.
+    """A reason for which episodes decide nothing, with its numbers.
 
     Args:
         count: number of what there is too little of.

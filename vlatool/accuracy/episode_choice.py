@@ -11,7 +11,7 @@ from vlatool.report import Row
 
 
 def differs_most(base: Sequence[Outcome], own: Sequence[Outcome]) -> int:
-    """Return the place of the pair that differs most: in success, then in steps, then in the worst ratio of motion."""
+    """Return the index of the pair that differs most: in success, then in steps, then in the worst ratio of motion."""
 
     def difference(index: int) -> tuple[float, ...]:
         one, two = base[index], own[index]
@@ -23,7 +23,7 @@ def differs_most(base: Sequence[Outcome], own: Sequence[Outcome]) -> int:
 
 
 def stands_out(outcomes: Sequence[Outcome]) -> int:
-    """Return the place of the first episode that fails; of the longest one where none does."""
+    """Return the index of the first episode that fails; of the longest one where none does."""
     return max(range(len(outcomes)), key=lambda index: (not outcomes[index].success, _length(outcomes[index]), -index))
 
 

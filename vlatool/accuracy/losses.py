@@ -1,4 +1,4 @@
-"""How far each recorded sample is off, and how much worse one policy is than another on the same samples."""
+"""Error of each recorded sample, and the additional error of one policy over another on the same samples."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def drop(
     Args:
         candidate, baseline: (N,) losses.
         episodes: (N,) episode of each sample; each sample is its own when None.
-        confidence: Of the two-sided interval.
+        confidence: coverage of the two-sided interval.
         answers: Whether losses are shares of wrong answers.
 
     Returns:

@@ -1,4 +1,4 @@
-"""How a variant moves, beside what it is held against: in the episodes in which both succeed, and by task."""
+"""Motion of a variant relative to its baseline: in the episodes in which both succeed, and by task."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vlatool.stats.success_sequential import exact_drop
 Array = NDArray[np.float64]
 AGAINST = {series.TASK: tables.AGAINST_BY_TASK, series.INSTRUCTION: tables.AGAINST_BY_INSTRUCTION}
 WORST_TASK_PREFIX = ", the worst of "
-"""What follows the name of the task in the note of that measurement."""
+"""Text after the name of the task in the note of that measurement."""
 CONFIDENCE = 0.95
 DOUBT = 0.25
 """Chance (an exact sign test) below which it is not an accident that the variant's values are missing more often: the
@@ -36,7 +36,7 @@ def compare_motion(baseline: Row, row: Row) -> Row:
     """Return the row with how it moves as a multiple of the baseline, its worst task, and both by task.
 
     Args:
-        baseline, row: Of ``success_row``, of the same episodes.
+        baseline, row: rows of ``success_row`` for the same episodes.
     """
     pairs = _Pairs(baseline, row)
     tables = {title: table for key, title in AGAINST.items() if (table := pairs.table(key))}
@@ -55,7 +55,7 @@ def ratios(baseline: Row, row: Row, names: Collection[str], confidence: float = 
     """Return metric -> how a variant moves as a multiple of the baseline, in episodes in which both succeed.
 
     Args:
-        baseline, row: Of ``success_row``, of the same episodes.
+        baseline, row: rows of ``success_row`` for the same episodes.
         names: Metrics; those that the episodes do not have are left out.
         confidence: Coverage of each interval.
     """
@@ -66,7 +66,7 @@ def doubts(baseline: Row, row: Row, names: Collection[str]) -> dict[str, Doubt]:
     """Return metric -> why its missing values leave nothing to be claimed of it; those that are known are left out.
 
     Args:
-        baseline, row: Of ``success_row``, of the same episodes.
+        baseline, row: rows of ``success_row`` for the same episodes.
         names: Metrics; those that the baseline's episodes do not have are left out.
     """
     pairs, known = _Pairs(baseline, row), known_of(baseline)
@@ -84,7 +84,7 @@ def pairs_above_none(baseline: Row, row: Row, names: Collection[str]) -> dict[st
     """Return metric -> in how many of the episodes in which both succeed a variant has any, and of how many.
 
     Args:
-        baseline, row: Of ``success_row``, of the same episodes.
+        baseline, row: rows of ``success_row`` for the same episodes.
         names: Metrics; those of which the baseline has some, or that the episodes do not have, are left out.
     """
     return {name: counts for name, counts in _Pairs(baseline, row).above_none() if name in names}

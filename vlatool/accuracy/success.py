@@ -1,4 +1,4 @@
-"""Whether an episode succeeded, as the info of its steps tells it."""
+"""Success of an episode, from the info of its steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from vlatool.errors import DataError
 
 KEYS = ("success", "is_success")
-"""Where success may stand in the info of a step; the first that is there counts."""
+"""Keys of success in the info of a step; the first one that is present counts."""
 FIX = (
     "let every episode tell it, also when it fails: info['success'] (or info['is_success']) is True or False in the "
     "last step, or in an earlier one; a reward alone does not say it (docs/guides/environment.md)"
@@ -19,7 +19,7 @@ FIX = (
 
 
 class Success:
-    """Listens to the info of every step of one episode: what was told last counts."""
+    """Success of one episode, from the info of every step: the last value counts."""
 
     def __init__(self) -> None:
         self._said: bool | None = None

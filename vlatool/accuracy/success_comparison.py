@@ -21,7 +21,7 @@ from vlatool.stats.starts import distinct_starts, has_too_few_starts, independen
 from vlatool.stats.success_sequential import exact_drop
 
 CLOCK = "time"
-"""Where an environment tells its clock in the info of a step."""
+"""Key of the environment's clock in the info of a step."""
 MOST_INSTRUCTIONS = 64
 """Wordings up to which each has a line in a table."""
 
@@ -31,12 +31,12 @@ class Outcome:
     """How one episode ended.
 
     Args:
-        steps: Control steps that it took.
-        instruction: What the policy was told; empty for one that takes no text.
-        motion: Metric of motion -> its number.
-        refused: What the environment told of the robot's body and could not be used -> why.
-        series: What was asked for to be shown: ``position.x``, ``action.NAME``, ``fresh``, a number a step.
-        start: Of the first observation, a hash; empty where it is not known.
+        steps: control steps that it took.
+        instruction: instruction of the policy; empty for one that takes no text.
+        motion: metric of motion -> its value.
+        refused: numbers of the robot's body that the environment gave and that could not be used -> why.
+        series: values of each step to be shown: ``position.x``, ``action.NAME``, ``fresh``.
+        start: hash of the first observation; empty where it is not known.
     """
 
     task: str
@@ -51,7 +51,7 @@ class Outcome:
 
     @property
     def begins(self) -> tuple[str, str | int]:
-        """What it shares with episodes that begin alike; one whose start is not known begins as no other."""
+        """Identity that episodes with the same beginning share; one whose start is not known begins as no other."""
         return self.task, self.start or self.seed
 
 
@@ -134,7 +134,7 @@ def _refused(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
 
 
 def _places(table: list[dict[str, Any]], column: str, values: Sequence[str]) -> list[float]:
-    """Return the place of each value in a table."""
+    """Return the index of each value in a table."""
     places = {record[column]: float(index) for index, record in enumerate(table)}
     return [places[value] for value in values]
 

@@ -66,16 +66,16 @@ class Latency(Measure):
     warmup: int = Field(10, ge=1, description="inferences before the first that counts")
     rate: float = Field(0.0, ge=0, le=10_000, description="pace of a control loop in Hz; back to back when 0")
     sustained: float = Field(
-        0.0, ge=0, le=LONGEST_S, description="run each so many seconds, and compare their end with the start"
+        0.0, ge=0, le=LONGEST_S, description="run each for this many seconds, and compare the end with the start"
     )
     threads: int = Field(1, ge=1, le=1024, description="intra-op threads")
     pin: str = Field("", description="processors to run on, such as 0-3 or 2,4; all when empty")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
     cold: bool = Field(True, description="also load each bundle in fresh processes: cold start, and memory by part")
     phase: bool = Field(True, description="also time the parts of an inference: encoding, each graph, decoding")
-    answers: bool = Field(True, description="also look for answers that change in the run, or come from memory")
+    answers: bool = Field(True, description="also check for answers that change during the run or come from memory")
     reach: bool = Field(
-        True, description="also time a large matrix product in the same engine, and which share of its speed is reached"
+        True, description="also time a large matrix product in the same engine, and report the share of its speed"
     )
     cores: int = Field(0, ge=0, le=4096, description="processors that the policy may use; all when 0")
     memory_mb: float = Field(

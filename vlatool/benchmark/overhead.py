@@ -19,7 +19,7 @@ from vlatool.measures.latency import BARE_RUN_P50, OVERHEAD_IN_TURN_P50, OVERHEA
 from vlatool.report import Report, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.policy import Policy
-from vlatool.runtime.program import draw
+from vlatool.runtime.program import draw, schedule_arrays
 from vlatool.stage.base import Context, Measure
 from vlatool.stats.intervals import quantile_interval
 
@@ -34,7 +34,7 @@ ROUND = 40
 class Overhead(Measure):
     """Measure what ``infer`` adds to the engine's bare ``run()`` on the same inputs.
 
-    Rounds of consecutive calls of one kind, as a controller makes them, alternate with rounds of the other; the
+    Rounds of consecutive calls of one kind, as a controller makes, alternate with rounds of the other; the
     overhead is the median over pairs of rounds of the difference of their medians. A second figure is the harder case:
     single calls of both kinds in turn, so that each finds the processor's caches as the other left them.
     """
@@ -111,11 +111,7 @@ def _own_values(step: ProgramStep) -> dict[str, Any]:
     random = np.random.default_rng(0)
     values: dict[str, Any] = {name: draw(wanted, random) for name, wanted in step.noise.items()}
     values |= {name: np.zeros(kept["shape"], kept.get("dtype", "float32")) for name, kept in step.keep.items()}
-    for name, numbers in step.schedule.items():
-        values[name] = np.array(
-            numbers[:1], np.int64 if all(isinstance(number, int) for number in numbers) else np.float32
-        )
-    return values
+    return values | {name: numbers[0] for name, numbers in schedule_arrays(step).items()}
 
 
 def _median_us(call: Callable[[Any], Any], arguments: Sequence[Any]) -> float:

@@ -1,1 +1,1 @@
-"""What a policy would do on a board."""
+"""Predictions for a policy on a board."""

@@ -13,7 +13,7 @@ from vlatool.boards.select import Choice, Wants, choose, in_the_cloud
 from vlatool.boards.simulate import Change, bounds, changes, parts_of, timeline
 from vlatool.boards.torch_workload import counted_apart
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, OutputError, SourceError, UsageError, fix_for, suggest
+from vlatool.errors import DataError, OutputError, SourceError, UsageError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.files.ownership import add_to_ledger
 from vlatool.graph.workload import PRECISIONS, Workload, workload
@@ -63,9 +63,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
         raise UsageError("--per-chunk asks how often the loop ticks.", "give --hz, too, or leave it out")
     for precision in asked.precisions:
         if precision not in PRECISIONS:
-            raise UsageError(
-                f"--precision is '{precision}'; {suggest(precision, PRECISIONS)}.", fix_for(precision, PRECISIONS)
-            )
+            raise UsageError.unknown(f"--precision is '{precision}'", precision, PRECISIONS)
     if asked.platform:
         sheet = load_platform(asked.platform)
         asked = replace(
@@ -203,10 +201,7 @@ def simulate(
     profile.mode(name)
     asked = Candidate(profile, name, engine or profile.engine, precision)
     if precision and precision not in asked.figures.dtypes:
-        raise UsageError(
-            f"--precision is '{precision}'; {suggest(precision, asked.figures.dtypes)}.",
-            fix_for(precision, asked.figures.dtypes),
-        )
+        raise UsageError.unknown(f"--precision is '{precision}'", precision, asked.figures.dtypes)
     bundle = open_bundle(source, context)
     spec, load = bundle.manifest.spec, count_workload(bundle, context)
     candidate = asked if engine or precision else replace(asked, engine=_engine_of(bundle, profile, load))

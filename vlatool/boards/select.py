@@ -72,7 +72,6 @@ class Choice:
     Args:
         state: One of ``STATES``.
         outcome: None when it was ruled out before anything was computed.
-        reason: Reason in words.
         others: Further ways that were looked at on this board.
     """
 

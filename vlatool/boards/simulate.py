@@ -21,7 +21,6 @@ class Bound:
     """One phase and what holds it back.
 
     Args:
-        phase: The phase.
         shares: ``compute``, ``memory``, ``overhead`` -> share of its roofline time (0-1).
     """
 
@@ -39,7 +38,6 @@ class Change:
     """What one change would give.
 
     Args:
-        name: Name in words.
         outcome: The changed policy on the same board.
     """
 

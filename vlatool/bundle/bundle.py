@@ -113,7 +113,6 @@ class Bundle:
         """Return the content of a recorded file: the very bytes that were verified, read once.
 
         Args:
-            name: name in the manifest.
             allowed: name of the limit on its size.
 
         Raises:
@@ -222,11 +221,8 @@ def digest_of(content: bytes) -> bytes:
 
 def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file as hex."""
-    digest = hashlib.sha256()
     with path.open("rb", buffering=0) as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+        return verified_read.hash_handle(stream.fileno())
 
 
 def _read_manifest(root: Path) -> Any:

@@ -1,21 +1,22 @@
-"""``manifest.json``: what a bundle is, which files it has, and how its graphs are run."""
+"""``manifest.json``: what a bundle contains, and how its graphs are run."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 from vlatool.bundle.program import ProgramStep, check_program, program_from
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import BundleError
 from vlatool.files.limits import check_limit
-from vlatool.files.validate import finite_number, integer, known_keys, mapping, path_problem, sequence, short_repr, text
+from vlatool.files.messages import field_values, to_json
+from vlatool.files.validate import finite_number, integer, mapping, path_problem, sequence, short_repr, text
 
 SCHEMA = 1
 GOLDEN_TOLERANCE = 0.05
-"""Allowed relative L2 difference from the golden action where a manifest says none."""
+"""Allowed relative L2 difference from the golden action if the manifest does not set one."""
 COMPUTES = ("", "float32", "bfloat16")
 SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -34,8 +35,8 @@ class Graph:
 
     Args:
         file: path inside the bundle.
-        precision: share of the multiply-accumulates that run in each dtype, as exported (0-1); ``int4 weights`` where
-            the weights alone are int4.
+        precision: share of the multiply-accumulates that run in each dtype, as exported (0-1); ``int4 weights`` if
+            only the weights are int4.
         opset: opset of the default ONNX domain.
         compute: dtype in which the engine computes what is not quantized: ``bfloat16``, or float32 when empty.
     """
@@ -63,25 +64,26 @@ class Manifest:
 
     Args:
         name: name of the policy.
-        version: version of the policy, as its author counts.
+        version: version of the policy, assigned by its author.
         spec: what the policy consumes and produces.
         graphs: graph name -> graph; empty in a source bundle.
         program: how the graphs are run, in order.
-        files: path inside the bundle -> SHA-256 and size, of every file but the reports.
+        files: path inside the bundle -> SHA-256 and size, for every file except the reports.
         parent: ``sha256:...`` of the bundle that this one was made from.
-        made_by: version of vlatool, stage, options, versions of the packages that change the result.
-        build: build record: for each stage from the source to this bundle what ``made_by`` says, the seed, the hash
-            of its input, the SHA-256 of its graphs, of its input files and of its calibration samples.
-        source: factory and hashes of the code and weights (a source bundle, and those exported from it).
+        made_by: version of vlatool, stage, options, and versions of the packages that affect the result.
+        build: build record: for each stage from the source to this bundle, the content of ``made_by``, the seed, the
+            hash of its input, and the SHA-256 of its graphs, its input files and its calibration samples.
+        source: factory and hashes of code and weights (in a source bundle, and in those exported from it).
         environment: factory and tasks of the closed-loop evaluation.
         parts: part of the policy -> globs of module names.
-        golden: file with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
+        golden: file with golden inputs and outputs; the outputs are the graphs' reference results, computed operator by
+            operator.
         golden_tolerance: largest relative L2 difference from the golden action with which a machine loads the bundle,
-            from what was measured when it was made; ``GOLDEN_TOLERANCE`` when 0.
+            derived from the difference measured when it was made; ``GOLDEN_TOLERANCE`` when 0.
         golden_chunk_tolerance: the same for the action in physical units, each element from the offset of its
             statistics and in units of their spread; ``golden_tolerance`` when 0.
-        findings: what a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
-            and ``gate`` refuse the bundle unless each is overruled by its name.
+        findings: problems that a stage found: ``name``, ``message`` and the measured values. ``load``, ``optimize``
+            and ``gate`` refuse the bundle unless each finding is accepted by name.
         accuracy: measured accuracy: name -> value, interval, samples.
         description: one sentence.
         license: SPDX identifier of the policy's licence.
@@ -132,15 +134,14 @@ class Manifest:
 
     @classmethod
     def from_dict(cls, data: Any) -> Manifest:
-        """Build from the parsed JSON.
+        """Build a manifest from the parsed JSON.
 
         Raises:
             BundleError: for a newer schema, a missing key or a wrong type.
             SpecError: for an impossible spec or program.
         """
-        values = mapping(data, "The manifest", BundleError)
-        check_schema(values.get("schema"))
-        known_keys(values, [item.name for item in fields(cls)], "The manifest", BundleError)
+        check_schema(mapping(data, "The manifest", BundleError).get("schema"))
+        values = field_values(cls, data, "The manifest", BundleError)
         for item in fields(cls):
             if item.name in values:
                 _check_type(item.name, values[item.name], item)
@@ -160,24 +161,17 @@ class Manifest:
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what ``from_dict`` turns back into an equal manifest; empty values are left out."""
-        plain: dict[str, Any] = {"schema": self.schema, "name": self.name, "version": self.version}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name not in plain and value:
-                plain[item.name] = value
-        plain["spec"] = self.spec.to_dict()
-        plain["graphs"] = {name: _nonempty(graph) for name, graph in self.graphs.items()}
-        plain["program"] = [_nonempty(step) for step in self.program]
-        plain["files"] = {path: asdict(record) for path, record in sorted(self.files.items())}
-        return plain
+        """Return a mapping that ``from_dict`` turns back into an equal manifest; defaults are left out."""
+        plain: dict[str, Any] = {"schema": self.schema, **to_json(self, defaults=False)}
+        plain |= {"graphs": plain.get("graphs", {}), "program": plain.get("program", [])}
+        return plain | {"files": dict(sorted(plain.get("files", {}).items()))}
 
 
 def check_files(manifest: Manifest) -> None:
-    """Check that every file which the manifest names has a record: golden file, statistics and tokenizers.
+    """Check that every file that the manifest names has a record: golden file, statistics and tokenizers.
 
     Raises:
-        BundleError: naming the first that has none.
+        BundleError: naming the first file without one.
     """
     named = {manifest.golden: "the golden file"} if manifest.golden else {}
     for tensor in (*manifest.spec.inputs, *manifest.spec.outputs) if manifest.graphs else ():
@@ -192,7 +186,7 @@ def check_schema(schema: Any) -> None:
     """Check the version of a manifest.
 
     Raises:
-        BundleError: when it is newer than this vlatool, or none.
+        BundleError: when it is newer than this vlatool supports, or not a version.
     """
     if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
         raise BundleError(f"The manifest has the schema {short_repr(schema)}; this vlatool reads 1 to {SCHEMA}.")
@@ -204,7 +198,7 @@ def check_schema(schema: Any) -> None:
 
 
 def _check_type(name: str, value: Any, item: Any) -> None:
-    """Check a value against the type that its field has by default: text, a mapping or a list."""
+    """Check a value against the type of its field's default: text, a mapping or a list."""
     where = f"The manifest's '{name}'"
     if name in ("spec", "schema"):
         return
@@ -221,16 +215,14 @@ def _check_type(name: str, value: Any, item: Any) -> None:
 
 
 def _graph(name: str, data: Any) -> Graph:
-    values = mapping(data, f"The graph '{name}'", BundleError)
-    known_keys(values, [item.name for item in fields(Graph)], f"The graph '{name}'", BundleError)
+    values = field_values(Graph, data, f"The graph '{name}'", BundleError)
     if "file" not in values:
         raise BundleError(f"The graph '{name}' has no 'file'.", "export the policy again")
     return Graph(**values)
 
 
 def _record(path: str, data: Any) -> FileRecord:
-    values = mapping(data, f"The record of {short_repr(path)}", BundleError)
-    known_keys(values, ("sha256", "bytes"), f"The record of {short_repr(path)}", BundleError)
+    values = field_values(FileRecord, data, f"The record of {short_repr(path)}", BundleError)
     digest = values.get("sha256")
     if not isinstance(digest, str) or not SHA256.fullmatch(digest):
         raise BundleError(f"The record of {short_repr(path)} has the SHA-256 {short_repr(digest)}, not 64 hex digits.")
@@ -253,12 +245,3 @@ def _entries(data: Any, where: str, keys: tuple[str, ...]) -> tuple[dict[str, An
         named = " and ".join(f"'{key}'" for key in keys)
         raise BundleError(f"The manifest has a malformed '{where}'; it must be a list of mappings with {named}.")
     return tuple(dict(entry) for entry in data)
-
-
-def _nonempty(value: Any) -> dict[str, Any]:
-    plain = {}
-    for item in fields(value):
-        content = getattr(value, item.name)
-        if content not in ({}, [], "", 0) and not (item.name == "repeat" and content == 1):
-            plain[item.name] = content
-    return plain

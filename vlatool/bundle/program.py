@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 from vlatool.bundle.spec import DTYPES, PolicySpec
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
+from vlatool.files.messages import field_values
 from vlatool.files.validate import element_count, finite_number, known_keys, mapping, short_repr, text
 
 DISTRIBUTIONS = ("normal", "uniform", "zeros")
@@ -125,7 +126,6 @@ def program_from(data: Any) -> tuple[ProgramStep, ...]:
     Raises:
         SpecError: for anything but a list of mappings with ``graph``, ``feeds`` and ``gives``.
     """
-    words = [item.name for item in fields(ProgramStep)]
     if not isinstance(data, list | tuple):
         raise SpecError(f"The program must be a list of steps; got {type(data).__name__}.")
     check_limit("steps", len(data), "The program", SpecError)
@@ -133,8 +133,7 @@ def program_from(data: Any) -> tuple[ProgramStep, ...]:
     for number, entry in enumerate(data):
         if not isinstance(entry, Mapping) or not {"graph", "feeds", "gives"} <= set(entry):
             raise SpecError(f"Step {number} of the program lacks 'graph', 'feeds' or 'gives': {short_repr(entry)}.")
-        known_keys(entry, words, f"Step {number} of the program", SpecError)
-        steps.append(ProgramStep(**entry))
+        steps.append(ProgramStep(**field_values(ProgramStep, entry, f"Step {number} of the program", SpecError)))
     return tuple(steps)
 
 

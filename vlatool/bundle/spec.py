@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
-from vlatool.files.validate import integer, known_keys, mapping, path_problem, short_repr, text
+from vlatool.files.messages import field_values, to_json
+from vlatool.files.validate import integer, path_problem, short_repr, text
 
 DTYPES = (
     "float32", "float16", "int64", "int32", "uint8", "bool", "float64", "int8", "int16", "uint16", "uint32", "uint64",
@@ -19,7 +20,7 @@ NORMALISATIONS = ("none", "mean_std", "min_max", "quantiles")
 STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99")}
 MODES = ("", "delta", "absolute", "velocity", "relative")
 MAX_INDICES = 2**18
-"""Labels that are made up for a discrete output that names none: more than any vocabulary of tokens has."""
+"""Most labels that are generated for a discrete output without labels: more than any token vocabulary has."""
 
 
 MAX_HZ = 100_000
@@ -30,23 +31,21 @@ class TensorSpec:
     """One named input or output of a policy.
 
     Args:
-        name: the key of the observation, or of the result.
-        shape: axes, the batch first; a string names an axis whose length is free. Empty for one number without
-            axes, which an action is not.
-        dtype: what the graph sees: float32, float16, float64, int8 to int64, uint8 to uint64 or bool; uint8 holds
-            pixels.
+        name: key in the observation or in the result.
+        shape: axes, the batch first; a string names a dynamic axis. Empty for a scalar, which an action may not be.
+        dtype: dtype in the graph: float32, float16, float64, int8 to int64, uint8 to uint64 or bool; uint8 for pixels.
         kind: ``tensor``; ``text`` (the observation holds a string, the graph sees token ids); ``discrete`` (an output
             of logits over ``labels``; the action is the index of the largest).
         unit: one unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
-        labels: a name for each element of the last axis; the indices, when a discrete output names none.
-        mode: how a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
-        normalisation: how the runtime maps physical values to what the graph sees (outputs: and back): ``none``,
-            ``mean_std``, ``min_max`` or ``quantiles``.
+        labels: names of the elements of the last axis; the indices for a discrete output without names.
+        mode: way in which a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
+        normalisation: mapping from physical values to the graph's values, and back for outputs: ``none``, ``mean_std``,
+            ``min_max`` or ``quantiles``.
         statistics: ``file#key`` of the statistics that the normalisation needs; file relative to the assets.
         tokenizer: file of the tokenizer, relative to the assets (``kind: text``).
         max_tokens: number of ids that the tokenizer pads or cuts to (``kind: text``).
-        finite: False for an input of floats in which the policy itself handles NaN and infinity, such as a depth image
-            without a return; everywhere else they are refused.
+        finite: False for a float input in which the policy itself handles NaN and infinity, such as missing returns in
+            a depth image; in any other input they are refused.
     """
 
     name: str
@@ -138,13 +137,13 @@ class TensorSpec:
 
     @property
     def width(self) -> int:
-        """Length of the last axis; 0 when it is free or there is none."""
+        """Length of the last axis; 0 when it is dynamic or there is none."""
         last = self.shape[-1] if self.shape else 0
         return last if isinstance(last, int) else 0
 
     @property
     def elements(self) -> int:
-        """Number of elements with every free axis counted as 1."""
+        """Number of elements with every dynamic axis counted as 1."""
         return math.prod(axis if isinstance(axis, int) else 1 for axis in self.shape)
 
     def units(self) -> tuple[str, ...]:
@@ -153,25 +152,22 @@ class TensorSpec:
 
     @property
     def gripper(self) -> int | None:
-        """The element of an action that is called a gripper, None when there is none, or several."""
+        """Index of the action's element whose label contains "grip"; None when there is none or more than one."""
         found = [index for index, label in enumerate(self.labels) if "grip" in label.lower()]
         return found[0] if len(found) == 1 and self.kind != "discrete" else None
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TensorSpec:
-        """Build from a mapping as in ``manifest.json`` or ``policy.yaml``.
+        """Build a tensor's spec from a mapping as in ``manifest.json`` or ``policy.yaml``.
 
         Raises:
             SpecError: for an unknown key or an impossible value.
         """
         name = short_repr(data.get("name", "?") if isinstance(data, Mapping) else data)
-        values = _known_only(cls, data, f"tensor {name}")
+        values = field_values(cls, data, f"The tensor {name}", SpecError)
         if values.get("kind") == "text":
             values.setdefault("dtype", "int64")
-            values.setdefault("shape", [1, values.get("max_tokens", 1)])
-        for key in ("shape", "labels", "unit"):
-            if isinstance(values.get(key), list):
-                values[key] = tuple(values[key])
+            values.setdefault("shape", (1, values.get("max_tokens", 1)))
         if "name" not in values or not isinstance(values.get("shape"), tuple):
             raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {short_repr(values.get('shape'))}.")
         if values.get("kind") == "discrete":
@@ -179,12 +175,13 @@ class TensorSpec:
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields that differ from their defaults, lists for tuples."""
-        return _plain(self)
+        """Return the fields that differ from their defaults, with tuples as lists."""
+        plain: dict[str, Any] = to_json(self, defaults=False)
+        return plain
 
 
 def _indices(shape: tuple[Any, ...]) -> tuple[str, ...]:
-    """Labels of actions without names, such as 256 action tokens: the indices of the last axis, unless it is free."""
+    """Return labels for unnamed actions, such as 256 action tokens: the last axis' indices, none if it is dynamic."""
     width = shape[-1] if shape else 0
     return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MAX_INDICES else ()
 
@@ -195,10 +192,10 @@ class PolicySpec:
 
     Args:
         inputs: inputs in the order in which the source takes them.
-        outputs: the first is the action.
+        outputs: outputs, the action first.
         control_hz: rate of the control loop in Hz.
-        chunk: actions in one inference.
-        execute: actions that are executed before the next inference; 0 means the whole chunk.
+        chunk: number of actions from one inference.
+        execute: number of actions executed before the next inference; 0 for the whole chunk.
     """
 
     inputs: tuple[TensorSpec, ...]
@@ -241,25 +238,25 @@ class PolicySpec:
 
     @property
     def inference_hz(self) -> float:
-        """Inferences per second that the control rate and the executed part of the chunk ask for."""
+        """Inferences per second that the control rate and the number of executed actions require."""
         return self.control_hz / self.executed_actions
 
     @property
     def executed_actions(self) -> int:
-        """Actions of an inference that are executed."""
+        """Number of actions executed from each chunk."""
         return self.execute or self.chunk
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PolicySpec:
-        """Build from a mapping.
+        """Build a policy's spec from a mapping.
 
         Raises:
             SpecError: for a missing or unknown key or an impossible value.
         """
-        values = _known_only(cls, data, "spec")
+        values = field_values(cls, data, "The spec", SpecError)
         for key in ("inputs", "outputs"):
             listed = values.get(key)
-            if not isinstance(listed, list | tuple):
+            if not isinstance(listed, tuple):
                 raise SpecError(f"The spec needs '{key}', a list of tensors; got {short_repr(listed)}.")
             values[key] = tuple(TensorSpec.from_dict(item) for item in listed)
         if "control_hz" not in values:
@@ -268,23 +265,5 @@ class PolicySpec:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a mapping that ``from_dict`` turns back into an equal spec."""
-        plain = _plain(self)
-        plain["inputs"] = [tensor.to_dict() for tensor in self.inputs]
-        plain["outputs"] = [tensor.to_dict() for tensor in self.outputs]
+        plain: dict[str, Any] = to_json(self, defaults=False)
         return plain
-
-
-def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
-    values = mapping(data, f"The {where}", SpecError)
-    known_keys(values, [field.name for field in fields(cls)], f"The {where}", SpecError)
-    return values
-
-
-def _plain(value: Any) -> dict[str, Any]:
-    """Return the non-default fields of a dataclass, tuples as lists (required fields always)."""
-    plain = {}
-    for field in fields(value):
-        item = getattr(value, field.name)
-        if item != field.default:
-            plain[field.name] = list(item) if isinstance(item, tuple) else item
-    return plain

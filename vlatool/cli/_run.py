@@ -54,7 +54,7 @@ SOURCE_FLAG = _flag("source", Annotated[str, SOURCE])
 NEW_BUNDLE = typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)
 REPORTS = typer.Option("-o", "--output", help="directory for report.html, report.md and report.json")
 EVENTS = typer.Option("--events", help="directory for events that TensorBoard reads: loss, learning rate, success")
-TARGET = typer.Option("--target", help="run there, through ssh: user@host, or a Host of your ssh config")
+TARGET = typer.Option("--target", help="machine to run on, through ssh: user@host, or a Host of your ssh config")
 VIDEO = typer.Option(
     "--video", help="file for a video of the episode that differs most (alone: of a failed one): .gif, .mp4"
 )

@@ -19,7 +19,7 @@ from vlatool.files.printable import printable
 if TYPE_CHECKING:
     from vlatool.stage.cache import Contents, Entry
 
-app = typer.Typer(help="List and remove finished stages that are kept.", no_args_is_help=True,
+app = typer.Typer(help="List and remove finished stages in the cache.", no_args_is_help=True,
                   rich_markup_mode=None)  # fmt: skip
 SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
@@ -42,7 +42,7 @@ def size(cache: Place = None, as_json: AsJson = False) -> None:
 
 @app.command("list")
 def list_entries(cache: Place = None, as_json: AsJson = False) -> None:
-    """List what is kept, the least recently used first: age, size of its own, size that it shares, name."""
+    """List the cache, least recently used first: age, own size, shared size, name."""
     held = _contents(cache)
     if as_json:
         document(_head(held) | {"entries": [_entry_row(held, entry) for entry in held.entries]})
@@ -56,9 +56,9 @@ def list_entries(cache: Place = None, as_json: AsJson = False) -> None:
 
 @app.command("prune")
 def prune(
-    older_than: Annotated[str, typer.Option(help="remove what was not used for this long: 30d, 12h, 2w")] = "",
+    older_than: Annotated[str, typer.Option(help="remove what has not been used for this long: 30d, 12h, 2w")] = "",
     max_size: Annotated[str, typer.Option(help="remove the least recently used until this much is left: 5GB")] = "",
-    everything: Annotated[bool, typer.Option("--all", help="remove all that no running process uses")] = False,
+    everything: Annotated[bool, typer.Option("--all", help="remove everything that no running process uses")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="show what would be removed, and remove nothing")] = False,
     cache: Place = None,
     as_json: AsJson = False,

@@ -15,22 +15,22 @@ from vlatool.cli._options import AsJson, BundlePath, Force, ReportFolder
 def explain(
     bundle: BundlePath,
     baseline: Annotated[
-        Path | None, typer.Option(help="float32 bundle that it was made from; looked for in the cache when not given")
+        Path | None, typer.Option(help="float32 bundle that it was made from; searched for in the cache when not given")
     ] = None,
     data: Annotated[
-        Path | None, typer.Option(help="recorded observations to take errors on; the bundle's own when not given")
+        Path | None, typer.Option(help="recorded observations to measure errors on; the bundle's own when not given")
     ] = None,
     samples: Annotated[int, typer.Option(min=1, help="observations at most, spread over the recording")] = 16,
     threads: Annotated[int, typer.Option(min=1, help="intra-op threads")] = 1,
     seconds: Annotated[
-        float, typer.Option(min=1, help="the layers are measured on fewer observations when all would take longer")
+        float, typer.Option(min=1, help="time limit for measuring the layers, with fewer observations if necessary")
     ] = 300.0,
-    suggest: Annotated[bool, typer.Option(help="make and measure what could be done about it")] = True,
+    suggest: Annotated[bool, typer.Option(help="build and measure candidates for an improvement")] = True,
     output: ReportFolder = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show which layers cost the accuracy, where the time goes, what fell back, and what to do about it."""
+    """Show which layers cost accuracy, where the time goes, what fell back, and what to do about it."""
     from vlatool.explain import Options
     from vlatool.explain.child_process import explain_in_child
 

@@ -55,7 +55,7 @@ def run(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="of observations, noise and order; fresh, and recorded in the report, if unset"),
+        typer.Option(min=0, help="seed of observations, noise and order; random, and in the report, if unset"),
     ] = None,
     output: ReportFolder = None,
     junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
@@ -96,11 +96,11 @@ def run(
 
 @app.command("init")
 def init(
-    directory: Annotated[Path, typer.Argument(help="of the repository")] = Path(),
+    directory: Annotated[Path, typer.Argument(help="root of the repository")] = Path(),
     baseline: Annotated[Path, typer.Option(help="bundle to compare with, relative to the repository")] = Path(
         "models/baseline"
     ),
-    candidate: Annotated[Path, typer.Option(help="what a change produces, relative to the repository")] = Path(
+    candidate: Annotated[Path, typer.Option(help="bundle that a change produces, relative to the repository")] = Path(
         "policy"
     ),
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     cls=group_with("select"), no_args_is_help=True, rich_markup_mode=None,
-    help="Say which board runs a policy, and in which precision: vlatool hwselect SOURCE --hz 20.",
+    help="Find the boards that can run a policy, and the precision to use: vlatool hwselect SOURCE --hz 20.",
 )  # fmt: skip
 
 Profiles = Annotated[
-    list[str] | None, typer.Option(help="look at this profile only; may be repeated", autocompletion=_complete.profiles)
+    list[str] | None, typer.Option(help="use only this profile; may be repeated", autocompletion=_complete.profiles)
 ]
 POINTS = "published latencies: a CSV file with device, device_class, runtime, model, precision, metric, value"
 
@@ -35,32 +35,32 @@ def select(
     hz: Annotated[
         float | None,
         typer.Option(
-            help="inferences in a second; the policy's control rate when neither it nor --latency-ms is given"
+            help="inferences per second; the policy's control rate when neither this nor --latency-ms is given"
         ),
     ] = None,
     per_chunk: Annotated[
         bool,
         typer.Option(
             "--per-chunk",
-            help="--hz counts control ticks, and an inference may last as long as the executed actions of a chunk",
+            help="--hz is the control rate, and an inference may take as long as the executed actions of a chunk",
         ),
     ] = False,
-    latency_ms: Annotated[float | None, typer.Option(help="what one inference may take")] = None,
+    latency_ms: Annotated[float | None, typer.Option(help="time limit of one inference")] = None,
     max_watts: Annotated[float | None, typer.Option(help="limit of the board's power mode")] = None,
     max_price: Annotated[float | None, typer.Option(help="US dollars")] = None,
-    memory: Annotated[float | None, typer.Option(help="what the policy may take of the memory, GB")] = None,
+    memory: Annotated[float | None, typer.Option(help="memory that the policy may use, GB")] = None,
     battery_wh: Annotated[
-        float | None, typer.Option(help="the robot's battery, to say how long it drives the board")
+        float | None, typer.Option(help="the robot's battery, to say how long it powers the board")
     ] = None,
-    robots: Annotated[int, typer.Option(min=1, help="robots that are bought for")] = 1,
-    years: Annotated[float, typer.Option(help="years that they run")] = 3.0,
-    hours: Annotated[float, typer.Option(help="hours a day that they run")] = 8.0,
+    robots: Annotated[int, typer.Option(min=1, help="number of robots to buy boards for")] = 1,
+    years: Annotated[float, typer.Option(help="years that the robots run")] = 3.0,
+    hours: Annotated[float, typer.Option(help="hours a day that the robots run")] = 8.0,
     kwh_price: Annotated[float, typer.Option(help="US dollars for a kWh")] = 0.3,
     cloud: Annotated[bool, typer.Option(help="compare with a rented machine")] = False,
-    network_ms: Annotated[float, typer.Option(help="way to the rented machine and back")] = 40.0,
+    network_ms: Annotated[float, typer.Option(help="round trip to the rented machine")] = 40.0,
     precision: Annotated[
         list[str] | None,
-        typer.Option(help="allow this precision only; may be repeated", autocompletion=_complete.precisions),
+        typer.Option(help="allow only this precision; may be repeated", autocompletion=_complete.precisions),
     ] = None,
     platform: Annotated[
         str | None,
@@ -68,13 +68,13 @@ def select(
     ] = None,
     boards: Profiles = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="file that `vlatool profiles calibrate` keeps; all of them when not given")
+        Path | None, typer.Option(help="file that `vlatool profiles calibrate` stored; all of them when not given")
     ] = None,
     carry: Annotated[
         bool,
         typer.Option(
             "--carry-count",
-            help="write the policy's work to workload.json beside policy.yaml: torch is not needed again",
+            help="write the policy's operation counts to workload.json beside policy.yaml: torch is not needed again",
         ),
     ] = False,
     output: ReportFolder = None,
@@ -138,10 +138,10 @@ def score(
     refit: Annotated[
         float | None,
         typer.Option(
-            min=0, help="choose the model's scales anew without each held-out part, in so many seconds for each of them"
+            min=0, help="choose the model's scales again without each held-out part, in this many seconds for each"
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="of the split")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the split")] = 0,
     as_json: Annotated[
         bool, typer.Option("--json", help="print JSON on stdout; with --refit a table for each kind")
     ] = False,
@@ -173,11 +173,11 @@ def fit(
         Path, typer.Option("-o", "--output", help="directory for latency.npz and latency.json", show_default=False)
     ],
     seconds: Annotated[
-        float, typer.Option(min=0, help="for the search of the scales; 0 keeps those that are shipped")
+        float, typer.Option(min=0, help="seconds for the search of the scales; 0 keeps the shipped ones")
     ] = 300.0,
-    seed: Annotated[int, typer.Option(min=0, help="of the search")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the search")] = 0,
     anew: Annotated[
-        bool, typer.Option("--anew", help="begin the search at built-in scales, not at those of the shipped model")
+        bool, typer.Option("--anew", help="start the search from built-in scales, not from those of the shipped model")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -33,7 +33,7 @@ def inspect(
     probe: Annotated[
         bool,
         typer.Option(
-            "--probe", help="run it once, too, in a child process with limits; exits with 3 if load would refuse it"
+            "--probe", help="also run it once, in a child process with limits; exits with 3 if load would refuse it"
         ),
     ] = False,
     first_run: Annotated[

@@ -47,7 +47,7 @@ Distance = Annotated[
 Motion = Annotated[
     str | None, typer.Option(help="largest growth of jerk, path and task time where both succeed, such as 5%")
 ]
-WorstTask = Annotated[str | None, typer.Option(help="largest drop of the task that loses most, such as 3%")]
+WorstTask = Annotated[str | None, typer.Option(help="largest drop in any single task, such as 3%")]
 Accept = Annotated[
     list[str] | None, typer.Option(help="overrule a finding of a candidate by its name (see: vlatool inspect)")
 ]
@@ -62,7 +62,7 @@ EveryCandidate = Annotated[
     typer.Option("--every-candidate", help="play the episodes of every candidate, not only until one is chosen"),
 ]
 StudyPlace = Annotated[
-    str | None, typer.Option(help="file or database URL that keeps the trials, so that several machines share them")
+    str | None, typer.Option(help="file or database URL that stores the trials, so that several machines share them")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout: the report, or the plan with --dry-run")]
 
@@ -93,7 +93,7 @@ def optimize(
     threads: Annotated[int | None, typer.Option(min=1, help="threads while timing (1)")] = None,
     workers: Workers = None,
     cache: Annotated[Path | None, typer.Option(help="where finished stages are kept")] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="measure again, even what was measured before")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="measure again, without stored measurements")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and stop")] = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -102,7 +102,7 @@ def optimize(
     """Export a policy, quantize it in several ways, measure and evaluate each, and keep the fastest inside the budget.
 
     Exits 0 when a candidate keeps to the limits, 1 when none does (the nearest one is kept), and 5 when float32 does no
-    better than actions that do not look at the observation, so that nothing can be held against it.
+    better than actions that ignore the observation, so that it cannot serve as a reference.
     """
     from vlatool.hardware.profile import load_profile
     from vlatool.optimize import pipeline

@@ -112,13 +112,13 @@ def validate_profiles(
 def new_profile(
     name: Annotated[str, typer.Argument(help="name of the new profile", show_default=False)],
     like: Annotated[
-        str, typer.Option("--from", help="profile to begin with", autocompletion=_complete.profiles)
+        str, typer.Option("--from", help="profile to copy", autocompletion=_complete.profiles)
     ] = "raspberry-pi-5",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="file; NAME.yaml when not given")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace a file that exists")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a profile of your own to begin with: another one's figures under a new name."""
+    """Write a profile of your own to edit: another one's figures under a new name."""
     from vlatool.hardware.profile import copy_profile
 
     target = output or Path(f"{name}.yaml")
@@ -137,10 +137,10 @@ def calibrate_profile(
         Path, typer.Option("--from", help="report of `vlatool benchmark` on the board", show_default=False)
     ],
     mode: Annotated[str | None, typer.Option(help="power mode that it ran in; the default one when not given")] = None,
-    bundle: Annotated[Path | None, typer.Option(help="what was measured, when the report does not say")] = None,
+    bundle: Annotated[Path | None, typer.Option(help="measured precision, if the report does not say")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Give the latency model a measurement on a board: predictions for it are based on that from now on."""
+    """Give the latency model a measurement on a board, on which its predictions are based from now on."""
     from vlatool.bundle.bundle import Bundle
     from vlatool.graph.workload import workload
     from vlatool.hardware.profile import load_profile

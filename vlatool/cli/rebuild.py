@@ -34,14 +34,14 @@ def rebuild(
     source: Annotated[
         str | None,
         typer.Option(
-            help="policy directory, path.py:make, .onnx file or an earlier bundle; where it was if unset",
+            help="policy directory, path.py:make, .onnx file or an earlier bundle; its former location if unset",
             autocompletion=_complete.sources,
         ),
     ] = None,
     check: Annotated[bool, typer.Option("--check", help="exit 1 when a byte differs")] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the rebuilt bundle here")] = None,
     file: Annotated[
-        list[Path] | None, typer.Option(help="a file that an option named (calibration), when not beside the source")
+        list[Path] | None, typer.Option(help="file that an option named (calibration), if it is not beside the source")
     ] = None,
     force: Force = False,
     as_json: AsJson = False,

@@ -34,7 +34,7 @@ def make(
     name: Annotated[
         str,
         typer.Argument(
-            help="which shape (see: vlatool samples list)", show_default=False, autocompletion=_complete.samples
+            help="name of the sample (see: vlatool samples list)", show_default=False, autocompletion=_complete.samples
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new policy", show_default=False)],
@@ -42,7 +42,7 @@ def make(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a policy with seeded random weights, for latency and memory work."""
+    """Write a policy with seeded random weights, to study latency and memory."""
     from vlatool.boards.answer import carry_count
     from vlatool.samples import write_sample
 

@@ -25,7 +25,7 @@ def simulate(
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Show where a policy's time would go on a board, and what int8, fewer steps or pruning would give. Predicted."""
+    """Predict where a policy's time would go on a board, and what int8, fewer steps or pruning would save."""
     from vlatool.boards.answer import simulate, simulation_lines
 
     with progress() as context:

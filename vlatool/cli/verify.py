@@ -20,12 +20,12 @@ def verify(
     map: MapNames = None,
     samples: Annotated[int, typer.Option(min=1, max=100_000, help="observations at most, spread over the data")] = 32,
     tolerance: Annotated[float, typer.Option(help="largest relative error of an action, and of each stage")] = 1e-3,
-    seed: Annotated[int, typer.Option(min=0, help="of the noise that both are given")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the noise that both are given")] = 0,
     output: ReportFolder = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Check whether a policy gives what the code that it was made from gives, and if not, show which stage differs.
+    """Check whether a policy computes what its original code computes, and if not, show which stage differs.
 
     FUNCTION takes an observation (a dict of physical values, without a batch axis) and returns the action in physical
     units. Exits 1 when the actions differ.

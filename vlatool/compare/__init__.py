@@ -1,1 +1,1 @@
-"""Reports that were made apart, as one report: ``vlatool compare``."""
+"""Combine separate reports into one: ``vlatool compare``."""

@@ -1,4 +1,4 @@
-"""Recordings: readers, one file each format; what is selected of them, and observations that are drawn."""
+"""Recordings: readers, one file for each format, selections of recordings, and random observations."""
 
 from __future__ import annotations
 

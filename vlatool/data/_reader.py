@@ -1,4 +1,4 @@
-"""What every reader of recordings is, and which one reads what a person names: one file for each format."""
+"""Base class of the readers of recordings, one file for each format, and the choice of the reader for a path."""
 
 from __future__ import annotations
 
@@ -60,27 +60,27 @@ class Reader:
     """Reads recordings of one format, each a file or a directory."""
 
     suffix: ClassVar[str] = ""
-    """How names of its recordings end, with the dot; bundles carry them under such a name."""
+    """Suffix of its recordings, with the dot; bundles store them under a name with this suffix."""
     needs: ClassVar[str] = ""
-    """What it reads, for messages: ``a .npz file``."""
+    """What the reader reads, for messages: ``a .npz file``."""
     carries_sample: ClassVar[bool] = False
     """Whether bundles carry a sample of such a recording as .npz, since it may be far larger than they are."""
 
     @classmethod
     def claims(cls, path: Path) -> Claim:
-        """Say how sure it is that this reader reads a path; by its suffix, unless a reader looks at more."""
+        """Return how sure this reader is that it can read a path; by the suffix, unless a subclass checks more."""
         return Claim.CERTAIN if cls.suffix and path.name.endswith(cls.suffix) else Claim.NONE
 
     def open(self, path: Path, spec: PolicySpec, names: Mapping[str, str]) -> Recording:
-        """Open a recording; large arrays stay on the disk (``files.rows.Rows``), and are read row by row.
+        """Open a recording; large arrays stay on disk (``files.rows.Rows``) and are read row by row.
 
         Args:
-            path: An existing file or directory, which is read and never written.
-            spec: What the policy takes and gives; ``build_recording`` checks arrays against it.
+            path: Existing file or directory, which is only read.
+            spec: Spec of the policy, against which ``build_recording`` checks the arrays.
             names: Name in the spec -> name in the recording, where they differ.
 
         Raises:
-            DataError: when it is corrupt, or does not fit the spec.
+            DataError: when the recording is corrupt or does not fit the spec.
         """
         raise NotImplementedError
 
@@ -89,7 +89,7 @@ def reader_of(path: Path) -> Reader:
     """Return the reader of a recording.
 
     Raises:
-        DataError: when nothing is there, no reader claims it, or several do.
+        DataError: when the path does not exist, no reader claims it, or several do.
     """
     if not path.exists():
         raise DataError(f"Data file {path} not found.", "check the path, and record the file if there is none")

@@ -15,7 +15,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._reader import Reader
 from vlatool.data._recording import Recording, Values, build_recording
 from vlatool.data._windows import with_windows
-from vlatool.errors import DataError, fix_for, suggest
+from vlatool.errors import DataError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.rows import in_memory
 
@@ -78,7 +78,7 @@ class Steps:
         match = PART.fullmatch(text)
         name = match["name"] if match else text
         if match is None or name not in self.columns:
-            raise DataError(f"{self.path} has no '{name}'; {suggest(name, self.columns)}.", fix_for(name, self.columns))
+            raise DataError.unknown(f"{self.path} has no '{name}'", name, self.columns)
         values = self.columns[name]
         if values.ndim > 2 or values.dtype.kind not in "iufb":
             raise DataError(
@@ -137,10 +137,7 @@ def recording_of(steps: Steps, spec: PolicySpec, names: Mapping[str, str]) -> Re
     """
     known = {*(tensor.name for tensor in spec.inputs), spec.action.name, "action"}
     if unknown := sorted({*names} - known):
-        raise DataError(
-            f"A name is mapped that the policy does not have: '{unknown[0]}'; {suggest(unknown[0], known)}.",
-            fix_for(unknown[0], known),
-        )
+        raise DataError.unknown(f"A name is mapped that the policy does not have: '{unknown[0]}'", unknown[0], known)
     arrays: dict[str, Values] = {tensor.name: _input(steps, tensor, names) for tensor in spec.inputs}
     action = names.get(spec.action.name) or names.get("action") or steps.action
     if action:

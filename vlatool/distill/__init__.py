@@ -1,1 +1,1 @@
-"""Give a policy other weights, trained on what a teacher does."""
+"""Train the weights of a policy to do what a teacher does."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.errors import RecipeError
 
 DEPTH = "prune.depth"
 STAGES = {"depth": DEPTH, "width": "prune.structured"}
 """Share that stays -> the stage that takes the rest away; in this order, so that no width is ranked for nothing."""
 EXAMPLE = "depth=0.5,width=0.75"
 DECIMALS = 6
-"""Of a share that count: 1 - 0.9 is then the 0.1 that a person would have asked the stage for."""
+"""Decimals of a share that count: 1 - 0.9 is then the 0.1 that a person would have asked the stage for."""
 
 
 def student_steps(text: str) -> tuple[tuple[str, dict[str, Any]], ...]:
@@ -35,7 +35,7 @@ def student_steps(text: str) -> tuple[tuple[str, dict[str, Any]], ...]:
                 f"write it as {EXAMPLE}",
             )
         if name not in STAGES:
-            raise RecipeError(f"--student knows no '{name}'; {suggest(name, STAGES)}.", fix_for(name, STAGES))
+            raise RecipeError.unknown(f"--student knows no '{name}'", name, STAGES)
         if name in shares:
             raise RecipeError(f"--student names {name} twice: '{text}'.", "name it once")
         shares[name] = _share(name, value)

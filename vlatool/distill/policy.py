@@ -34,12 +34,12 @@ class PolicyDistillation(ImitationStage):
     """Train a policy to do what a teacher does, on recordings and, where it names an environment, on episodes.
 
     The teacher is the policy as it was before any edit, so that this recovers what pruning lost; or another bundle. No
-    expert is needed: first the teacher acts, then again and again the student, and the teacher says what it would have
-    done wherever they came to (DAgger: Ross et al., arXiv 1011.0686). With ``--student`` the policy is made smaller
-    first, by ``prune depth`` and ``prune structured``.
+    expert is needed: first the teacher acts, then repeatedly the student, and the teacher labels all states that they
+    reach (DAgger: Ross et al., arXiv 1011.0686). With ``--student`` the policy is made smaller first, by
+    ``prune depth`` and ``prune structured``.
 
-    ``--alpha 0`` and ``--control noise`` are controls: trainings without what the teacher knows. What they reach, and
-    not what the untrained student does, is what a distillation must beat.
+    ``--alpha 0`` and ``--control noise`` are controls: training without the teacher's knowledge. Distillation must beat
+    them, not the untrained student.
     """
 
     student: str = Field(
@@ -55,16 +55,16 @@ class PolicyDistillation(ImitationStage):
         1.0,
         ge=0,
         le=1,
-        description="share of the teacher in the loss; the rest is of the expert's actions in the recording. 0: the "
-        "teacher is not asked, and nobody plays (a control)",
+        description="share of the teacher in the loss; the rest compares with the expert's actions in the recording. "
+        "0: no teacher and no episodes (a control)",
     )
     label_share: float = Field(
         1.0, gt=0, le=1, description="share of the recorded observations whose expert's actions are used"
     )
     control: Literal["none", "noise"] = Field(
         "none",
-        description="noise: each observation gets what the teacher said of another one, so that the student learns "
-        "nothing from it; to prove that the teacher matters",
+        description="noise: each observation gets the teacher's answer to another one, so that the student learns "
+        "nothing from it; shows whether the teacher matters",
     )
 
     def chain(self) -> tuple[Transform, ...]:

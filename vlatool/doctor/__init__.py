@@ -1,1 +1,1 @@
-"""What this machine has and can do."""
+"""What is installed on this machine, and what it can do."""

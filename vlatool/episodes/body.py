@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.motion.track import Track
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 SERIES = {"position": 1, "joints": 1, "heading": 0, "gripper": 0, "collision": 0}
 """What the info of a step may tell -> number of its axes."""
 MAX_ELEMENTS = {"position": 3, "joints": 64}
@@ -27,7 +26,7 @@ class Body:
     """Listens to one episode, and tells it as a track.
 
     Args:
-        spec: Of the policy: names, units and rate of its actions.
+        spec: spec of the policy: names, units and rate of its actions.
     """
 
     def __init__(self, spec: PolicySpec) -> None:
@@ -138,7 +137,7 @@ def series_of(track: Track, action: TensorSpec) -> dict[str, tuple[float, ...]]:
     """Return what a drawing of an episode needs: ``position.x``, ``action.NAME`` and ``fresh``, of its first steps.
 
     Args:
-        action: Of the spec; a discrete one gives ``action``, its index.
+        action: action of the spec; a discrete one gives ``action``, its index.
     """
     series = {"fresh": track.fresh.astype(float)}
     if track.position is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from vlatool.accuracy.success import truth_of
 from vlatool.bundle.spec import PolicySpec
-from vlatool.errors import DataError, fix_for, suggest
+from vlatool.errors import DataError
 from vlatool.files.limits import LIMITS_VARIABLE, limit
 from vlatool.machine.watched_calls import watched_call
 
@@ -40,7 +40,7 @@ def time_limit(
     """Let whoever watches this process end it where a call of an environment, the block, takes too long.
 
     Args:
-        seed: Of the episode; None before there is one.
+        seed: seed of the episode; None before there is one.
         timeout_s: Seconds that it may take; the limit ``environment_seconds`` when 0.
         when: How the call is related to the seed: ``at`` or ``after``.
     """
@@ -150,10 +150,7 @@ class World:
         """
         known = self.disturbances()
         if kind not in known:
-            raise DataError(
-                f"{self._name.capitalize()} offers no disturbance '{kind}'; {suggest(kind, known)}.",
-                fix_for(kind, known),
-            )
+            raise DataError.unknown(f"{self._name.capitalize()} offers no disturbance '{kind}'", kind, known)
         self._seed = seed
         with self._limited("disturb()"):
             self._own("disturb")(kind, strength, seed)

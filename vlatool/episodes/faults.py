@@ -21,7 +21,7 @@ def error_context(task: str, seed: int | None = None, under: tuple[str, float] |
     """Turn whatever is raised in this block into an error that names task, seed and remedy.
 
     Args:
-        seed: Of the episode; None before there is one.
+        seed: seed of the episode; None before there is one.
         under: Disturbance and strength; None where there is none.
 
     Raises:
@@ -47,7 +47,7 @@ def locate(
     """Add to an error what of task and seed it does not name, and what to do where it does not say it.
 
     Args:
-        seed: Of the episode; None where it is not known.
+        seed: seed of the episode; None where it is not known.
         seeds: Which ones come into question then, a part of a sentence.
         under: Disturbance and strength; None where there is none.
     """

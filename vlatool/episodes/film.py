@@ -22,9 +22,9 @@ RENDERS = "rgb_array"
 MOST_SIDE = 480
 """Pixels of the longer side of a picture; a larger one is made smaller by a whole factor."""
 MOST_PICTURES, MOST_BYTES = 1000, 1 << 28
-"""Of one episode that are kept: its first ones."""
+"""Largest number, and bytes, of the pictures of an episode that are kept: its first ones."""
 CHUNK_BYTES = 1 << 22
-"""Of pictures that are in memory at a time, one at least."""
+"""Bytes of pictures that are in memory at a time, one picture at least."""
 
 
 class Filmed(World):
@@ -32,7 +32,7 @@ class Filmed(World):
 
     Args:
         environment, task, spec, timeout_s: See ``World``.
-        folder: For ``NUMBER.npy``, uint8 (N, H, W, 3); it is made when absent.
+        folder: folder of ``NUMBER.npy``, uint8 (N, H, W, 3); it is made when absent.
     """
 
     def __init__(self, environment: Any, task: str, spec: PolicySpec, folder: Path, timeout_s: float = 0.0) -> None:
@@ -78,7 +78,7 @@ class Camera:
     Which of both is decided at the first picture.
 
     Args:
-        environment: Of ``render_mode`` ``rgb_array``, or any other.
+        environment: one with the ``render_mode`` ``rgb_array``, or any other.
     """
 
     def __init__(self, environment: Any, task: str, spec: PolicySpec) -> None:
@@ -138,7 +138,7 @@ class Roll:
     """Writes pictures into a folder, some at a time.
 
     Args:
-        folder: For ``NUMBER.npy``; it is made when absent.
+        folder: folder of ``NUMBER.npy``; it is made when absent.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from vlatool.episodes.play import STEP_LIMIT, EpisodesJob, Request
 from vlatool.files.messages import from_json, to_json
 from vlatool.module.factory import call_factory
 from vlatool.stage.base import Context
-from vlatool.user_code.children import call
+from vlatool.user_code.children import OnProgress, call
 
 
 def check_filmable(bundles: Sequence[Bundle], job: EpisodesJob, context: Context) -> None:
@@ -33,7 +33,7 @@ def check_filmable(bundles: Sequence[Bundle], job: EpisodesJob, context: Context
         call(f"{__name__}:probe", request, context.progress, job.environment.rpartition(":")[0])
 
 
-def probe(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> None:
+def probe(request: Mapping[str, Any], _tell: OnProgress) -> None:
     """Take the first picture of the first episode of a ``Request`` in this process.
 
     Raises:

@@ -37,7 +37,7 @@ def run_jobs(
     """Play all episodes and return their outcomes in the order of the jobs, whoever plays them.
 
     Args:
-        engine: Of the runtime; the bundle's own when empty.
+        engine: engine of the runtime; the bundle's own when empty.
         context: Progress, workers, and what is kept of an interrupted run.
         tally: Counts successes for the progress; one of these jobs alone when None.
 
@@ -113,7 +113,7 @@ def check_opens(bundles: Sequence[Bundle], job: EpisodesJob, engine: str, contex
     """Refuse, before episodes are played, a bundle that cannot be: each is opened once, golden action and all.
 
     Args:
-        engine: Of the runtime; the bundle's own when empty.
+        engine: engine of the runtime; the bundle's own when empty.
 
     Raises:
         BundleError, GraphError: when a bundle was changed, or its engine computes something else here.

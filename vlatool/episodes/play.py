@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from vlatool.motion.measure import measure_episode
 from vlatool.runtime.control import build_controller
 from vlatool.runtime.interface import Array, Controller
 from vlatool.runtime.policy import FIRST_RUN_S, BundlePolicy
+from vlatool.user_code.children import OnProgress
 
 OUTCOME_PREFIX = "ended: "
 """How the progress begins that says how an episode ended: what comes after it in its job may never end."""
@@ -49,7 +50,6 @@ EVALUATION_SEEDS = 5_000_000
 """First seed of the episodes that policies are judged by; those that they are trained on have smaller ones."""
 RECORDINGS = "data/"
 """What of a bundle no episode needs."""
-Tell = Callable[[str, float | None], None]
 PRELOAD = ("numpy", "onnxruntime", __name__)
 
 
@@ -65,7 +65,7 @@ class EpisodesJob:
         record: Folder for what the policy was given at each inference, ``NAME.npy`` for each input; nothing is kept
             when empty.
         disturb: Disturbance of the environment, or of what the policy sees (``episodes/disturbances.py``).
-        strength: Of the disturbance; 1 is what an ordinary day brings.
+        strength: strength of the disturbance; 1 is what an ordinary day brings.
         latency_ms: How late actions come; 0 for at once.
         controller: Names of the controller and of wrappers; vlatool's own when empty (``vlatool.runtime.control``).
         show: Whether the outcomes hold the path and the actions of each step.
@@ -113,7 +113,7 @@ def jobs_for(job: EpisodesJob, tasks: Sequence[str], episodes: int, first_seed: 
     Args:
         job: What all of them have in common; task and seeds are of no account.
         episodes: Rounded up to a multiple of the tasks.
-        first_seed: Of each task.
+        first_seed: first seed of each task.
     """
     end = first_seed - (-episodes // len(tasks))
     starts = range(first_seed, end, SLICE)
@@ -149,7 +149,7 @@ class Worker:
             self._key, self._job = key, job
         return self._environment
 
-    def play(self, job: EpisodesJob, limit: int = STEP_LIMIT, tell: Tell = lambda *_: None) -> list[Outcome]:
+    def play(self, job: EpisodesJob, limit: int = STEP_LIMIT, tell: OnProgress = lambda *_: None) -> list[Outcome]:
         """Play the episodes of a job; tell of each that it begins."""
         spec = self.policy.spec
         os.chdir(self._home)  # an environment before may have changed it, and the next one's file is named from here
@@ -210,7 +210,7 @@ def _open_policy(bundle: Bundle, engine: str) -> BundlePolicy:
 _worker: Worker | None = None
 
 
-def play(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
+def play(request: Mapping[str, Any], tell: OnProgress) -> dict[str, Any]:
     """Answer a ``Request`` in this process with ``Played``."""
     global _worker
     asked = from_json(Request, request)
@@ -220,7 +220,7 @@ def play(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
     return answer
 
 
-def open_bundle(request: Mapping[str, Any], _tell: Tell) -> None:
+def open_bundle(request: Mapping[str, Any], _tell: OnProgress) -> None:
     """Open the bundle of a ``Request`` in this process, as its episodes would.
 
     Raises:
@@ -230,7 +230,7 @@ def open_bundle(request: Mapping[str, Any], _tell: Tell) -> None:
     _open_policy(Bundle.open_lazily(asked.bundle), asked.engine)
 
 
-def disturbances(request: Mapping[str, Any], _tell: Tell) -> list[str]:
+def disturbances(request: Mapping[str, Any], _tell: OnProgress) -> list[str]:
     """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
     asked = from_json(Request, request)
     spec = Bundle.open_lazily(asked.bundle).manifest.spec
@@ -250,7 +250,7 @@ def _close(environment: Any, job: EpisodesJob) -> None:
         environment.close()
 
 
-def close(_request: Mapping[str, Any], _tell: Tell) -> None:
+def close(_request: Mapping[str, Any], _tell: OnProgress) -> None:
     """Close what is open in this process."""
     global _worker
     if _worker is not None:

@@ -18,7 +18,7 @@ from vlatool.report import Measurement
 from vlatool.stage.base import Context
 
 CALLS, SECONDS = 50, 2.0
-"""Of each bundle, when its latency is measured."""
+"""Least calls, and seconds, of the measurement of each bundle."""
 
 
 def loop_latency(bundle: Bundle, board: str, engine: str, context: Context) -> Measurement:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
@@ -15,6 +15,7 @@ from vlatool.stage.base import Context
 from vlatool.workers import PROCESSES
 
 
+@dataclass
 class Player:
     """Plays jobs with a bundle, and tells how it does beside the one that it is paired with.
 
@@ -25,27 +26,22 @@ class Player:
         baseline: The player of the same episodes before, if there is one.
     """
 
-    def __init__(
-        self,
-        bundle: Bundle,
-        latency: Measurement | None,
-        engine: str,
-        context: Context,
-        most: int,
-        baseline: Player | None = None,
-    ) -> None:
-        self._bundle, self._latency, self._engine, self._context = bundle, latency, engine, context
-        self._most, self._baseline = most, baseline
-        self.outcomes: list[Outcome] = []
+    bundle: Bundle
+    latency: Measurement | None
+    engine: str
+    context: Context
+    most: int
+    baseline: Player | None = None
+    outcomes: list[Outcome] = field(default_factory=list)
 
     def __call__(self, jobs: list[EpisodesJob]) -> list[Outcome]:
         """Play further episodes; one that is only to be shown was counted before."""
         if jobs[0].show:
-            here = replace(self._context, launcher=PROCESSES, workers=1, store=None)  # pictures stay on this machine
-            context = here if jobs[0].film else self._context
-            return run_jobs(self._bundle, with_latency(jobs, self._latency), self._engine, context)
-        tally = Tally(self._most, self._baseline.outcomes if self._baseline else ())
+            here = replace(self.context, launcher=PROCESSES, workers=1, store=None)  # pictures stay on this machine
+            context = here if jobs[0].film else self.context
+            return run_jobs(self.bundle, with_latency(jobs, self.latency), self.engine, context)
+        tally = Tally(self.most, self.baseline.outcomes if self.baseline else ())
         tally.add(self.outcomes)
-        outcomes = run_jobs(self._bundle, with_latency(jobs, self._latency), self._engine, self._context, tally)
+        outcomes = run_jobs(self.bundle, with_latency(jobs, self.latency), self.engine, self.context, tally)
         self.outcomes += outcomes
         return outcomes

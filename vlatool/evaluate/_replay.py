@@ -32,7 +32,7 @@ class Again:
     """What came of playing an episode again.
 
     Args:
-        outcomes: With their steps, the baseline's first; empty where it could not be played, or is shown by no report.
+        outcomes: outcomes with their steps, the baseline's first; empty where it was not played, or no report shows it.
     """
 
     outcomes: tuple[Outcome, ...] = ()

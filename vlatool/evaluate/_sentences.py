@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from vlatool.accuracy.disturbance_drops import worst_record
 from vlatool.accuracy.motion_comparison import pairs_above_none, worst_task
+from vlatool.bundle.bundle import Bundle
 from vlatool.measures.latency import LATENCY_IN_THE_LOOP
 from vlatool.measures.motion import ADDED_MEAN, RATIO, STEPS_RATIO
 from vlatool.measures.success import WORST_TASK_DROP
@@ -15,6 +16,12 @@ MIN_RATIO = 1.005
 """Ratio below which two decimals say 1.00, and nothing is worth a sentence."""
 FEWEST_ADDED = 6
 """Pairs in which the variant alone has something, so that an exact two-sided sign test gives less than 5 %."""
+
+
+def found_wrong(bundle: Bundle) -> tuple[str, ...]:
+    """Return why ``load`` refuses a bundle, in sentences: what a stage found to be wrong with it."""
+    found = bundle.manifest.findings
+    return tuple(f"load refuses this bundle ({finding['name']}): {finding['message']}" for finding in found)
 
 
 def sentences(rows: Sequence[Row], board: str) -> Iterator[str]:

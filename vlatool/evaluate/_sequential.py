@@ -23,7 +23,7 @@ def played_until(
     """Play the episodes of jobs, the same of both, and stop when the limit is decided or hardly can be.
 
     Args:
-        jobs: Of ``jobs_for``: so many episodes at most.
+        jobs: jobs of ``jobs_for``: so many episodes at most.
         limit: The largest drop that passes, a share.
         baseline, variant: Play jobs with a bundle.
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 from pydantic_core import PydanticCustomError
@@ -20,16 +20,16 @@ from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
-from vlatool.errors import DataError, SourceError, UsageError, fix_for, suggest
-from vlatool.evaluate._findings import found_wrong
+from vlatool.errors import DataError, SourceError, UsageError
 from vlatool.evaluate._loop_latency import loop_latency, with_latency
 from vlatool.evaluate._names import BASELINE, names_of
 from vlatool.evaluate._player import Player
 from vlatool.evaluate._replay import check_video_of, played_again
-from vlatool.evaluate._sentences import sentences
+from vlatool.evaluate._sentences import found_wrong, sentences
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._training_overlap import FIX, seen_in_training
 from vlatool.files.resumable_work import Store
+from vlatool.hardware.profile import Profile
 from vlatool.machine.host import cache_directory, fingerprint
 from vlatool.measures import series, with_derived
 from vlatool.measures.success import SUCCESS
@@ -42,9 +42,6 @@ from vlatool.stage.cache import STREAMS
 from vlatool.stats.starts import distinct_starts
 from vlatool.user_code import trust
 
-if TYPE_CHECKING:
-    from vlatool.hardware.profile import Profile
-
 ALL = "all"
 """Every disturbance that there is."""
 STRONGEST = 10
@@ -56,7 +53,7 @@ CONTROL_EPISODES = 20
 class ClosedLoop(Measure):
     """Run episodes in a gymnasium environment: success rate with Wilson interval, and McNemar's exact test when paired.
 
-    With a baseline, actions that do not look at the observation are played, too: it must succeed more often than they.
+    With a baseline, actions that ignore the observation are played, too: the baseline must succeed more often.
     Episode ``k`` of a task has the seed ``first_seed + k`` for every bundle, so that outcomes are paired.
     """
 
@@ -69,15 +66,12 @@ class ClosedLoop(Measure):
     first_seed: int = Field(EVALUATION_SEEDS, ge=0, description="seed of the first episode of every task")
     baseline: Path | None = Field(None, description="bundle to pair with, usually float32")
     control: Literal["", "random", "constant"] = Field(
-        "", description="actions that do not look, in the place of the policy's: what succeeds by chance"
+        "", description="actions that ignore the observation, instead of the policy's: shows what succeeds by chance"
     )
     instruction: Literal["right", "wrong"] = Field("right", description="wrong: the control that a policy must fail")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
     limit: float | None = Field(
-        None,
-        ge=0,
-        lt=1,
-        description="stop when it is decided whether the drop is above this share (0.03 = 3 points)",
+        None, ge=0, lt=1, description="stop when it is decided whether the drop is above this share (0.03 = 3 points)"
     )
     disturb: tuple[str, ...] = Field(
         (),
@@ -87,14 +81,14 @@ class ClosedLoop(Measure):
     strength: tuple[float, ...] = Field(
         (1.0,),
         min_length=1,
-        description="of the disturbances, or several, such as 0.5,1,2; 1: what an ordinary day brings",
+        description="strength of the disturbances, or several, such as 0.5,1,2; 1 is ordinary operation",
     )
-    latency_in_the_loop: bool = Field(False, description="let actions come as late as inferences take")
+    latency_in_the_loop: bool = Field(False, description="delay actions by the time that inferences take")
     environment_timeout: float = Field(
         0.0,
         ge=0,
         le=1e6,
-        description="seconds that a call of the environment may take; when 0, what policy.yaml says, or 300",
+        description="seconds that a call of the environment may take; when 0, the limit in policy.yaml, or 300",
     )
     controller: tuple[str, ...] = Field(
         (),
@@ -102,8 +96,7 @@ class ClosedLoop(Measure):
         "as smooth,late; when not given, late with --latency-in-the-loop, and chunked without",
     )
     board: str = Field(
-        "",
-        description="profile whose predicted latency that is; --profile sets it; measured here when empty",
+        "", description="profile whose predicted latency that is; --profile sets it; measured here when empty"
     )
 
     @field_validator("disturb", "controller", mode="before")
@@ -254,10 +247,7 @@ class ClosedLoop(Measure):
             return ()
         known = disturbances_of(source, job, context)
         if unknown := [kind for kind in self.disturb if kind not in (*known, ALL)]:
-            raise UsageError(
-                f"There is no disturbance '{unknown[0]}'; {suggest(unknown[0], (*known, ALL))}.",
-                fix_for(unknown[0], (*known, ALL)),
-            )
+            raise UsageError.unknown(f"There is no disturbance '{unknown[0]}'", unknown[0], (*known, ALL))
         return known if ALL in self.disturb else tuple(dict.fromkeys(self.disturb))
 
     def _whose(self, names: Sequence[str]) -> list[str]:
@@ -368,7 +358,7 @@ class ClosedLoop(Measure):
             )
         for task in self.tasks:
             if known and task not in known and not self.environment:
-                raise UsageError(f"There is no task '{task}'; {suggest(task, known)}.", fix_for(task, known))
+                raise UsageError.unknown(f"There is no task '{task}'", task, known)
         timeout = self.environment_timeout or timeout_of(named)
         job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control,
                           controller=self.controller, timeout_s=timeout)  # fmt: skip

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from vlatool.accuracy.credibility import Credibility, credibility
@@ -20,13 +19,14 @@ from vlatool.bundle.program import keeps_values
 from vlatool.bundle.spec import TensorSpec
 from vlatool.data import MAP_HELP, Moment, Recording, carries_evaluation, evaluation_recording, named_recording
 from vlatool.errors import DataError
-from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._names import names_of
+from vlatool.evaluate._sentences import found_wrong
 from vlatool.machine.host import fingerprint
 from vlatool.measures import with_derived
 from vlatool.measures.actions import BASELINE, EXPERT, RELATIVE_ERROR, Reference
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.contract import off_the_robot
+from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.first_run import run_once_in_child
@@ -35,7 +35,6 @@ from vlatool.stats.intervals import wilson
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
-Array = NDArray[Any]
 MAKE_OTHERWISE = (
     "make the bundle otherwise (vlatool explain says where it differs), or remove a sample that is not an observation"
 )

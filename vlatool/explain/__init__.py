@@ -48,8 +48,6 @@ class Options:
         baseline: The float32 bundle; searched in the cache when None.
         data: Recorded observations for the errors; the bundle's own when None.
         samples: Largest number of observations.
-        runs: Number of profiled inferences.
-        threads: Number of intra-op threads.
         suggest: Whether to build and measure candidates.
         seconds: Time limit for measuring the layers, which reduces the number of observations.
     """
@@ -146,11 +144,8 @@ def explanation(
     """Return the explanation as a few sentences, for another report, without what cannot be determined.
 
     Args:
-        bundle: Bundle to explain.
         baseline: The float32 bundle that it was made from.
-        context: Receiver of progress.
         samples: Number of observations for measuring the layers.
-        runs: Number of profiled inferences.
         seconds: Time limit for measuring the layers, which reduces the number of observations, down to one.
     """
     try:
@@ -207,7 +202,6 @@ def _times(findings: _Findings, options: Options, context: Context) -> None:
         context.progress("profiling the operators of float32", None)
         compared = reference_engine(findings.bundle)
         findings.float_operators = profile(findings.baseline, values, options.runs, options.threads, compared)
-    engine = findings.bundle.manifest.engine or DEFAULT_ENGINE
     for name, graph in findings.bundle.manifest.graphs.items():
         seen = QuantizedGraph(name, findings.bundle.file(graph.file))
         findings.round_trips += seen.round_trips()

@@ -31,7 +31,6 @@ class Phases:
     """Effect of bfloat16 on the phases of one graph.
 
     Args:
-        graph: Name of the graph.
         kept: Name of the float32 graph that its phases were moved to; empty when they were not moved.
         nodes: Names of its Sin and Cos that depend on an input and are computed in bfloat16.
         error: Relative error of the actions to float32 with the phases in bfloat16; NaN when not measured.
@@ -53,10 +52,7 @@ def measure_phases(
     """Return the effect on each graph of a bundle that computes in bfloat16.
 
     Args:
-        bundle: Bundle to explain.
         baseline: The float32 bundle, to measure the bundle without its cuts.
-        observations: Raw observations.
-        context: Receiver of progress.
     """
     effects = []
     graphs = bundle.manifest.graphs
@@ -144,7 +140,6 @@ def phase_sentences(effects: Sequence[Phases], again: str) -> list[str]:
     """Return the sentences for a reader, the bad news first.
 
     Args:
-        effects: Result of ``measure_phases``.
         again: Command that makes the bundle again.
     """
     sentences = []

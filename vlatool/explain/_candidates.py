@@ -40,11 +40,9 @@ class Candidate:
 
     Args:
         name: Description of the change.
-        stage: Stage with the change.
         layers: Number of additional layers in float32.
         bundle: The new bundle; None until it is built.
         error: Relative L2 error of the raw action to float32, mean over the observations.
-        contestant: Contestant with its latencies.
         failed: Reason why it could not be built.
     """
 
@@ -69,7 +67,6 @@ class Comparison:
     Args:
         current: The bundle to explain.
         baseline: The float32 bundle; None when it was not found.
-        others: Candidates.
     """
 
     current: Candidate
@@ -141,17 +138,7 @@ def measure(
     threads: int,
     context: Context,
 ) -> Comparison:
-    """Build the candidates and measure error and interleaved latency of all.
-
-    Args:
-        bundle: The bundle to explain.
-        baseline: The float32 bundle.
-        tried: Result of ``plan_candidates``.
-        observations: Raw observations for errors and latencies.
-        scratch: Directory of the candidates.
-        threads: Number of intra-op threads.
-        context: Receiver of progress.
-    """
+    """Build the candidates and measure error and interleaved latency of all."""
     current = Candidate("as it is", None, bundle=bundle)
     base = Candidate("float32", None, bundle=baseline) if baseline is not None else None
     for number, candidate in enumerate(tried):
@@ -162,11 +149,9 @@ def measure(
             candidate.bundle = run_transform(candidate.stage, baseline, scratch / str(number), Context())
         except VlatoolError as error:
             candidate.failed = error.message
-    candidates = [
-        candidate for candidate in (base, current, *tried) if candidate is not None and candidate.bundle is not None
-    ]
     reference: list[Any] = []
-    for candidate in candidates:
+    contestants: list[Contestant] = []
+    for candidate in filter(None, (base, current, *tried)):
         if candidate.bundle is None:
             continue
         context.progress(f"errors of the candidate: {candidate.name}", None)
@@ -176,10 +161,7 @@ def measure(
         if base is not None:
             reference = reference or outputs
             candidate.error = float(np.mean([relative_error(*pair) for pair in zip(outputs, reference, strict=True)]))
-        candidate.contestant = Contestant(
-            candidate.name, candidate.bundle, policy, [dict(item) for item in observations]
-        )
-    run_interleaved(
-        [candidate.contestant for candidate in candidates if candidate.contestant], ITERATIONS, 5, context.progress
-    )
+        contestants.append(Contestant(candidate.name, candidate.bundle, policy, list(map(dict, observations))))
+        candidate.contestant = contestants[-1]
+    run_interleaved(contestants, ITERATIONS, 5, context.progress)
     return Comparison(current, base, [candidate for candidate in tried if candidate.bundle is not None])

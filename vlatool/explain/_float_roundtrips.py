@@ -26,7 +26,6 @@ class RoundTrip:
     """A value that is dequantized, computed in float by a few light operators, and quantized again.
 
     Args:
-        graph: Name of the graph.
         start: Name of the DequantizeLinear.
         between: Operator types in between; empty when QuantizeLinear follows directly.
         end: Name of the QuantizeLinear.
@@ -47,8 +46,6 @@ class Fallback:
     """A layer that is int8 in the file but does not run as a fast int8 kernel, and its cost.
 
     Args:
-        graph, layer: Names of graph and layer.
-        why: Explanation in words.
         ms: Its time in one inference.
     """
 

@@ -38,7 +38,6 @@ class Operator:
     """One node of a graph as the engine runs it.
 
     Args:
-        graph: Name of the graph.
         name: The engine's name of the node, often that of the layer.
         kind: The engine's operator type.
         precision: One of ``GROUPS``, or another dtype.
@@ -72,10 +71,8 @@ def profile(
     """Run a bundle with the engine's profiler on.
 
     Args:
-        bundle: Bundle to profile.
         observations: Raw observations, used in turn.
         runs: Number of inferences after three warm-up inferences.
-        threads: Number of intra-op threads.
         engine: Engine to profile; the bundle's own when empty.
 
     Returns:

@@ -46,7 +46,6 @@ class Observations:
     """Observations to run the bundles on.
 
     Args:
-        values: Raw observations.
         words: Description of their source.
         recorded: Whether they are recorded, so that errors on them are meaningful.
     """
@@ -152,9 +151,9 @@ def sensitivity_stage(stage: Stage | None) -> StaticInt8 | None:
     return None
 
 
-def command(stage: Stage, source: str, out: str = "BUNDLE") -> str:
+def command(stage: Stage, source: str) -> str:
     """Return the command line that runs a stage."""
-    words = [f"vlatool quantize {stage.name().partition('.')[2].replace('_', '-')} {source} -o {out}"]
+    words = [f"vlatool quantize {stage.name().partition('.')[2].replace('_', '-')} {source} -o BUNDLE"]
     for name, value in stage.options().items():
         flag = name.replace("_", "-")
         if isinstance(value, bool):

@@ -147,7 +147,6 @@ def limit_sentences(
     """Return why int8 is not faster: Amdahl's law on the measured time of both bundles.
 
     Args:
-        operators: Operators of the bundle.
         before: Operators of the float32 bundle; empty when it was not found.
         macs: Precision -> multiply-accumulates of one inference of the bundle.
         speed: Measured speed-up over float32; that of the profiles when NaN.
@@ -182,7 +181,6 @@ def reach_sentence(operators: Sequence[Operator], macs: Mapping[str, int], reach
     """Return the share of the time that the work would take at the speed of large products, and the rest.
 
     Args:
-        operators: Operators of the bundle.
         macs: Precision -> multiply-accumulates of one inference.
         reach: Precision -> 10^9 multiply-accumulates in a second of a large product in the same engine.
     """

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError
 from vlatool.explain import Options, explain, explanation
-from vlatool.files.messages import to_json
+from vlatool.files.messages import from_json, to_json
 from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.user_code import children
 
 PRELOAD = ("numpy", "onnx", "onnxruntime", __name__)
-Tell = Callable[[str, float | None], None]
 
 
 def explain_in_child(bundle: Bundle, options: Options, context: Context) -> Report:
@@ -24,7 +23,7 @@ def explain_in_child(bundle: Bundle, options: Options, context: Context) -> Repo
     Raises:
         VlatoolError: errors of ``explain``; GraphError when an engine crashes the child.
     """
-    job = {"bundle": str(bundle.path.absolute()), "options": _options_to_json(options)}
+    job = {"bundle": str(bundle.path.absolute()), "options": to_json(options)}
     return Report.from_json(_call("report", job, context))
 
 
@@ -32,9 +31,7 @@ def explanation_in_child(bundle: Bundle, baseline: Bundle | None, context: Conte
     """Return the sentences of ``explanation``, or one with the reason why it failed.
 
     Args:
-        bundle: Bundle to explain.
         baseline: The float32 bundle that it was made from.
-        context: Receiver of progress.
         limits: Limits for ``explanation``.
     """
     paths = [str(each.path.absolute()) if each is not None else "" for each in (bundle, baseline)]
@@ -44,14 +41,13 @@ def explanation_in_child(bundle: Bundle, baseline: Bundle | None, context: Conte
         return (f"This could not be explained: {error.message}",)
 
 
-def report(job: Mapping[str, Any], tell: Tell) -> str:
+def report(job: Mapping[str, Any], tell: children.OnProgress) -> str:
     """Explain the bundle of a job in this process; return the report as JSON."""
-    options = job["options"]
-    paths = {name: Path(options[name]) if options[name] else None for name in ("baseline", "data")}
-    return explain(Bundle.open(Path(job["bundle"])), Options(**{**options, **paths}), Context(tell)).to_json()
+    options = from_json(Options, job["options"], "options")
+    return explain(Bundle.open(Path(job["bundle"])), options, Context(tell)).to_json()
 
 
-def sentences(job: Mapping[str, Any], tell: Tell) -> list[str]:
+def sentences(job: Mapping[str, Any], tell: children.OnProgress) -> list[str]:
     """Explain the bundle of a job in a few sentences in this process."""
     bundle, baseline = (Bundle.open(Path(path), verify=False) if path else None for path in job["paths"])
     return list(explanation(bundle, baseline, Context(tell), **job["limits"])) if bundle else []
@@ -59,8 +55,3 @@ def sentences(job: Mapping[str, Any], tell: Tell) -> list[str]:
 
 def _call(function: str, job: Mapping[str, Any], context: Context) -> Any:
     return children.call(f"{__name__}:{function}", job, context.progress, "explain", PRELOAD, own=True)
-
-
-def _options_to_json(options: Options) -> dict[str, Any]:
-    paths = {name: str(path) if path else "" for name, path in (("baseline", options.baseline), ("data", options.data))}
-    return {**to_json(options), **paths}

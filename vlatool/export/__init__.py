@@ -1,1 +1,1 @@
-"""Turn a policy into a bundle with graphs that ONNX Runtime was seen to run."""
+"""Turn a policy into a bundle of graphs, checked in ONNX Runtime."""

@@ -46,14 +46,14 @@ if TYPE_CHECKING:
 
 
 LOWEST_OPSET = 18
-"""Of torch's dynamo exporter."""
+"""Lowest opset of torch's dynamo exporter."""
 
 
 class ExportOnnx(Transform):
     """Export every graph of a torch policy to ONNX (dynamo exporter, static shapes).
 
-    The files count only after ONNX Runtime loaded them and gave, through the policy's whole program, what torch gives
-    on calibration observations.
+    The files are accepted only after ONNX Runtime has loaded them and, through the policy's whole program, given the
+    same results as torch on calibration observations.
     """
 
     takes_modules: ClassVar[bool] = True

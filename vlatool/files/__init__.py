@@ -1,1 +1,1 @@
-"""Files and directories: bounded reads, atomic writes, and no change to files of other owners."""
+"""Files and directories: bounded reads, atomic writes, and no change to files that others wrote."""

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from vlatool.files.locks import is_same_file
+from vlatool.files.locks import exclusive_lock, is_same_file
 from vlatool.files.printable import file_of
 from vlatool.files.user_files import add_stamp, atomic_file, is_own_file
 
@@ -72,33 +72,22 @@ def _remove_old_work(folder: Path) -> None:
 
 
 def remove_if_unused(folder: Path) -> None:
-    """Remove a work directory, unless another run uses it (which then removes it itself).
-
-    Raises:
-        OSError: when it is in use, or does not exist.
-    """
-    handle = os.open(folder / LOCK, os.O_RDWR)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        remove_work(folder)
-    finally:
-        os.close(handle)
+    """Remove a work directory, unless another run uses it (which then removes it itself)."""
+    with exclusive_lock(folder / LOCK) as free:
+        if free:
+            remove_work(folder)
 
 
 def remove_all_unused(folders: Iterable[Path]) -> None:
     """Remove the work directories of a result that was written, except those that another run uses."""
     for folder in folders:
-        with contextlib.suppress(OSError):
-            remove_if_unused(folder)
+        remove_if_unused(folder)
 
 
 class Store:
     """Finished parts of a run: key -> JSON value, each in a file that is written atomically.
 
     Several runs may use it at a time. Where it cannot be written, the run goes on without it, and ``problem`` says why.
-
-    Args:
-        folder: folder of the files.
     """
 
     def __init__(self, folder: Path) -> None:

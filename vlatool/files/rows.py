@@ -100,7 +100,6 @@ class CompressedSource:
 
     Args:
         file: the archive.
-        entry: name of the entry.
         start: size of the array's header in bytes.
         size: size of its elements in bytes.
     """
@@ -160,7 +159,6 @@ class RowSubset:
     """A subset of the rows of an array.
 
     Args:
-        source: source of the array.
         indices: index of each row, ascending.
         row: size of a row in bytes.
     """

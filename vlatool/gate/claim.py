@@ -1,4 +1,4 @@
-"""A claim of a gate: its options in the gate file, what it needs, how it is examined, and its words."""
+"""A claim of a gate: its options in the gate file, the evidence that it needs, how it is examined, and its wording."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ KIND = "claims"
 
 
 class Claim(Numeric):
-    """Base of the claims; each is one file, found by its name. Its fields are its options in a gate file."""
+    """Base of the claims; each is one file, found by its name. The fields are the claim's options in a gate file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     needs: ClassVar[frozenset[Need]] = frozenset()
-    """Evidence that it looks at."""
+    """Evidence that ``examine`` uses."""
     by_default: ClassVar[bool] = False
-    """Whether a gate file that does not name it claims it."""
+    """Whether the claim is examined if the gate file does not mention it."""
     order: ClassVar[int] = 100
-    """Its position in a gate file, and among claims with the same needs."""
+    """Position in a gate file, and among claims with the same needs."""
     example: ClassVar[str] = ""
-    """Its lines in a new gate file; its name and the first line of its docstring when empty."""
+    """Lines for a new gate file; the name and the first line of the docstring when empty."""
 
     @classmethod
     def name(cls) -> str:
-        """Return its name in a gate file."""
+        """Return the name of the claim in a gate file."""
         return registry.entry_of(cls).partition(".")[2]
 
     @property
     def paths(self) -> dict[str, Path]:
-        """The options that name files: what the gate reads, relative to the gate file."""
+        """Options that name files for the gate to read, relative to the gate file."""
         return {name: value for name, value in self if isinstance(value, Path)}
 
     def extend_plan(self, plan: Plan) -> Plan:
-        """Return the plan with what this claim asks for."""
+        """Return the plan with the needs of this claim added."""
         return replace(plan, needs=plan.needs | self.needs)
 
     def check(self, baseline: Bundle, plan: Plan) -> None:
-        """Refuse, before anything is measured, a claim that there is nothing to examine on.
+        """Refuse a claim that cannot be examined, before anything is measured.
 
         Raises:
-            DataError: when it needs recordings, and neither the gate file nor the baseline has any.
+            DataError: when the claim needs recordings, and neither the gate file nor the baseline has any.
         """
         if Need.RECORDINGS in self.needs and recorded_data(baseline, plan) is None:
             raise DataError(
@@ -60,7 +60,7 @@ class Claim(Numeric):
             )
 
     def examine(self, evidence: Evidence) -> Verdict:
-        """Return what is found, as values.
+        """Return the verdict, as values.
 
         Raises:
             VlatoolError: when something cannot be measured.
@@ -68,16 +68,16 @@ class Claim(Numeric):
         raise PluginError(f"The claim {self.name()} has no method examine().", "define examine(self, evidence)")
 
     def verdicts(self, evidence: Evidence) -> dict[str, Verdict]:
-        """Return title -> verdict, where one claim is examined several times."""
+        """Return title -> verdict; several if the claim is examined more than once."""
         return {self.name(): self.examine(evidence)}
 
     def sentence(self, verdict: Verdict) -> str:
-        """Return what was found in words, without a full stop."""
+        """Return the verdict as a sentence without a full stop."""
         return "; ".join(map(measured_words, verdict.decisive)) or verdict.reason.value
 
 
 def measured_words(judged: Judgement) -> str:
-    """Return ``TITLE VALUE UNIT (LOW to HIGH; allowed: LIMIT)``, or why there is not such a number."""
+    """Return ``TITLE VALUE UNIT (LOW to HIGH; allowed: LIMIT)``, or the reason why there is no value."""
     measured = judged.measured
     if measured is None:
         return f"{judged.title}: {judged.reason.value}" if judged.title else judged.reason.value

@@ -1,4 +1,4 @@
-"""A gate: what a candidate may cost against a baseline, as YAML that a repository keeps."""
+"""A gate: the claims that a candidate must keep to beside a baseline, as YAML that a repository keeps."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic_core import ErrorDetails
 
 from vlatool import registry
-from vlatool.errors import PluginError, RecipeError, VlatoolError, require
+from vlatool.errors import PluginError, RecipeError, VlatoolError, require, suggest
 from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
 from vlatool.gate.claim import KIND, Claim
@@ -29,13 +30,13 @@ class _Gate(Numeric):
 
     @property
     def claims(self) -> dict[str, Claim]:
-        """Name -> claim that is not null, in the order of a gate file."""
+        """The claims that are not null by name, in the order of a gate file."""
         named = {name: getattr(self, name) for name in claim_classes()}
         return {name: claim for name, claim in named.items() if claim is not None}
 
     @property
     def plan(self) -> Plan:
-        """What is measured for all claims together."""
+        """The measurements for all claims together."""
         return functools.reduce(lambda plan, claim: claim.extend_plan(plan), self.claims.values(), Plan())
 
     @property
@@ -111,14 +112,20 @@ else:
     Gate = create_model("Gate", __base__=_Gate, __module__=__name__, __doc__=_Gate.__doc__, **SECTIONS)
 
 
-def _problem(key: str, got: object, message: str) -> str:
-    """One sentence about one key; what was got is shown where it is one value."""
+def _problem(error: ErrorDetails) -> str:
+    """Return one problem in a sentence; what was got is shown where it is one value."""
+    path, got = error["loc"], error["input"]
+    key = ".".join(map(str, path))
+    if error["type"] == "extra_forbidden":
+        fields = claim_classes()[str(path[0])].model_fields if path[1:] else Gate.model_fields
+        known = [field.alias or name for name, field in fields.items()]
+        return f"{key}: is not a known key; {suggest(str(path[-1]), known)}"
     shown = f" (got {got!r})" if key and isinstance(got, str | int | float) else ""
-    return f"{key or 'gate'}: {message}{shown}"
+    return f"{key or 'gate'}: {error['msg']}{shown}"
 
 
 def _fix(error: ValidationError) -> str:
-    """What to write instead; a percentage is what people write who know --max-drop 1%."""
+    """Return what to write instead; a percentage is what people write who know --max-drop 1%."""
     shares = [item for item in error.errors() if str(item["input"]).strip().endswith("%")]
     share = "write a share as a number: 0.05 is 5 %; " if shares else ""
     return f"{share}docs/reference/gate.md says what each key takes"
@@ -139,5 +146,5 @@ def read_gate(path: Path) -> Gate:
     try:
         return Gate.model_validate(data).with_paths_in(path.parent)
     except ValidationError as error:
-        problems = [_problem(".".join(map(str, item["loc"])), item["input"], item["msg"]) for item in error.errors()]
+        problems = map(_problem, error.errors())
         raise RecipeError(f"The gate {path}: {'; '.join(problems)}.", _fix(error)) from error

@@ -1,4 +1,4 @@
-"""What the claims of a gate look at: both bundles, and what was measured of them."""
+"""Evidence for the claims of a gate: both bundles, and their measurements."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from vlatool.stage.base import Context
 
 @dataclass(frozen=True)
 class Evidence:
-    """Both bundles, and what is measured of them, most of it when a claim first asks for it.
+    """Both bundles and their measurements, most of which are made when a claim first asks for them.
 
     Args:
         timed: processes that time both bundles, measured one by one (needs ``Need.TIMES``).
-        answers: what both answer to observations drawn afresh; read it as ``agreement``.
+        answers: answers of both to observations drawn afresh; read it as ``agreement``.
     """
 
     candidate: Bundle
@@ -38,7 +38,7 @@ class Evidence:
 
     @property
     def agreement(self) -> Agreement:
-        """What both bundles answer to observations drawn afresh (needs ``Need.AGREEMENT``)."""
+        """Answers of both bundles to observations drawn afresh (needs ``Need.AGREEMENT``)."""
         self._require(Need.AGREEMENT)
         return self.answers
 

@@ -1,4 +1,4 @@
-"""What ``vlatool gate init`` writes: a gate with every line explained, and jobs that run it."""
+"""Files that ``vlatool gate init`` writes: a gate with every line explained, and jobs that run it."""
 
 from __future__ import annotations
 

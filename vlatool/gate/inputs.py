@@ -1,4 +1,4 @@
-"""What a gate calls both bundles with: drawn anew each time, from the baseline's recordings and the gate's."""
+"""Observations that a gate calls both bundles with, drawn anew each time, from recordings where there are any."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Inputs:
     """Observations for the processes of a gate; nothing of them is the candidate's.
 
     Args:
-        baseline: Whose spec, vocabulary, statistics and recordings are drawn from.
-        data: Further recorded observations, that the gate file names.
-        seed: Of all draws; the observations of each process are its own.
+        baseline: bundle whose spec, vocabulary, statistics and recordings are drawn from.
+        data: further recorded observations, named in the gate file.
+        seed: seed of all draws; the observations of each process are its own.
     """
 
     baseline: Bundle

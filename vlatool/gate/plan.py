@@ -1,4 +1,4 @@
-"""What is measured for all claims of a gate together."""
+"""Measurements that all claims of a gate together need."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Need(IntEnum):
 
 @dataclass(frozen=True)
 class Plan:
-    """What is measured, and how; each claim of a gate adds what its options say.
+    """Measurements, and how they are made; each claim of a gate adds what its options say.
 
     Args:
         needs: evidence that any claim looks at.

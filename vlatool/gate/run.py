@@ -37,9 +37,9 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     """Examine every claim of a gate; what is cheap first.
 
     Args:
-        candidate, baseline: Bundles with graphs, of one spec.
-        seed: Of everything that is drawn: observations, noise, the order in which bundles are loaded and called. Fresh
-            entropy when None, so that nobody can know it before; the report says it.
+        candidate, baseline: bundles with graphs, of one spec.
+        seed: seed of everything that is drawn: observations, noise, the order in which bundles are loaded and called.
+            Fresh entropy when None, so that nobody can know it before; the report says it.
 
     Raises:
         BundleError: when a bundle has no graph, the two have other inputs or outputs, or a file was changed.

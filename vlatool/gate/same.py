@@ -1,7 +1,8 @@
-"""Whether two bundles are versions of one policy: only those can be held against each other."""
+"""Check that two bundles are versions of one policy: only those can be held against each other."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from vlatool import registry
@@ -15,18 +16,18 @@ from vlatool.graph.files import read
 from vlatool.graph.random_ops import random_operators
 
 MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite")
-"""What a robot relies on; files of statistics and tokenizers may differ."""
+"""Fields that a robot relies on; files of statistics and tokenizers may differ."""
 RATE = {"control_hz": "control_hz", "chunk": "chunk", "executed": "executed_actions"}
-"""What a message calls a rate -> the field or property of the spec."""
+"""Name of a rate in messages -> field or property of the spec."""
 FEWER_STEPS = "prune.steps"
 ACCURACY = "accuracy"
 """The claim that alone says what steps are worth."""
 LARGEST_TOLERANCE = 1.0
-"""Of a golden action: with more, ``load`` would accept any."""
+"""Largest tolerance of a golden action: with more, ``load`` would accept any."""
 
 
 def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
-    """Say before anything is measured why it cannot be.
+    """Refuse what cannot be compared, before anything is measured.
 
     Raises:
         BundleError: when a bundle has no graph or lacks the baseline's golden action, or the two have other inputs or
@@ -45,7 +46,9 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
             )
     mine, theirs = candidate.manifest, baseline.manifest
     differs = _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs)
-    if differs := differs or (_scene(mine, theirs) if _plays_what_bundles_name(gate) else ""):
+    if gate.plan.episodes and gate.plan.policy is None:  # they are played in what the bundles name
+        differs = differs or _scene(mine, theirs)
+    if differs:
         raise BundleError(
             f"{candidate.path} and {baseline.path} are not versions of one policy: {differs}.",
             "name a candidate and a baseline that were made from the same policy",
@@ -62,11 +65,6 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
         claim.check(baseline, gate.plan)
 
 
-def _plays_what_bundles_name(gate: Gate) -> bool:
-    """Return whether episodes are played in an environment that no file of the gate's names."""
-    return gate.plan.episodes > 0 and gate.plan.policy is None
-
-
 def _scene(mine: Manifest, theirs: Manifest) -> str:
     """Return in words how the environment that the candidate names differs from the baseline's, which is played.
 
@@ -76,7 +74,7 @@ def _scene(mine: Manifest, theirs: Manifest) -> str:
         return ""
     keys = [key for key in dict.fromkeys((*theirs.environment, *mine.environment)) if key != "timeout"]
     pairs = [(key, mine.environment.get(key), theirs.environment.get(key)) for key in keys]
-    return "; ".join(text for key, one, two in pairs if (text := _difference(f"environment: {key}", one, two)))
+    return _differences(pairs, "environment: ")
 
 
 def _check_golden(candidate: Bundle, baseline: Bundle) -> None:
@@ -118,7 +116,7 @@ def _tensors(mine: Manifest, theirs: Manifest) -> str:
         for name in {**two, **one}:
             if differs := _differs(one.get(name), two.get(name)):
                 return f"{kind[:-1]} {name}: {differs}"
-    return _difference("the action", mine.spec.action.name, theirs.spec.action.name)
+    return _differences([("the action", mine.spec.action.name, theirs.spec.action.name)])
 
 
 def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
@@ -126,12 +124,12 @@ def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
     if mine is None or theirs is None:
         return f"it is in the {'baseline' if mine is None else 'candidate'} alone"
     pairs = [(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING]
-    return "; ".join(text for name, one, two in pairs if (text := _difference(name, one, two)))
+    return _differences(pairs)
 
 
 def _rates(mine: Manifest, theirs: Manifest) -> str:
     pairs = [(name, getattr(mine.spec, of), getattr(theirs.spec, of)) for name, of in RATE.items()]
-    return "; ".join(text for name, one, two in pairs if (text := _difference(name, one, two)))
+    return _differences(pairs)
 
 
 def _program(mine: Manifest, theirs: Manifest) -> str:
@@ -144,7 +142,7 @@ def _program(mine: Manifest, theirs: Manifest) -> str:
     parts: list[tuple[str, Any, Any]] = [(word, _of_all(mine, word), _of_all(theirs, word)) for word in words]
     if not _has_fewer_steps(mine, theirs):
         parts.append(("repeat", _repeat(mine), _repeat(theirs)))
-    return "; ".join(text for word, one, two in parts if (text := _difference(f"the program's {word}", one, two)))
+    return _differences(parts, "the program's ")
 
 
 def _has_fewer_steps(mine: Manifest, theirs: Manifest) -> bool:
@@ -163,8 +161,8 @@ def _of_all(manifest: Manifest, word: str) -> dict[str, Any]:
     return {name: value for step in manifest.program for name, value in getattr(step, word).items()}
 
 
-def _difference(name: str, mine: Any, theirs: Any) -> str:
-    if mine == theirs:
-        return ""
-    one, two = (list(value) if isinstance(value, tuple) else value for value in (mine, theirs))
-    return f"{name} {one!r} in the candidate, {two!r} in the baseline"
+def _differences(values: Sequence[tuple[str, Any, Any]], about: str = "") -> str:
+    """Return in words which values differ: name, the candidate's, the baseline's."""
+    listed = ((name, *(list(each) if isinstance(each, tuple) else each for each in pair)) for name, *pair in values)
+    return "; ".join(f"{about}{name} {mine!r} in the candidate, {theirs!r} in the baseline"
+                     for name, mine, theirs in listed if mine != theirs)  # fmt: skip

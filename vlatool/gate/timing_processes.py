@@ -12,12 +12,12 @@ from vlatool.stage.base import Context
 
 @dataclass
 class Timed:
-    """The processes that were measured so far.
+    """Processes that were measured so far.
 
     Args:
-        job: What each measures; process n has the seed ``job.seed + n``.
-        timeout: Seconds that a process may take.
-        inputs: What the bundles are called with; drawn by each process from the baseline's spec when None.
+        job: question to each process; process n has the seed ``job.seed + n``.
+        timeout: seconds that a process may take.
+        inputs: observations that the bundles are called with; drawn by each process from the baseline's spec when None.
     """
 
     job: PairJob

@@ -1,4 +1,4 @@
-"""What a claim was found to be, as values: sentences about it are made at the end, by the claim."""
+"""Verdicts on claims, as values: sentences about it are made at the end, by the claim."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CONFIDENCE = 1 - 2 * ALPHA
 
 
 class Outcome(str, Enum):
-    """What a claim, or one number of it, was found to be; the worst first."""
+    """Outcome of a claim, or of one of its numbers; the worst first."""
 
     FAIL = "fail"
     INCONCLUSIVE = "inconclusive"
@@ -24,7 +24,7 @@ class Outcome(str, Enum):
 
 
 class Reason(Enum):
-    """What decides: the number against its limit, or why there is nothing that could."""
+    """Reason of an outcome: the number against its limit, or why there is nothing that decides."""
 
     LIMIT = "the number, held against its limit"
     REFERENCE_FAILS = "the baseline does not do its task"
@@ -54,7 +54,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What an examined claim was found to be.
+    """Verdict on a claim.
 
     Args:
         outcome: pass, fail or inconclusive.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import require
-from vlatool.graph.nodes import unique_name
+from vlatool.graph.nodes import subgraphs, unique_name
 from vlatool.graph.onnx_graph import static_shape
 
 CONTROL_OPS = ("If", "Loop", "Scan")
@@ -57,14 +57,13 @@ def with_unique_names(model: Any) -> Any:
 
 
 def _name_inside(node: Any, taken: set[str]) -> None:
-    for item in node.attribute:
-        for graph in (*([item.g] if item.HasField("g") else []), *item.graphs):
-            for number, inner in enumerate(graph.node):
-                if not inner.name or inner.name in taken:
-                    base = inner.name or f"{node.name or node.op_type}/{inner.op_type}"
-                    inner.name = unique_name(base, number, taken)
-                taken.add(inner.name)
-                _name_inside(inner, taken)
+    for graph in subgraphs(node):
+        for number, inner in enumerate(graph.node):
+            if not inner.name or inner.name in taken:
+                base = inner.name or f"{node.name or node.op_type}/{inner.op_type}"
+                inner.name = unique_name(base, number, taken)
+            taken.add(inner.name)
+            _name_inside(inner, taken)
 
 
 def flatten(graph: Any, opset: int, known: Mapping[str, Any]) -> list[Item]:
@@ -112,33 +111,28 @@ class _Flattener:
         items: list[Item] = []
         for node in nodes:
             renamed = _rename(node, inside, prefix)
-            subgraphs = {item.name: item.g for item in node.attribute if item.HasField("g")}
-            is_control = not node.domain and node.op_type in CONTROL_OPS and subgraphs
+            bodies = {item.name: item.g for item in node.attribute if item.HasField("g")}
+            is_control = not node.domain and node.op_type in CONTROL_OPS and bodies
             if is_control and not (node.op_type == "Scan" and self.opset < MIN_SCAN_OPSET):
-                items.append(self._body(renamed, subgraphs, inside))
+                items.append(self._body(renamed, bodies, inside))
             else:
                 items.append(renamed)
                 self.nodes.append(renamed)
         return tuple(items)
 
-    def _body(self, node: Any, subgraphs: Mapping[str, Any], names: Mapping[str, str]) -> Branches | LoopBody:
+    def _body(self, node: Any, bodies: Mapping[str, Any], names: Mapping[str, str]) -> Branches | LoopBody:
         if node.op_type == "If":
-            bodies = [self._add_body(body, names, []) for body in subgraphs.values()]
-            for name, given in zip(node.output, bodies[0][1], strict=False):
+            branches = [self._add_body(body, names, []) for body in bodies.values()]
+            for name, given in zip(node.output, branches[0][1], strict=False):
                 self._connect_output(name, given, None, 0)
-            return Branches(tuple(items for items, _ in bodies))
-        return (
-            self._loop(node, subgraphs["body"], names)
-            if node.op_type == "Loop"
-            else self._scan(node, subgraphs["body"], names)
-        )
+            return Branches(tuple(items for items, _ in branches))
+        flatten_loop = self._loop if node.op_type == "Loop" else self._scan
+        return flatten_loop(node, bodies["body"], names)
 
     def _loop(self, node: Any, body: Any, names: Mapping[str, str]) -> LoopBody:
-        numpy = require("onnx.numpy_helper", "build")
-        first, holds = self._name("turn"), self._name("condition")
-        self.graph.initializer.append(numpy.from_array(np.array(0, np.int64), first))
-        self.graph.initializer.append(numpy.from_array(np.array(True), holds))
         states = list(node.input[2:])
+        first = self._add_constant("turn", np.array(0, np.int64))
+        holds = self._add_constant("condition", np.array(True))
         items, given = self._add_body(body, names, [first, holds, *states])
         count = self._constant(node.input[0]) if node.input[0] else None
         for index, (name, value) in enumerate(zip(node.output, given[1:], strict=False)):
@@ -152,9 +146,7 @@ class _Flattener:
         into, out = (
             list(options[name].ints) if name in options else [] for name in ("scan_input_axes", "scan_output_axes")
         )
-        zero = self._name("first")
-        self.graph.initializer.append(require("onnx.numpy_helper", "build").from_array(np.array(0, np.int64), zero))
-        slices = []
+        zero, slices = self._add_constant("first", np.array(0, np.int64)), []
         for index, name in enumerate(scanned):
             slices.append(self._name("slice"))
             self._add("Gather", [name, zero], slices[-1], axis=into[index] if into else 0)
@@ -193,14 +185,16 @@ class _Flattener:
             if self.opset < 13:
                 self._add("Unsqueeze", [value], part, axes=[axis])
             else:
-                axes = self._name("axes")
-                helper = require("onnx.numpy_helper", "build")
-                self.graph.initializer.append(helper.from_array(np.array([axis], np.int64), axes))
-                self._add("Unsqueeze", [value, axes], part)
+                self._add("Unsqueeze", [value, self._add_constant("axes", np.array([axis], np.int64))], part)
             self._add("Concat", [part] * stacked, name, axis=axis)
 
     def _add(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> None:
         self.nodes.append(require("onnx.helper", "build").make_node(kind, inputs, [output], output, **attributes))
+
+    def _add_constant(self, what: str, values: Any) -> str:
+        name = self._name(what)
+        self.graph.initializer.append(require("onnx.numpy_helper", "build").from_array(values, name))
+        return name
 
     def _name(self, what: str) -> str:
         self.count += 1

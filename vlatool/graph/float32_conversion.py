@@ -12,7 +12,7 @@ import numpy as np
 from vlatool.errors import require
 from vlatool.graph.files import save
 from vlatool.graph.macs import COMPUTE
-from vlatool.graph.nodes import inner_nodes, rename_reads, unique_name
+from vlatool.graph.nodes import rename_reads, subgraphs, unique_name, with_inner_nodes
 from vlatool.graph.onnx_graph import FLOAT, OnnxGraph, type_name
 
 FLOAT16, FLOAT64, BFLOAT16 = 10, 11, 16
@@ -72,22 +72,15 @@ def _compute_types(model: Any) -> set[int]:
     types = {name: tensor.data_type for name, tensor in graph.constants.items()}
     with contextlib.suppress(Exception):  # the seam: onnx infers nothing beside operators that it does not know
         types |= graph.types
-    layers = [node for node in _all_nodes(model.graph) if node.op_type in COMPUTE]
+    layers = [node for node in with_inner_nodes(model.graph.node) if node.op_type in COMPUTE]
     return {types.get(name, 0) for node in layers for name in node.input[:2]}
-
-
-def _all_nodes(graph: Any) -> Iterator[Any]:
-    for node in graph.node:
-        yield node
-        yield from inner_nodes(node)
 
 
 def _graphs(graph: Any) -> Iterator[Any]:
     """Yield a graph and its subgraphs."""
     yield graph
-    for node in _all_nodes(graph):
-        for item in node.attribute:
-            yield from (*([item.g] if item.HasField("g") else []), *item.graphs)
+    for node in with_inner_nodes(graph.node):
+        yield from subgraphs(node)
 
 
 def _uses_type(graph: Any, code: int) -> bool:
@@ -98,7 +91,7 @@ def _uses_type(graph: Any, code: int) -> bool:
             return True
         if any(value.type.tensor_type.elem_type == code for value in values):
             return True
-    items = (item for node in _all_nodes(graph) for item in node.attribute)
+    items = (item for node in with_inner_nodes(graph.node) for item in node.attribute)
     return any((item.name in TYPE_ATTRIBUTES and item.i == code) or item.t.data_type == code for item in items)
 
 
@@ -114,8 +107,8 @@ def _retype(graph: Any, codes: set[int], outermost: bool) -> None:
                 item.i = FLOAT
             for tensor in (*([item.t] if item.HasField("t") else []), *item.tensors):
                 _widen(tensor, codes)
-            for inner in (*([item.g] if item.HasField("g") else []), *item.graphs):
-                _retype(inner, codes, outermost=False)
+        for inner in subgraphs(node):
+            _retype(inner, codes, outermost=False)
 
 
 def _widen(tensor: Any, codes: set[int]) -> None:

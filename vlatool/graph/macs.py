@@ -65,13 +65,19 @@ def _source(name: str, tensors: Tensors) -> Any:
     return node
 
 
+def second_operand(node: Any) -> str:
+    """Return the name of the second value that a compute layer multiplies; empty where it has none."""
+    index = WEIGHT_AT.get(node.op_type, 1)
+    return str(node.input[index]) if len(node.input) > index else ""
+
+
 def node_macs(node: Any, tensors: Tensors) -> int | None:
     """Return the multiply-accumulates of a compute layer; None when a shape that it needs is not static."""
     kind = node.op_type
     if kind in OPAQUE or (kind == "Attention" and node.domain):
         return None
     first, out = tensors.shape(node.input[0]), tensors.shape(node.output[0])
-    second = tensors.shape(node.input[WEIGHT_AT.get(kind, 1)]) if len(node.input) > WEIGHT_AT.get(kind, 1) else None
+    second = tensors.shape(second_operand(node))
     if kind == "MatMulNBits":
         return None if out is None else math.prod(out) * int(tensors.attribute(node, "K", 0))
     if first is None or second is None:

@@ -12,22 +12,31 @@ from vlatool.errors import require
 def reads(node: Any) -> Iterator[str]:
     """Yield the values that a node reads, including those that its subgraphs (If, Loop, Scan) capture."""
     yield from (name for name in node.input if name)
+    for graph in subgraphs(node):
+        inside = {value.name for value in graph.input} | {tensor.name for tensor in graph.initializer}
+        inside.update(name for inner in graph.node for name in inner.output)
+        inside.discard("")
+        yield from (name for inner in graph.node for name in reads(inner) if name not in inside)
+        yield from (value.name for value in graph.output if value.name not in inside)
+
+
+def subgraphs(node: Any) -> Iterator[Any]:
+    """Yield the graphs that a node has as attributes (If, Loop, Scan)."""
     for item in node.attribute:
-        for graph in (item.g, *item.graphs) if item.HasField("g") or item.graphs else ():
-            inside = {value.name for value in graph.input} | {tensor.name for tensor in graph.initializer}
-            inside.update(name for inner in graph.node for name in inner.output)
-            inside.discard("")
-            yield from (name for inner in graph.node for name in reads(inner) if name not in inside)
-            yield from (value.name for value in graph.output if value.name not in inside)
+        yield from (*([item.g] if item.HasField("g") else []), *item.graphs)
 
 
 def inner_nodes(node: Any) -> Iterator[Any]:
-    """Yield the nodes of the subgraphs of a node (If, Loop, Scan), recursively."""
-    for item in node.attribute:
-        for graph in (item.g, *item.graphs):
-            for inner in graph.node:
-                yield inner
-                yield from inner_nodes(inner)
+    """Yield the nodes of the subgraphs of a node, recursively."""
+    for graph in subgraphs(node):
+        yield from with_inner_nodes(graph.node)
+
+
+def with_inner_nodes(nodes: Iterable[Any]) -> Iterator[Any]:
+    """Yield nodes, each before those of its subgraphs."""
+    for node in nodes:
+        yield node
+        yield from inner_nodes(node)
 
 
 def read_names(nodes: Iterable[Any]) -> set[str]:
@@ -39,11 +48,10 @@ def rename_reads(graph: Any, old: str, new: str) -> None:
     """Rename a value wherever nodes of a graph, or of its subgraphs, read it."""
     for node in graph.node:
         node.input[:] = [new if name == old else name for name in node.input]
-        for attribute in node.attribute:
-            for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
-                rename_reads(inner, old, new)
-                for value in inner.output:  # a value that a branch passes through
-                    value.name = new if value.name == old else value.name
+        for inner in subgraphs(node):
+            rename_reads(inner, old, new)
+            for value in inner.output:  # a value that a branch passes through
+                value.name = new if value.name == old else value.name
 
 
 def varying_values(model: Any) -> set[str]:

@@ -29,7 +29,6 @@ def insert_qdq(model: Any, layers: Iterable[Layer], ranges: Mapping[str, Range],
         model: An ``onnx.ModelProto``.
         layers: From ``find_layers`` of the same model.
         ranges: Value name -> (low, high), for every value of ``calibrated_values``.
-        style: Quantization style of the layers.
 
     Raises:
         GraphError: when a weight holds NaN or infinity.

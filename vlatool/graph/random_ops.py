@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
 from vlatool.errors import GraphError
-from vlatool.graph.nodes import inner_nodes
+from vlatool.graph.nodes import inner_nodes, with_inner_nodes
 
 DISTRIBUTIONS = {
     "RandomNormal": "normal", "RandomNormalLike": "normal", "RandomUniform": "uniform", "RandomUniformLike": "uniform",
@@ -31,7 +31,6 @@ def refuse_random_ops(model: Any, graph: str) -> None:
 
     Args:
         model: An ``onnx_ir.Model``.
-        graph: Name of the graph in the program.
 
     Raises:
         GraphError: with number and location of the draws, and how to declare the noise instead.
@@ -99,7 +98,7 @@ def _random_nodes(model: Any) -> list[Any]:
     """
     graph, off = model.graph, _false_constants(model.graph)
     inside = [inner for node in graph.node for inner in inner_nodes(node)]
-    inside += [node for value in model.functions for node in _nodes(value.node)]
+    inside += [node for value in model.functions for node in with_inner_nodes(value.node)]
     outer = [node for node in graph.node if _is_random(node, off)]
     return outer + [node for node in inside if _is_random(node, set())]
 
@@ -122,13 +121,6 @@ def _is_random(node: Any, off: Set[str]) -> bool:
     index = TRAINING_MODE_INPUT.get(node.op_type)
     dropping = index is not None and len(node.input) > index and node.input[index] not in {"", *off}
     return node.domain in DOMAINS and (dropping or node.op_type in DISTRIBUTIONS or node.op_type in SAMPLING_OPS)
-
-
-def _nodes(nodes: Sequence[Any]) -> Iterator[Any]:
-    """Yield nodes and those of their subgraphs."""
-    for node in nodes:
-        yield node
-        yield from inner_nodes(node)
 
 
 def _static(value: Any) -> tuple[int, ...]:

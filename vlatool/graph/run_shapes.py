@@ -20,7 +20,6 @@ class RunShapes:
 
     Args:
         inputs: Shapes of its inputs in the last run, without omitted ones and weights that the engine packed.
-        outputs: Shapes of its outputs.
     """
 
     times: int

@@ -140,25 +140,24 @@ class Tensors:
             if any(inner.op_type in operators for inner in inner_nodes(node)):
                 yield node.name or node.output[0]
 
-    def run_counts(self, macs: Callable[[Any], int]) -> list[tuple[Any, int]]:
+    def run_counts(self, items: Sequence[Any], macs: Callable[[Any], int], times: int = 1) -> list[tuple[Any, int]]:
         """Return the nodes that run, and the number of runs of each; 0: unknown.
 
         Of the branches of an If, the one with the most multiply-accumulates counts.
 
         Args:
+            items: Nodes with nested bodies, such as ``items`` of the graph.
             macs: Function that returns the multiply-accumulates of a node.
+            times: Number of runs of the items.
         """
-        return self._runs(self.items, 1, macs)
-
-    def _runs(self, items: Sequence[Any], times: int, macs: Callable[[Any], int]) -> list[tuple[Any, int]]:
         found: list[tuple[Any, int]] = []
         for item in items:
             if isinstance(item, Branches):
-                bodies = [self._runs(body, times, macs) for body in item.bodies]
+                bodies = [self.run_counts(body, macs, times) for body in item.bodies]
                 costs = [sum(macs(node) * max(1, count) for node, count in body) for body in bodies]
                 found += bodies[costs.index(max(costs))]
             elif isinstance(item, LoopBody):
-                found += [] if item.count == 0 else self._runs(item.body, times * self._loop_count(item), macs)
+                found += [] if item.count == 0 else self.run_counts(item.body, macs, times * self._loop_count(item))
             else:
                 seen = self._run_shapes.get(item.name)
                 found.append((item, times or (seen.times if seen else 0)))

@@ -15,7 +15,7 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, require
-from vlatool.graph.macs import COMPUTE, CONVOLUTIONS, INTEGER_OPS, WEIGHT_AT, node_macs, precision_of
+from vlatool.graph.macs import COMPUTE, CONVOLUTIONS, INTEGER_OPS, node_macs, precision_of, second_operand
 from vlatool.graph.nodes import matches
 from vlatool.graph.shapes import Tensors, open_graph
 
@@ -160,7 +160,11 @@ def _count(
     tally = Tally()
     activation_bytes = 0
     unknown = [*tensors.nodes_with_inner(COMPUTE)]
-    for node, times in tensors.run_counts(lambda node: (node.op_type in COMPUTE and node_macs(node, tensors)) or 0):
+
+    def macs_of(node: Any) -> int:
+        return (node.op_type in COMPUTE and node_macs(node, tensors)) or 0
+
+    for node, times in tensors.run_counts(tensors.items, macs_of):
         tally.add_concat(node.op_type == "Concat")
         if node.op_type not in COMPUTE:
             continue
@@ -175,7 +179,8 @@ def _count(
         part = part_of(node.name, parts)
         written_numbers = math.prod(tensors.shape(node.output[0]) or ())
         weights, groups = _operands(node, tensors)
-        tally.add_layer(count, written_numbers, weights, groups, part, _weight_of(node, tensors), times)
+        weight = tensors.source_tensor(second_operand(node))
+        tally.add_layer(count, written_numbers, weights, groups, part, weight, times)
     integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
     return GraphWorkload(
         dict(macs), tally.layers, tally.weights, tally.activations, tally.traits(), tensors.weight_bytes,
@@ -187,16 +192,10 @@ def _operands(node: Any, tensors: Tensors) -> tuple[int, int]:
     """Return the elements of a layer's weight (0 for a product of activations) and the groups of a convolution."""
     if node.op_type == "MatMulNBits":
         return int(tensors.attribute(node, "K", 0)) * int(tensors.attribute(node, "N", 0)), 1
-    second = node.input[WEIGHT_AT.get(node.op_type, 1)] if len(node.input) > WEIGHT_AT.get(node.op_type, 1) else ""
+    second = second_operand(node)
     shape = tensors.shape(second) or ()
     groups = int(tensors.attribute(node, "group", 1)) if node.op_type in CONVOLUTIONS else 1
     return (math.prod(shape) if tensors.is_constant(second) else 0), groups
-
-
-def _weight_of(node: Any, tensors: Tensors) -> str:
-    """Return the name of the stored tensor of a layer's weight."""
-    index = WEIGHT_AT.get(node.op_type, 1)
-    return tensors.source_tensor(node.input[index]) if len(node.input) > index else ""
 
 
 @dataclass
@@ -230,7 +229,6 @@ class Tally:
 
         Args:
             weight: Identity of its weight; a known weight is read again, not stored again. Empty: a new weight.
-            times: Number of runs.
         """
         before = self._parts.get(part, (0, 0, 0, 0))
         added = zip(before, (times * macs, times * weights, times * written, times), strict=True)
@@ -271,21 +269,16 @@ WORKLOAD_TABLE = "workload"
 
 def summarize_workload(load: Workload) -> dict[str, Any]:
     """Return the work of one inference as one record: sums over its graphs and their repeats."""
-    sums = {"macs": 0.0, "weights": 0.0, "activations": 0.0, "layers": 0.0}
-    traits: set[str] = set()
-    precision = "float32"
-    most = -1.0
-    for name, runs in load.runs.items():
-        graph = load.graphs[name]
-        macs = float(sum(graph.macs.values())) * runs
-        sums["macs"] += macs
-        sums["weights"] += graph.reads * runs
-        sums["activations"] += graph.activations * runs
-        sums["layers"] += graph.layers * runs
-        traits |= graph.traits
-        if macs > most:
-            most, precision = macs, stored_precision(graph)
-    return {**sums, "traits": sorted(traits), "precision": precision}
+    runs = [(load.graphs[name], count) for name, count in load.runs.items()]
+    macs = [float(sum(graph.macs.values())) * count for graph, count in runs]
+    return {
+        "macs": sum(macs, 0.0),
+        "weights": float(sum(graph.reads * count for graph, count in runs)),
+        "activations": float(sum(graph.activations * count for graph, count in runs)),
+        "layers": float(sum(graph.layers * count for graph, count in runs)),
+        "traits": sorted(set().union(*(graph.traits for graph, _ in runs))),
+        "precision": stored_precision(runs[macs.index(max(macs))][0]) if runs else "float32",
+    }
 
 
 def stored_precision(graph: GraphWorkload) -> str:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from vlatool.errors import ProfileError, fix_for, suggest
+from vlatool.errors import ProfileError
 from vlatool.files.yaml import read_yaml
+from vlatool.hardware._problems import describe_problem
 from vlatool.hardware.profile import NAME, SUFFIXES, Kind, Strict
 
 
@@ -52,16 +53,16 @@ def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
     own = name.endswith(SUFFIXES) or os.sep in name
     path = Path(name) if own else _folder() / f"{name}.yaml"
     if not own and name not in platform_names():
-        raise ProfileError(
-            f"Unknown platform '{name}'; {suggest(name, platform_names())}.", fix_for(name, platform_names())
-        )
+        raise ProfileError.unknown(f"Unknown platform '{name}'", name, platform_names())
     try:
         return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
+        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        if first["type"] == "extra_forbidden":
+            problem = describe_problem(first, Platform.model_fields)
         raise ProfileError(
-            f"The platform {path} is malformed: {where}: {first['msg']}.",
+            f"The platform {path} is malformed: {problem.rstrip('.')}.",
             "correct it in the file; the platforms that come with vlatool show what belongs there",
         ) from error
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from vlatool.errors import ProfileError, fix_for, suggest
+from vlatool.errors import ProfileError
 from vlatool.graph.workload import PRECISIONS, GraphWorkload, Workload, stored_precision
 from vlatool.hardware.profile import EngineFigures, Profile
 from vlatool.latency_model.features import ComputeUnit, Question, Shares, Work, roofline_parts
@@ -49,10 +49,7 @@ class Candidate:
         """
         engines = self.profile.engines
         if self.engine not in engines:
-            raise ProfileError(
-                f"{self.profile.name} has no engine '{self.engine}'; {suggest(self.engine, engines)}.",
-                fix_for(self.engine, engines),
-            )
+            raise ProfileError.unknown(f"{self.profile.name} has no engine '{self.engine}'", self.engine, engines)
         return engines[self.engine]
 
 
@@ -61,10 +58,8 @@ class Phase:
     """One graph of an inference on a candidate.
 
     Args:
-        name: Name of the graph.
         runs: Number of runs in one inference.
         once: Prediction of one run.
-        question: Question to the model.
     """
 
     name: str
@@ -131,8 +126,6 @@ def engine_for(profile: Profile, load: Workload, own: str = "") -> str:
     """Return the engine of a board that a policy runs in: its own, the preferred one, or the first that can run it.
 
     Args:
-        profile: Profile of the board.
-        load: Workload of the policy.
         own: Engine that the bundle was made for, if any.
 
     Returns:

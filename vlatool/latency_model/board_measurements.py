@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import DataError, ProfileError
+from vlatool.files.messages import to_json
 from vlatool.files.user_files import atomic_file
 from vlatool.graph.workload import PRECISIONS, TRAITS, WORKLOAD_TABLE, Workload, summarize_workload
 from vlatool.hardware.profile import Profile, load_profile, profile_names
@@ -32,7 +33,6 @@ class BoardMeasurement:
 
     Args:
         profile, mode, engine, precision: Names as in a profile.
-        work: Work of one inference.
         ms: Median latency.
     """
 
@@ -62,7 +62,6 @@ def report_measurements(
 
     Args:
         report: ``report.json`` or its directory.
-        profile: Profile of the board.
         mode: Power mode of the board; the default one when None.
         load: Workload of the policy, for a report without it.
 
@@ -114,7 +113,7 @@ def store(measured: list[BoardMeasurement]) -> Path:
     file = calibrations() / f"{measured[0].profile}.json"
     known = [item for item in _read(file) if item not in measured] if file.is_file() else []
     file.parent.mkdir(parents=True, exist_ok=True)
-    rows = [dict(vars(item)) for item in (*known, *measured)]
+    rows = to_json([*known, *measured])
     with atomic_file(file) as draft:
         draft.write_text(json.dumps({"schema": SCHEMA_VERSION, "measured": rows}, indent=1) + "\n", encoding="utf-8")
     return file

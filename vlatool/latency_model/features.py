@@ -6,15 +6,12 @@ import math
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.graph.workload import PRECISIONS, TRAITS
 from vlatool.latency_model.gaussian_process import KEYS, Rows
-
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
 
 PROXIES = {"bfloat16": "float16", "float8": "int8"}
 """Precision -> precision whose published latencies stand for it."""
@@ -31,11 +28,8 @@ class Work:
     """Work of one run of a graph.
 
     Args:
-        macs: Multiply-accumulates.
         weights: Elements read from weights, counted at each read.
         activations: Elements that its compute layers write.
-        layers: Number of compute layers.
-        traits: Traits of ``TRAITS``.
         name: Published name; unique for a user's own graph.
     """
 
@@ -55,9 +49,7 @@ class ComputeUnit:
         device: Name of the board or processor; units with one name share what is known about it.
         unit: ``cpu``, ``gpu``, ``igpu`` or ``npu``.
         cores: Number of cores (threads) in use.
-        clock_ghz: Clock of the cores.
         peaks: Precision -> 10^12 operations per second, dense; at least one.
-        bandwidth_gb_s: Bandwidth of the memory.
         setting: Other conditions of a measurement: power mode, threads, version.
         isa: Instruction set features of its cores, as in profiles: units with the same features inform each other.
     """

@@ -11,10 +11,8 @@ import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import DataError, OutputError
 from vlatool.latency_model.features import Shares, rows_of
@@ -22,8 +20,8 @@ from vlatool.latency_model.folds import UNITS, Folds, Sample
 from vlatool.latency_model.gaussian_process import Scales
 from vlatool.latency_model.model import DATA, LEVEL, LatencyModel, TrainingData, read_model, write
 from vlatool.latency_model.published_latencies import Point, merge_versions, read_points
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 TAIL_WEIGHT = 0.3
 """Weight of the 90th percentile relative to the median."""
 DEVICE_WEIGHT = 0.6
@@ -74,7 +72,6 @@ def tune(
     Args:
         seconds: Time limit of the search.
         seed: Random seed of the order of the coordinates.
-        tell: Receiver of each improvement.
     """
     names = [field.name for field in dataclasses.fields(Scales) if field.name != "constant"]
     names += [f"shares.{field.name}" for field in dataclasses.fields(Shares)]
@@ -222,8 +219,6 @@ def fit(
     Args:
         before: Start of the search for scales; ``Scales()`` and ``Shares()`` when None.
         seconds: Time limit of the search; 0 keeps the scales.
-        seed: Random seed of the search.
-        tell: Receiver of progress.
     """
     parts: dict[str, TrainingData] = {}
     shares: dict[str, Shares] = {}
@@ -271,7 +266,6 @@ def fit_files(
     Args:
         anew: Start the search for scales at ``Scales()`` and ``Shares()``, instead of those of the shipped model, which
             was fitted on all published figures.
-        tell: Receiver of progress.
 
     Raises:
         DataError: when the file is malformed, or has no row to fit on.

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.latency_model.features import Question
 from vlatool.latency_model.gaussian_process import Rows, Scales, kernel
 from vlatool.latency_model.published_latencies import Point, merge_versions
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 UNITS = ("cpu", "gpu", "igpu", "npu")
 MAX_MODELS = 32
 """Largest number of models that calibrate a held-out device, one at a time."""
@@ -28,7 +26,6 @@ class Sample:
     """The rows of a fit.
 
     Args:
-        questions: Question of each row.
         logs: (n,) natural logarithm of ms.
         models, devices: (n,) codes of the groups that are left out as a whole.
         units: (n,) index into ``UNITS``.
@@ -65,13 +62,7 @@ def _codes(names: Sequence[str]) -> Array:
 
 
 class Folds:
-    """Predictions of each row without its group.
-
-    Args:
-        rows: Rows of the sample.
-        sample: The sample.
-        scales: Scales of the process.
-    """
+    """Predictions of each row without its group."""
 
     def __init__(self, rows: Rows, sample: Sample, scales: Scales) -> None:
         covariance = kernel(rows, rows, scales)

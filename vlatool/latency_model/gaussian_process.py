@@ -14,9 +14,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
 
 KEYS = ("unit", "core", "device", "runtime", "kind", "made", "line", "pair", "setting", "model", "known")
 """Categories of a row: class of unit; instruction set of its cores; device and unit; runtime; runtime and precision;
@@ -153,9 +152,7 @@ class Process:
     """The process conditioned on measurements.
 
     Args:
-        rows: Measured rows.
         logs: (n,) natural logarithm of the latency in ms.
-        scales: Scales of the fit.
         noise: (n,) standard deviation of each measurement; that of the fit when None.
     """
 

@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import DataError
+from vlatool.files.messages import to_json
 from vlatool.files.user_files import atomic_file
 from vlatool.latency_model.features import PROXIES, Question, Shares, rows_of
-from vlatool.latency_model.gaussian_process import KEYS, Process, Rows, Scales
+from vlatool.latency_model.gaussian_process import KEYS, PARTS, Process, Rows, Scales
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 DATA = Path(__file__).with_name("data")
 MODEL_ENV = "VLATOOL_LATENCY"
 """Environment variable with a directory of ``vlatool hwselect fit``."""
@@ -49,6 +49,12 @@ class Prediction:
     regime: str = "unseen"
     why: str = ""
 
+    @classmethod
+    def between(cls, log_ms: float, half: float, regime: str) -> Prediction:
+        """Return a prediction from the logarithm of its median and the half width of its interval in log(ms)."""
+        ms = math.exp(log_ms)
+        return cls(ms, ms * math.exp(-half), ms * math.exp(half), regime)
+
     @property
     def known(self) -> bool:
         """Whether there is a prediction."""
@@ -60,9 +66,7 @@ class TrainingData:
     """Data of a process: figures and scales.
 
     Args:
-        rows: Measured rows.
         logs: (n,) natural logarithm of the ms.
-        scales: Scales of the fit.
     """
 
     rows: Rows
@@ -155,18 +159,13 @@ class LatencyModel:
             regime = "known" if int(rows.keys["pair"][number]) in pairs else "unseen"
             if int(rows.keys["device"][number]) in self.own:
                 regime = "calibrated"
-            if why := unknown_reason(question, int(rows.keys["runtime"][number]) in runtimes, regime != "unseen"):
-                answers.append(Prediction(math.nan, regime=regime, why=why))
-                continue
             spans = self.conformal[part][regime]
             half = float(spans.get(question.compute_unit.unit, max(spans.values())) * deviation[number])
-            if half > MAX_HALF_INTERVAL:
-                factor = math.exp(half)
-                reason = f"published figures leave a factor of {factor:.1f} either way; measure it on the board"
-                answers.append(Prediction(math.nan, regime=regime, why=reason))
-                continue
-            ms = math.exp(mean[number])
-            answers.append(Prediction(ms, ms * math.exp(-half), ms * math.exp(half), regime))
+            why = unknown_reason(question, int(rows.keys["runtime"][number]) in runtimes, regime != "unseen")
+            if not why and half > MAX_HALF_INTERVAL:
+                why = f"published figures leave a factor of {math.exp(half):.1f} either way; measure it on the board"
+            unknown = Prediction(math.nan, regime=regime, why=why)
+            answers.append(unknown if why else Prediction.between(mean[number], half, regime))
         return answers
 
     def _process(self, part: str, rows: Rows) -> Process:
@@ -193,7 +192,6 @@ def unknown_reason(question: Question, published: bool, device_known: bool) -> s
     """Return why a question cannot be answered, or an empty string.
 
     Args:
-        question: The question.
         published: Whether a figure of the runtime is known.
         device_known: Whether a figure of this device is known.
     """
@@ -236,7 +234,7 @@ def read_model(folder: Path) -> LatencyModel:
     parts, shares = {}, {}
     with (folder / "latency.npz").open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
         for part, values in parameters["parts"].items():
-            arrays = {name: stored[f"{part}.{name}"] for name in ("model", "traits", "device", "prior")}
+            arrays = {name: stored[f"{part}.{name}"] for name in PARTS}
             keys = stored[f"{part}.keys"]
             if keys.ndim != 2 or keys.shape[1] != len(KEYS):
                 raise ValueError("it was fitted by another version of vlatool")
@@ -252,19 +250,17 @@ def read_model(folder: Path) -> LatencyModel:
 
 def write(model: LatencyModel, folder: Path) -> None:
     """Write ``latency.npz`` and ``latency.json`` as ``load_model`` reads them."""
-    import dataclasses
-
     arrays: dict[str, Array] = {}
     described: dict[str, Any] = {}
     for part, known in model.parts.items():
         rows = known.rows
         arrays[f"{part}.keys"] = np.stack([rows.keys[name] for name in KEYS], axis=1).astype(np.uint32)
-        for name in ("model", "traits", "device", "prior"):
+        for name in PARTS:
             arrays[f"{part}.{name}"] = getattr(rows, name).astype(np.float32)
         arrays[f"{part}.logs"] = known.logs.astype(np.float32)
         described[part] = {
-            "scales": {key: float(f"{value:.5g}") for key, value in dataclasses.asdict(known.scales).items()},
-            "shares": {key: float(f"{value:.5g}") for key, value in dataclasses.asdict(model.shares[part]).items()},
+            "scales": {key: float(f"{value:.5g}") for key, value in to_json(known.scales).items()},
+            "shares": {key: float(f"{value:.5g}") for key, value in to_json(model.shares[part]).items()},
             "conformal": {
                 regime: {unit: round(value, 4) for unit, value in units.items()}
                 for regime, units in model.conformal[part].items()

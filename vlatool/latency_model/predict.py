@@ -22,8 +22,6 @@ def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Meas
     """Return predicted latency, memory and energy of a bundle on a board; NaN with a note where unknown.
 
     Args:
-        profile: Profile of the board.
-        bundle: Bundle with graphs.
         engine: Engine of the board; when empty, the bundle's own, where the board has that, or its preferred one, where
             it runs such graphs, or another one that does.
     """

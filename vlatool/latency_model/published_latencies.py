@@ -65,7 +65,6 @@ class Point:
         group: Name of the board for hold-out: see ``DEVICE_ALIASES``.
         kind: ``device_class``: cpu, gpu, igpu, npu.
         model: Name of the model for hold-out.
-        why: Reason why there is no question.
     """
 
     question: Question | None
@@ -160,11 +159,8 @@ def runtime_of(name: str) -> str:
 
 def work_of(row: Mapping[str, str], where: str, *, decoding: bool) -> Work | None:
     """Return the work of a row; None when its multiply-accumulates are unknown."""
-    macs, weights = (
-        _number(row.get("gflops_or_gmacs", ""), where, "gmacs"),
-        _number(row.get("params_m", ""), where, "p"),
-    )
-    activations, layers = _number(row.get("macts_m", ""), where, "a"), _number(row.get("n_layers", ""), where, "l")
+    columns = {"gflops_or_gmacs": "gmacs", "params_m": "p", "macts_m": "a", "n_layers": "l"}
+    macs, weights, activations, layers = (_number(row.get(name, ""), where, short) for name, short in columns.items())
     known = _models().get(row["model"], {})
     macs, weights = known.get("gmacs", macs), known.get("params_m", weights)
     if decoding and weights > 0:  # each weight is used once

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vlatool.errors import DataError, UsageError
+from vlatool.files.messages import from_json, to_json
 from vlatool.latency_model.fit import fit
 from vlatool.latency_model.model import LatencyModel, Prediction
 from vlatool.latency_model.published_latencies import Point, merge_versions, read_points
 from vlatool.latency_model.score import DRAWS, FOLDS, describe_split, summarize
 from vlatool.machine.processes import single_threads
-from vlatool.user_code.children import map_jobs
+from vlatool.user_code.children import OnProgress, map_jobs
 
 PredictedPoints = list[tuple[Point, Prediction]]
 
 
 def refit_points(
-    path: Path, held_out: str | None, seed: int, seconds: float, tell: Callable[[str, float | None], None]
+    path: Path, held_out: str | None, seed: int, seconds: float, tell: OnProgress
 ) -> dict[str, dict[str, Any]]:
     """Predict a file's rows with models that were fitted without them, in one process for each core.
 
@@ -31,11 +31,9 @@ def refit_points(
     not on the intervals.
 
     Args:
-        path: File of published latencies.
         held_out: ``models``: a tenth of the models at a time; ``devices``: each board.
         seed: Random seed of the folds, of the search, and of the calibrating models.
         seconds: Time limit of the search of each part.
-        tell: Receiver of progress and the share that is done.
 
     Returns:
         ``models``; or ``devices`` and ``calibrated``, where a board is left out except for one of its models.
@@ -65,7 +63,7 @@ def refit_points(
     with single_threads(), contextlib.closing(parts):
         for done, part in enumerate(parts, 1):
             for kind, rows in part.items():
-                answered[kind] += [(points[number], Prediction(**values)) for number, values in rows]
+                answered[kind] += [(points[number], from_json(Prediction, values)) for number, values in rows]
             tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
     unasked = [point for point in points if not point.question]
     summaries = {}
@@ -89,12 +87,12 @@ def deal_folds(points: Sequence[Point], held_out: str, seed: int) -> list[frozen
     return [part for part in parts if part]
 
 
-def fold(job: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+def fold(job: Mapping[str, Any], _tell: OnProgress) -> dict[str, Any]:
     """Compute one part in this process: kind -> index of the point and its prediction."""
     points = read_points(Path(job["points"]))
     numbers = {id(point): number for number, point in enumerate(points)}
     answered = one_fold(points, frozenset(job["held"]), job["held_out"], job["seed"], job["seconds"])
-    return {kind: [[numbers[id(point)], asdict(answer)] for point, answer in part] for kind, part in answered.items()}
+    return {kind: [[numbers[id(point)], to_json(answer)] for point, answer in part] for kind, part in answered.items()}
 
 
 def one_fold(

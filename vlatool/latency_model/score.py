@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import DataError, UsageError, fix_for
 from vlatool.latency_model.features import rows_of
@@ -18,8 +17,8 @@ from vlatool.latency_model.fit import Scores, split_by_part
 from vlatool.latency_model.folds import UNITS, Folds, Sample
 from vlatool.latency_model.model import LEVEL, MAX_HALF_INTERVAL, MODEL_ENV, Prediction, load_model, unknown_reason
 from vlatool.latency_model.published_latencies import Point, read_points
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 SPLITS = ("models", "devices", "calibrated")
 DRAWS = 5
 """Number of models that calibrate each device, one at a time."""
@@ -31,7 +30,6 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
     """Predict a file; with ``held_out`` from its own other rows.
 
     Args:
-        path: File of published latencies.
         held_out: ``models``: a tenth of the models is left out at a time; ``devices``: each device; ``calibrated``:
             each device except for one of its models. The widths of the intervals come from the errors of the others,
             whose predictions used the rows that are left out here; ``refit`` is stricter.
@@ -100,13 +98,12 @@ def _predict_left_out(sample: Sample, part: str, held_out: str, seed: int) -> di
         why = unknown_reason(question, not unknown[index], regime != "unseen")
         if not why and half > MAX_HALF_INTERVAL:
             why = "published figures leave too wide an interval"
-        if calibrating[index] or why:
-            predictions[question] = Prediction(
-                math.nan, regime="told" if calibrating[index] else regime, why=why or "it was told"
-            )
+        if calibrating[index]:
+            predictions[question] = Prediction(math.nan, regime="told", why=why or "it was told")
+        elif why:
+            predictions[question] = Prediction(math.nan, regime=regime, why=why)
         else:
-            ms = math.exp(sample.logs[index] + error[index])
-            predictions[question] = Prediction(ms, ms * math.exp(-half), ms * math.exp(half), regime)
+            predictions[question] = Prediction.between(sample.logs[index] + error[index], half, regime)
     return predictions
 
 

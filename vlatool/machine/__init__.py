@@ -1,1 +1,1 @@
-"""The machine that this runs on: its processor, processes and version of vlatool."""
+"""Processor, processes and version of vlatool on this machine."""

@@ -23,6 +23,12 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 """
 """What an isolated process does first: ``-P`` would say it shorter, from Python 3.11 on."""
 
+NO_MEMORY = (
+    "MemoryError", "bad_alloc", "bad allocation", "ailed to allocate", "ut of memory", "annot allocate",
+    "Memory allocation",
+)  # fmt: skip
+"""What Python, C++ and the engines say when a limit on memory is reached; a control group kills instead."""
+
 
 def signal_name(code: int) -> str:
     """Return the name of the signal that ended a process, from its negative exit code."""

@@ -78,7 +78,7 @@ def _run_worker(job: LatencyJob, limits: Limits, tell: OnProgress) -> Benchmark:
         contextlib.ExitStack() as recording,
     ):
         recorder: Recorder | None = None
-        _send(worker, json.dumps(to_json(WorkerJob(job, tuple(map(tuple, trust.named_folders()))))))
+        _send(worker, json.dumps(to_json(WorkerJob(job, trust.named_folders()))))
         for line in cast(IO[str], worker.stdout):
             match child.read_line(line):
                 case child.Progress(what, share):

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.program import keeps_values
 from vlatool.measurement.child import ask, serve
 from vlatool.measurement.pairs import PairJob
 
@@ -41,10 +42,8 @@ class OutputAgreement:
 
     Args:
         kind: kind of the observations (``data.Drawn.kind``).
-        output: its name.
         correlation: over observations and elements, each by the baseline's spread: 1 gives the same everywhere, 0 is
             what a constant reaches, -1 is its opposite.
-        samples: observations.
     """
 
     kind: str
@@ -95,7 +94,7 @@ def run_agreement(job: PairJob) -> Agreement:
     policies = [load_policy(path, job) for path in (job.baseline, job.candidate)]
     pool = pool_of(job, baseline) if job.pairs else []
     calls, skipped = _answers(policies, pool, job)
-    if any(step.keep for step in baseline.manifest.program):
+    if keeps_values(baseline.manifest.program):
         for policy in policies:
             policy.reset()
         calls += _answers(policies, [replace(drawn, kind=SEQUENCE) for drawn in pool], job, afresh=False)[0]
@@ -156,7 +155,7 @@ def _strays(policy: Any, calls: Sequence[_Call], which: int, seed: int) -> int:
     """Count the answers that are others in another order without reset; 0 for a policy that keeps values by design."""
     from vlatool.measurement.answers import Answers
 
-    if any(step.keep for step in policy.bundle.manifest.program):
+    if keeps_values(policy.bundle.manifest.program):
         return 0
     answers = Answers([call.outputs[which] for call in calls])
     for index in random.Random(seed).sample(range(len(calls)), len(calls)):

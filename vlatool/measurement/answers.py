@@ -106,7 +106,6 @@ class Memory:
     Args:
         ratio: ratio of the medians, fresh over repeated.
         low: lower bound of the ratio at 99.9 %; 0 when there are too few pairs.
-        pairs: number of pairs.
     """
 
     ratio: float

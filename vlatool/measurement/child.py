@@ -17,8 +17,8 @@ from typing import IO, Any, TypeVar
 from vlatool import errors
 from vlatool.errors import GateFailed, GraphError, VlatoolError
 from vlatool.files.messages import from_json, to_json
-from vlatool.machine.processes import die_with_parent, signal_name
-from vlatool.measurement.jobs import Limits
+from vlatool.machine.processes import NO_MEMORY, die_with_parent, signal_name
+from vlatool.measurement.jobs import NO_LIMITS, Limits
 from vlatool.measurement.process_limits import command, ran_out
 
 REINSTALL = "see whether this Python runs vlatool at all: python -m vlatool doctor"
@@ -29,15 +29,6 @@ CRASHES = (
 T = TypeVar("T")
 MAX_LAST_LINE = 240
 """Characters of the last line of a process that a signal ended: the end of an assertion says most."""
-NO_MEMORY = (
-    "MemoryError",
-    "bad_alloc",
-    "ailed to allocate",
-    "out of memory",
-    "annot allocate memory",
-    "Memory allocation",
-)
-"""What Python, C++ and the engines say when a limit is reached; a control group kills instead."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +72,7 @@ MESSAGES: dict[str, type[Message]] = {kind.__name__.lower(): kind for kind in (P
 
 
 def ask(
-    module: str,
-    job: Any,
-    kind: type[T],
-    about: str,
-    timeout: float | None = None,
-    limits: Limits = Limits(),  # noqa: B008
+    module: str, job: Any, kind: type[T], about: str, timeout: float | None = None, limits: Limits = NO_LIMITS
 ) -> T:
     """Run a module of vlatool in a fresh process and return what it answers.
 
@@ -96,7 +82,6 @@ def ask(
         kind: type of its answer.
         about: subject of the question, for errors.
         timeout: seconds; endless when None.
-        limits: limits of the process.
 
     Raises:
         VlatoolError: what the process raised, of the same class; GraphError when it ended in another way or answered
@@ -143,7 +128,6 @@ def read_line(text: str, check: Callable[[Any], Any] = lambda value: value) -> M
     """Return the message of a line; None for what an engine prints, and for a line that was not written to its end.
 
     Args:
-        text: line of text.
         check: function called with its JSON values, and returns those that are read.
     """
     try:
@@ -153,11 +137,7 @@ def read_line(text: str, check: Callable[[Any], Any] = lambda value: value) -> M
         return None
 
 
-def error_of(
-    message: Raised,
-    limits: Limits = Limits(),  # noqa: B008
-    otherwise: type[VlatoolError] = GraphError,
-) -> VlatoolError:
+def error_of(message: Raised, limits: Limits = NO_LIMITS, otherwise: type[VlatoolError] = GraphError) -> VlatoolError:
     """Return what a process says that it raised, as ``otherwise`` where that is not an error of vlatool."""
     if limits.memory_mb and any(sign in message.message for sign in NO_MEMORY):
         return too_large(limits)

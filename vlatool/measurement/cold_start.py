@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.measurement.child import ask, serve
-from vlatool.measurement.jobs import ColdStartJob, Limits
+from vlatool.measurement.jobs import NO_LIMITS, ColdStartJob, Limits
 from vlatool.measurement.memory import peak_rss_mb, resident_mb
 
 FURTHER_CALLS = 5
@@ -55,7 +55,7 @@ def cold_start(
     bundle: Path,
     engine: str,
     threads: int,
-    limits: Limits = Limits(),  # noqa: B008
+    limits: Limits = NO_LIMITS,
     timeout: float | None = None,
     observations: Path | None = None,
 ) -> ColdStart:
@@ -63,7 +63,6 @@ def cold_start(
 
     Args:
         bundle, engine, threads: bundle to load, with which engine and threads.
-        limits, timeout: limits and timeout of the process.
         observations: file of observations (``save_drawn``) to infer on after the golden one.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 
@@ -24,6 +24,9 @@ class Limits:
 
     def __bool__(self) -> bool:
         return bool(self.cpus or self.cores or self.memory_mb)
+
+
+NO_LIMITS = Limits()
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class LatencyJob:
     phases: bool = False
     cold: int = 0
     check: bool = True
-    limits: Limits = Limits()
+    limits: Limits = NO_LIMITS
     reach: bool = False
 
 
@@ -64,12 +67,11 @@ class WorkerJob:
     """What the agent asks of the worker.
 
     Args:
-        job: job of the benchmark.
         named: folders whose code the user lets run (``trust.named_folders``).
     """
 
     job: LatencyJob
-    named: tuple[tuple[Any, ...], ...] = ()
+    named: Any = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -90,10 +90,8 @@ def run_paced(
     """Serve ticks of a control loop.
 
     Args:
-        policy: answers.
         observations: observations, used in turns.
         rate: ticks in a second.
-        ticks: number of ticks.
         answers: expected answers of the policy.
         tell: callback: what is being done, and the share that is done.
         clock, sleep: functions in seconds, replaced in tests.

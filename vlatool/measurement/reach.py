@@ -52,7 +52,6 @@ class Product:
     Args:
         engine: name of the engine; the default one when empty.
         dtype: ``int8``, ``float32`` or ``bfloat16``.
-        threads: threads of the engine.
 
     Raises:
         GraphError: when the engine refuses it, or does not compute in that dtype.

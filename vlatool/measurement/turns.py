@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.program import keeps_values
 from vlatool.data import RANDOM_KIND, RECORDED_KIND, Drawer, Drawn, read_drawn
 from vlatool.errors import GraphError, VlatoolError
 from vlatool.measurement.answers import Answers, vary_observation
@@ -126,15 +127,12 @@ class Turns:
         for policy in self.policies:
             policy.reset()
         calls = [call for index in indices if (call := self._pair(index)) is not None]
-        if self._keeps_values():  # what they answer depends on all that came before: one block, from its start
+        if keeps_values(self.steps):  # what they answer depends on all that came before: one block, from its start
             whole = len(calls) == len(indices)
             self.kept = calls if whole and (not self.kept or self.order.random() < 0.5) else self.kept
         else:
             self.kept += self.order.sample(calls, min(len(calls), REPEATS + 2))
         return len(indices)
-
-    def _keeps_values(self) -> bool:
-        return any(step.keep for step in self.steps)
 
     def _pair(self, index: int) -> Call | None:
         """Time both with an observation, exact or varied; None when the baseline cannot answer it."""
@@ -200,7 +198,7 @@ class Turns:
     def _replay(self, which: int) -> tuple[int, int]:
         """Let a fresh session answer the kept calls; return how many, and how many it answers otherwise."""
         policy = self._load(which)
-        keeps = self._keeps_values()
+        keeps = keeps_values(self.steps)
         calls = self.kept if keeps else self.order.sample(self.kept, min(MAX_REPLAYED, len(self.kept)))
         answers = Answers([call.outputs[which] for call in calls])
         for number, call in enumerate(calls):

@@ -65,7 +65,6 @@ def run_job(
     """Measure in this process.
 
     Args:
-        job: what to measure.
         tell: callback: what is being done, and the share that is done.
         wait: called when all is open and warm, before the first call that counts.
         timed: called after the last one.

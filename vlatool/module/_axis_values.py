@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from vlatool.module._zero_values import ZeroValues
 from vlatool.module.factors import Axis, Factors, Shape
+
+Rule = Callable[["Values", Any], Any]
+"""Walk and node -> axes of what the node gives."""
 
 
 class Values:
     """The axes of the values of a graph, and the products that it computes.
 
     Attributes:
-        factors: what axes are made of.
         products: axes over which each multiply-accumulate runs.
         widths: widths of each product, axes of the weights that it takes, without those of a kernel.
         reads: factors of axes of weights over which a product sums: what reads units, where others write them.
@@ -78,7 +80,6 @@ class Values:
         """Note a product.
 
         Args:
-            axes: axes over which it runs.
             widths: those of its weights, without those of a kernel.
         """
         self.products.append(axes)
@@ -103,6 +104,16 @@ class Values:
     def _is_stuck(self, axis: Axis) -> bool:
         return all(self.factors.is_frozen(leaf) for leaf in self.factors.leaves(axis))
 
+    def freeze(self, axes: Iterable[Axis]) -> None:
+        """Let all elements of some axes stay."""
+        for axis in axes:
+            self.factors.freeze(axis)
+
+    def unite_argument(self, node: Any, name: str, axis: Axis) -> None:
+        """Unite an axis with that of a vector, such as a bias, where an operator is given one."""
+        if (vector := argument(node, name)) is not None:
+            self.factors.unite(axis, self.shape_of(vector)[0])
+
     def frozen_axes(self, sizes: Sequence[int]) -> Shape:
         """Return new axes whose elements stay."""
         return [self.factors.new(size, frozen=True) for size in sizes]
@@ -115,6 +126,19 @@ def argument(node: Any, name: str, otherwise: Any = None) -> Any:
             default = stated.default_value if stated.has_default_value() else otherwise
             return node.args[number] if number < len(node.args) else node.kwargs.get(name, default)
     return otherwise
+
+
+def for_each_value(node: Any, shape: Callable[[Any], Shape | None]) -> Any:
+    """Return the axes of what an operator gives: a shape, or one for each where it gives several values."""
+    value = node.meta["val"]
+    return [shape(each) for each in value] if isinstance(value, list | tuple) else shape(value)
+
+
+def replace_axis(shape: Shape, along: int, axis: Axis) -> Shape:
+    """Return a shape with another axis in one place."""
+    result = list(shape)
+    result[along] = axis
+    return result
 
 
 def sizes_of(value: Any) -> list[int]:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from vlatool.module._axis_values import Values, argument, sizes_of
+from vlatool.module._axis_values import Rule, Values, argument, for_each_value, sizes_of
 from vlatool.module.factors import Shape
-
-Rule = Callable[[Values, Any], Any]
 
 
 def _channels(walk: Values, node: Any) -> Shape:
@@ -24,11 +21,9 @@ def _in_groups(walk: Values, node: Any) -> Shape:
     """Normalise over groups of channels: a group may go, a part of one may not."""
     given = walk.shape_of(node.args[0])
     groups, inside = walk.factors.split_axis(given[1], node.args[1])
-    for axis in (inside, *given[2:]):
-        walk.factors.freeze(axis)
+    walk.freeze((inside, *given[2:]))
     for name in ("weight", "bias"):
-        if argument(node, name) is not None:
-            walk.factors.unite(given[1], walk.shape_of(argument(node, name))[0])
+        walk.unite_argument(node, name, given[1])
     walk.counts[node] = {("num_groups", None): [groups]}
     return given
 
@@ -39,8 +34,7 @@ def _over_last(walk: Values, node: Any) -> Shape:
     for each in node.args[2:4]:
         if hasattr(each, "op"):
             walk.broadcast([given, walk.shape_of(each)])
-    for axis in given[-len(node.args[1]) :]:
-        walk.factors.freeze(axis)
+    walk.freeze(given[-len(node.args[1]) :])
     return given
 
 
@@ -56,12 +50,8 @@ def _weight_norm(walk: Values, node: Any) -> Shape:
 def _over_space(walk: Values, node: Any) -> Any:
     """Pool or interpolate: batch and channels stay as they are, places become others."""
     given, rank = walk.shape_of(node.args[0]), _rank(node)
-    for axis in given[-rank:]:
-        walk.factors.freeze(axis)
-    value = node.meta["val"]
-    values = value if isinstance(value, list | tuple) else [value]
-    shapes = [[*given[:-rank], *walk.frozen_axes(sizes_of(each)[-rank:])] for each in values]
-    return shapes if isinstance(value, list | tuple) else shapes[0]
+    walk.freeze(given[-rank:])
+    return for_each_value(node, lambda value: [*given[:-rank], *walk.frozen_axes(sizes_of(value)[-rank:])])
 
 
 def _unpool(walk: Values, node: Any) -> Any:
@@ -77,8 +67,7 @@ def _rank(node: Any) -> int:
 
 def _grid_sample(walk: Values, node: Any) -> Shape:
     given = walk.shape_of(node.args[0])
-    for axis in (*given[2:], *walk.shape_of(node.args[1])[1:]):
-        walk.factors.freeze(axis)
+    walk.freeze((*given[2:], *walk.shape_of(node.args[1])[1:]))
     return [*given[:2], *walk.frozen_axes(sizes_of(node.meta["val"])[2:])]
 
 
@@ -86,8 +75,7 @@ def _pixel_shuffle(walk: Values, node: Any) -> Shape:
     """Turn the faster part of the channels into places."""
     given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
     channels, space = walk.factors.split_axis(given[-3], sizes[-3])
-    for axis in (space, *given[-2:]):
-        walk.factors.freeze(axis)
+    walk.freeze((space, *given[-2:]))
     return [*given[:-3], channels, *walk.frozen_axes(sizes[-2:])]
 
 
@@ -104,8 +92,7 @@ def _unfold(walk: Values, node: Any) -> Shape:
 
 
 def _patches(walk: Values, given: Shape, back: int, size: int, space: list[int]) -> Shape:
-    for axis in given[-back + 1 :]:
-        walk.factors.freeze(axis)
+    walk.freeze(given[-back + 1 :])
     channels = given[-back]
     (patch,) = walk.frozen_axes([size // walk.factors.size(channels)])
     return [*given[:-back], (*channels, *patch), *walk.frozen_axes(space)]
@@ -114,8 +101,7 @@ def _patches(walk: Values, given: Shape, back: int, size: int, space: list[int])
 def _fold(walk: Values, node: Any) -> Shape:
     given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
     channels, inside = walk.factors.split_axis(given[-2], sizes[-3])
-    for axis in (inside, given[-1]):
-        walk.factors.freeze(axis)
+    walk.freeze((inside, given[-1]))
     return [*given[:-2], channels, *walk.frozen_axes(sizes[-2:])]
 
 

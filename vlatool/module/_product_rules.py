@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from vlatool.module._axis_values import Values, argument, sizes_of
+from vlatool.module._axis_values import Rule, Values, argument, sizes_of
 from vlatool.module.factors import Axis, Shape
-
-Rule = Callable[[Values, Any], Any]
 
 
 def _linear(walk: Values, node: Any) -> Shape:
@@ -57,8 +55,7 @@ def _bilinear(walk: Values, node: Any) -> Shape:
     one, other, weight = (walk.shape_of(each) for each in node.args[:3])
     for number, given in ((1, one), (2, other)):
         walk.contract(node.args[number - 1], given[-1], node.args[2], weight[number])
-    if argument(node, "bias") is not None:
-        walk.factors.unite(weight[0], walk.shape_of(argument(node, "bias"))[0])
+    walk.unite_argument(node, "bias", weight[0])
     lead = walk.broadcast([one[:-1], other[:-1]])
     walk.multiply([*lead, *weight], weight)
     return [*lead, weight[0]]
@@ -93,10 +90,8 @@ def _group_channels(walk: Values, node: Any) -> tuple[Shape, Shape, Axis, Axis]:
 def _convolution_output(walk: Values, node: Any, given: Shape, out: Axis, kernel: Shape) -> Shape:
     """Return the axes of what a convolution gives: batch, channels, places."""
     lead, spatial = given[: -len(kernel) - 1], given[-len(kernel) :]
-    if argument(node, "bias") is not None:
-        walk.factors.unite(out, walk.shape_of(argument(node, "bias"))[0])
-    for axis in (*spatial, *kernel):
-        walk.factors.freeze(axis)
+    walk.unite_argument(node, "bias", out)
+    walk.freeze((*spatial, *kernel))
     weight = walk.shape_of(node.args[1])
     space = walk.frozen_axes(sizes_of(node.meta["val"])[-len(kernel) :])
     counted = spatial if "transpose" in node.target._opname else space
@@ -143,8 +138,7 @@ def _recurrent(walk: Values, node: Any) -> list[Shape]:
     each = len(weights) // (ways * layers)
     if len(given) != 3 or each != (4 if argument(node, "has_biases") else 2):
         raise ValueError("a projection, or a packed sequence")
-    for axis in given[:2]:
-        walk.factors.freeze(axis)
+    walk.freeze(given[:2])
     read, hidden = given[-1], walk.shape_of(weights[1])[1]
     (way,) = walk.frozen_axes([ways])
     for layer in range(layers):
@@ -163,7 +157,7 @@ def _gates(walk: Values, node: Any, read: Axis, weights: Sequence[Any], lead: Sh
     """Unite the axes of a recurrent layer's weights; return that of its hidden units.
 
     Args:
-        weights: of the input (gates x hidden, read), of the state (gates x hidden, hidden), biases (gates x hidden).
+        weights: for the input (gates x hidden, read), for the state (gates x hidden, hidden), biases (gates x hidden).
     """
     first, second = walk.shape_of(weights[0]), walk.shape_of(weights[1])
     walk.contract(node, read, weights[0], first[1])

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from vlatool.module._axis_values import Values, argument, sizes_of
+from vlatool.module._axis_values import Rule, Values, argument, replace_axis, sizes_of
 from vlatool.module.factors import Axis, Shape
 
-Rule = Callable[[Values, Any], Any]
 FIXED_AXES = {"hstack": 1, "column_stack": 1, "vstack": 0, "dstack": 2, "hsplit": 1, "vsplit": 0, "dsplit": 2}
 """Operators that join or split along one axis, of values of rank 2 or more -> which it is."""
 SPLITS = ("chunk", "split", "split_with_sizes", "tensor_split", "unsafe_chunk", "unsafe_split",
@@ -29,7 +27,7 @@ def _concatenate(walk: Values, node: Any) -> Shape:
     shapes = [walk.shape_of(part) for part in node.args[0]]
     shapes = [shape for shape in shapes if len(shape) > 1 or walk.factors.size(shape[0])]  # torch skips empty vectors
     along = along_of(node, len(shapes[0]))
-    result = walk.broadcast([[*shape[:along], (), *shape[along + 1 :]] for shape in shapes])
+    result = walk.broadcast([replace_axis(shape, along, ()) for shape in shapes])
     result[along] = walk.factors.concatenate([shape[along] for shape in shapes])
     return result
 
@@ -51,7 +49,7 @@ def _split(walk: Values, node: Any) -> list[Shape]:
     given = walk.shape_of(node.args[0])
     along = along_of(node, len(given))
     pieces = walk.pieces(node, given[along], [sizes_of(value)[along] for value in node.meta["val"]])
-    return [_with(given, along, piece) for piece in pieces]
+    return [replace_axis(given, along, piece) for piece in pieces]
 
 
 def _glu(walk: Values, node: Any) -> Shape:
@@ -59,7 +57,7 @@ def _glu(walk: Values, node: Any) -> Shape:
     given, along = walk.shape_of(node.args[0]), argument(node, "dim", -1)
     one, other = walk.pieces(node, given[along], [walk.factors.size(given[along]) // 2] * 2)
     walk.factors.unite(one, other)
-    return _with(given, along, one)
+    return replace_axis(given, along, one)
 
 
 def _slice(walk: Values, node: Any) -> Shape:
@@ -70,7 +68,7 @@ def _put_slice(walk: Values, node: Any) -> Shape:
     """Replace a slice by a value."""
     part, along = _piece(walk, node, node.args[1])
     put = walk.shape_of(node.args[1])
-    walk.broadcast([[*part[:along], (), *part[along + 1 :]], [*put[:along], (), *put[along + 1 :]]])
+    walk.broadcast([replace_axis(shape, along, ()) for shape in (part, put)])
     walk.factors.unite(part[along], put[along])
     return walk.shape_of(node.args[0])
 
@@ -83,14 +81,14 @@ def _piece(walk: Values, node: Any, like: Any) -> tuple[Shape, int]:
     if count == whole:
         return given, along
     if argument(node, "step", 1) != 1:
-        return _with(given, along, _every(walk, node, given[along], count)), along
+        return replace_axis(given, along, _every(walk, node, given[along], count)), along
     start = _number(argument(node, "start") or 0)
     start = min(start if start >= 0 else max(start + whole, 0), whole)
     before, piece, _ = walk.factors.pieces(given[along], [start, count, whole - start - count])
     end: dict[tuple[str, int | None], list[Axis]] = {("end", None): [before, piece]}
     length: dict[tuple[str, int | None], list[Axis]] = {("length", None): [piece]}
     walk.counts[node] = {("start", None): [before]} | (length if node.target._opname == "narrow" else end)
-    return _with(given, along, piece), along
+    return replace_axis(given, along, piece), along
 
 
 def _every(walk: Values, node: Any, axis: Axis, count: int) -> Axis:
@@ -123,12 +121,6 @@ def _pad(walk: Values, node: Any) -> Shape:
         given[number] = walk.factors.concatenate([one, given[number], other])
     walk.counts[node] = counts
     return given
-
-
-def _with(given: Shape, along: int, axis: Axis) -> Shape:
-    result = list(given)
-    result[along] = axis
-    return result
 
 
 def _number(value: Any) -> int:

@@ -17,13 +17,14 @@ import contextlib
 import itertools
 import math
 import operator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import NDArray
 
 from vlatool.errors import require
-from vlatool.module._axis_values import Values, sizes_of
+from vlatool.module._axis_values import Values, for_each_value, sizes_of
 from vlatool.module.axis_rules import TRANSPOSES, rule_for
 from vlatool.module.factors import Atom, Axis, Shape
 
@@ -41,7 +42,6 @@ class Member:
 
     Args:
         weight: name in the state of the module.
-        axis: number of the axis.
         atom: position of the factor in the axis.
         reads: whether a product sums over the axis: the weight reads the units, which others write.
         numbers: unit that each element of the axis belongs to; -1 for none.
@@ -91,7 +91,7 @@ class Walk(Values):
                 self._placeholder(node, weight, tensors, id(program.state_dict.get(weight, node)))
             elif node.op == "output":
                 self.factors.operator = OUTPUT
-                self._freeze_all(node.args)
+                self._freeze_all(node.all_input_nodes)
             elif "val" in node.meta:
                 self._visit(node)
 
@@ -182,7 +182,7 @@ class Walk(Values):
                 self.stored.add(node)
             return given
         self.unknown.add(self.factors.operator)
-        self._freeze_all((node.args, node.kwargs))
+        self._freeze_all(node.all_input_nodes)
         del self.products[counted:], self.widths[counted:]
         self.counts.pop(node, None)
         if macs := macs_of(node) if node in self._live else 0:
@@ -201,23 +201,13 @@ class Walk(Values):
 
     def _frozen_outputs(self, node: Any) -> Any:
         """Return frozen axes for what a node gives."""
-        value = node.meta.get("val")
-        if isinstance(value, list | tuple):
-            return [self._frozen_value(each) for each in value]
-        return self._frozen_value(value)
+        return for_each_value(
+            node, lambda value: self.frozen_axes(sizes_of(value)) if hasattr(value, "shape") else None
+        )
 
-    def _frozen_value(self, value: Any) -> Shape | None:
-        return [self.factors.new(size, frozen=True) for size in sizes_of(value)] if hasattr(value, "shape") else None
-
-    def _freeze_all(self, arguments: Any) -> None:
-        if isinstance(arguments, dict):
-            arguments = list(arguments.values())
-        if isinstance(arguments, list | tuple):
-            for argument in arguments:
-                self._freeze_all(argument)
-        elif hasattr(arguments, "op"):
-            for axis in self.shape(arguments) or ():
-                self.factors.freeze(axis)
+    def _freeze_all(self, nodes: Iterable[Any]) -> None:
+        for node in nodes:
+            self.freeze(self.shape(node) or ())
 
 
 def _live(graph: Any) -> set[Any]:

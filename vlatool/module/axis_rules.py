@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
+from vlatool.module._axis_values import Rule, argument, for_each_value, replace_axis, sizes_of
 from vlatool.module._axis_values import Values as Values
-from vlatool.module._axis_values import argument, sizes_of
 from vlatool.module._axis_values import size_of as size_of
 from vlatool.module._layer_rules import LAYERS
 from vlatool.module._product_rules import PRODUCTS
 from vlatool.module._segment_rules import SEGMENTS
 from vlatool.module.factors import Shape
-
-Rule = Callable[[Values, Any], Any]
 
 
 def _same(walk: Values, node: Any) -> Shape:
@@ -39,10 +36,7 @@ def _along_axis(walk: Values, node: Any) -> Any:
     along = {dim % len(given) for dim in listed}
     for axis in along:
         walk.factors.freeze(given[axis])
-    value = node.meta["val"]
-    values = value if isinstance(value, list | tuple) else [value]
-    shapes = [_resize(walk, given, sizes_of(each)) for each in values]
-    return shapes if isinstance(value, list | tuple) else shapes[0]
+    return for_each_value(node, lambda value: _resize(walk, given, sizes_of(value)))
 
 
 def _resize(walk: Values, given: Shape, sizes: list[int]) -> Shape:
@@ -53,8 +47,7 @@ def _resize(walk: Values, given: Shape, sizes: list[int]) -> Shape:
 
 def _triangle(walk: Values, node: Any) -> Shape:
     given = walk.shape_of(node.args[0])
-    for axis in given[-2:]:
-        walk.factors.freeze(axis)
+    walk.freeze(given[-2:])
     return given
 
 
@@ -67,8 +60,7 @@ def _reduce(walk: Values, node: Any) -> Any:
     for axis in gone:
         walk.factors.freeze(given[axis])
     shape = [() if number in gone else axis for number, axis in enumerate(given) if keep or number not in gone]
-    value = node.meta["val"]
-    return [shape for _ in value] if isinstance(value, list | tuple) else shape
+    return for_each_value(node, lambda _: shape)
 
 
 def _reshape(walk: Values, node: Any) -> Shape:
@@ -200,8 +192,8 @@ def _by_numbers(walk: Values, node: Any) -> Shape:
     along = argument(node, "dim") % len(values[0])
     for shape in values:
         walk.factors.freeze(shape[along])
-    others = walk.broadcast([[*shape[:along], (), *shape[along + 1 :]] for shape in values])
-    return [*others[:along], *walk.frozen_axes([sizes_of(node.meta["val"])[along]]), *others[along + 1 :]]
+    others = walk.broadcast([replace_axis(shape, along, ()) for shape in values])
+    return replace_axis(others, along, walk.frozen_axes([sizes_of(node.meta["val"])[along]])[0])
 
 
 def _scatter_add(walk: Values, node: Any) -> Shape:
@@ -210,18 +202,13 @@ def _scatter_add(walk: Values, node: Any) -> Shape:
     put = [walk.shape_of(source)] if hasattr(source, "op") else []
     for shape in (given, *put):
         walk.factors.freeze(shape[along % len(given)])
-    walk.broadcast([_without(shape, along) for shape in (given, *put)])
+    walk.broadcast([replace_axis(shape, along, ()) for shape in (given, *put)])
     return given
-
-
-def _without(given: Shape, along: int) -> Shape:
-    return [() if number == along % len(given) else axis for number, axis in enumerate(given)]
 
 
 def _embedding(walk: Values, node: Any) -> Shape:
     weight, ids = walk.shape_of(node.args[0]), walk.shape_of(node.args[1])
-    for axis in weight:
-        walk.factors.freeze(axis)
+    walk.freeze(weight)
     return [*ids, weight[1]]
 
 
@@ -267,9 +254,6 @@ def rule_for(target: Any) -> Rule | None:
     name = getattr(target, "_opname", "")  # what computes a size has no name of an operator
     if getattr(target, "namespace", "") != "aten":
         return None
-    found = _RULES.get(name) or _RULES.get(name.removesuffix("_"))
-    return found or (_elementwise if _is_pointwise(target.tags) else None)
-
-
-def _is_pointwise(tags: Any) -> bool:
-    return {"pointwise"} <= {tag.name for tag in tags} and not any("nondeterministic" in tag.name for tag in tags)
+    tags = {tag.name for tag in target.tags}
+    pointwise = "pointwise" in tags and not any("nondeterministic" in tag for tag in tags)
+    return _RULES.get(name) or _RULES.get(name.removesuffix("_")) or (_elementwise if pointwise else None)

@@ -103,10 +103,7 @@ class BatchedProgram:
     def _by_rows(self, run: Run, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Run a batch at once where the modules take batches, and row by row where they do not."""
         size = len(next(iter(inputs.values())))
-        if size == 1 or self._batches:
-            return run(inputs, others)
-        rows = [run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(size)]
-        return _concatenate(rows)
+        return run(inputs, others) if size == 1 or self._batches else _run_single_rows(run, inputs, others, size)
 
     def look(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> None:
         """Find out with a first batch whether the modules take batches; where runs are changed, look before that."""
@@ -125,19 +122,14 @@ class BatchedProgram:
         """Say whether two rows together give what each gives alone; of what is kept, too, once it is not zero."""
         drawn = {name: value for name, value in noise.items() if name not in self.kept}
         with require("torch", "build").no_grad():
-            first = self._run_single_rows(inputs, drawn)
+            first = _run_single_rows(self._run, inputs, drawn, 2)
             again = {**drawn, **self.kept_of(first)}
-            wanted = [(drawn, first), *([(again, self._run_single_rows(inputs, again))] if self.kept else [])]
+            wanted = [(drawn, first), *([(again, _run_single_rows(self._run, inputs, again, 2))] if self.kept else [])]
             sizes = [len(kept["shape"]) for kept in self.kept.values()]
             for self._axis in range(max(sizes, default=1)):
                 if all(self._is_same(_rows(inputs, 0, 2), others, values) for others, values in wanted):
                     return True
         return False
-
-    def _run_single_rows(self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return what the first two rows give, each for itself."""
-        rows = [self._run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(2)]
-        return _concatenate(rows)
 
     def _is_same(
         self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor], wanted: Mapping[str, Tensor]
@@ -245,9 +237,12 @@ def _dtype_of(numbers: Sequence[float]) -> Any:
     return torch.int64 if all(isinstance(number, int) for number in numbers) else torch.float32
 
 
-def _concatenate(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """Put single rows behind each other, whatever their dtype: autocast refuses float16 on a processor."""
+def _run_single_rows(
+    run: Run, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor], count: int
+) -> dict[str, Tensor]:
+    """Return what the first rows give, each for itself, whatever its dtype: autocast refuses float16 on a processor."""
     torch = require("torch", "build")
+    rows = [run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(count)]
     with torch.autocast("cpu", enabled=False):
         return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
 

@@ -16,7 +16,7 @@ from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.program import ProgramStep, check_program, keeps_values, program_from, single_graph
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import PURPOSES, NamedRecording, carry_recording
-from vlatool.errors import MissingExtra, SourceError, SpecError, fix_for, suggest
+from vlatool.errors import MissingExtra, SourceError, SpecError
 from vlatool.files.printable import one_line, truncate
 from vlatool.files.yaml import read_mapping
 from vlatool.runtime.observation import ObservationEncoder
@@ -41,7 +41,6 @@ class Description:
         folder: where relative paths start, and whose code runs once it is trusted.
         factory: ``path.py:make`` or ``package.module:make`` of the torch modules; empty for a policy that is graphs.
         graphs: graph name -> ONNX file, of a policy that is graphs already.
-        arguments: keyword arguments of the factory.
         program: how the graphs are run; one graph of all inputs and outputs when empty.
         environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation, and
             ``timeout``: seconds that a call of it may take.
@@ -117,9 +116,7 @@ def read_description(path: Path) -> Description:
     data = read_mapping(file, str(file), SourceError)
     for key in data:
         if key not in KEYS:
-            raise SourceError(
-                f"{file} has the unknown key '{key}'; {suggest(str(key), KEYS)}.", fix_for(str(key), KEYS)
-            )
+            raise SourceError.unknown(f"{file} has the unknown key '{key}'", str(key), KEYS)
     if data.get("schema", 1) != 1:
         raise SourceError(f"{file} has the schema {data['schema']!r}; this vlatool reads 1.", "upgrade vlatool")
     for key in ("arguments", "environment", "parts"):

@@ -136,7 +136,6 @@ def apply(
 
     Args:
         modules: graph name -> module, changed in place, or replaced where it must be traced.
-        edits: edits of any graphs.
         bundle: bundle whose policy runs once for the trace where a module loses units; other edits do not need it.
 
     Raises:
@@ -184,9 +183,6 @@ def loses_units(edits: Iterable[Edit]) -> bool:
 
 def refuse_traced(bundle: Bundle, what: str, command: str) -> None:
     """Refuse a policy that lost units: its parts are those of a trace, and not of the classes that it was made of.
-
-    Args:
-        command: command that looks for them.
 
     Raises:
         RecipeError: naming the order that works.

@@ -53,7 +53,6 @@ def passages(bundle: Bundle, program: BatchedProgram, noise: Values, count: int,
     Args:
         program: the policy as it is.
         noise: what it draws, each time.
-        count: count of observations at most.
         leading: length of a passage at most; 1 for a policy that keeps nothing.
     """
     if not program.kept:

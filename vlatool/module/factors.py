@@ -41,7 +41,6 @@ class Factors:
     occurs.
 
     Attributes:
-        sizes: sizes of each factor.
         operator: what is being looked at; it is noted as a reason for what it freezes.
     """
 
@@ -99,12 +98,7 @@ class Factors:
                     yield Atom(atom.leaf, path, slower, last and atom.is_fastest)
 
     def numbers(self, axis: Iterable[int], path: Sequence[int]) -> NDArray[Any]:
-        """Return for each element of an axis which element of a factor it belongs to; -1 for none.
-
-        Args:
-            axis: axis of so many elements.
-            path: place of the factor.
-        """
+        """Return for each element of an axis which element of a factor it belongs to; -1 for none."""
         leaves = self.leaves(axis)
         leaf = leaves[path[0]]
         found = np.arange(self.sizes[leaf])
@@ -119,7 +113,6 @@ class Factors:
         """Return the elements of an axis that stay.
 
         Args:
-            axis: axis of so many elements.
             keep: factor -> its elements that stay; all of the others stay.
         """
         found = np.zeros(1, dtype=np.int64)
@@ -290,13 +283,10 @@ class Factors:
             return
         first, rest = segment[0], segment[1:]
         if not rest:
-            self._cut_leaf(first, offset)
+            reasons = self._frozen.pop(first, set())
+            self._segments[first] = self._new(offset, reasons), self._new(self.sizes[first] - offset, reasons)
             return
         before, within = divmod(offset, self.size(rest))
         for bound in (before, before + bool(within)):
             self._end_segment((first,), bound)
         self._end_segment(rest, within)
-
-    def _cut_leaf(self, leaf: int, offset: int) -> None:
-        reasons = self._frozen.pop(leaf, set())
-        self._segments[leaf] = self._new(offset, reasons), self._new(self.sizes[leaf] - offset, reasons)

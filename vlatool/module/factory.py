@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, fix_for, pip_install, suggest
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, pip_install
 from vlatool.files.printable import message_of
 from vlatool.module.bytecode import ignore_bytecode
 from vlatool.user_code.children import exit_error
@@ -90,9 +90,7 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
     make = getattr(module, function, None)
     if not callable(make):
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
-        raise SourceError(
-            f"'{where}' has no function '{function}'; {suggest(function, known)}.", fix_for(function, known)
-        )
+        raise SourceError.unknown(f"'{where}' has no function '{function}'", function, known)
     if path is None:
         _check_own(make, factory)
     return make  # type: ignore[no-any-return]
@@ -114,7 +112,6 @@ def iterate_function(function: str, folder: Path, arguments: dict[str, Any]) -> 
 
     Args:
         function: name of the function, in the form of a factory.
-        folder: where its file lies.
 
     Raises:
         SourceError: when it raises, or gives nothing to go through.

@@ -28,9 +28,7 @@ class Cause:
     """A reason for which torch gives up.
 
     Args:
-        name: name in words.
         pattern: found in ``TypeName: message`` of one of the chained errors, across its lines; None: not by its text.
-        remedy: what helps.
     """
 
     name: str

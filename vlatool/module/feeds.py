@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -51,11 +52,8 @@ def first_feeds(modules: Mapping[str, nn.Module], bundle: Bundle) -> dict[str, l
 
         return look
 
-    handles = [module.register_forward_pre_hook(note(graph)) for graph, module in modules.items()]
-    try:
-        with torch.no_grad():
-            program.run(recorded_inputs(bundle, 1)[0], draw_noise(program.noise, 1, np.random.default_rng(0)))
-    finally:
-        for handle in handles:
-            handle.remove()
+    with contextlib.ExitStack() as hooks, torch.no_grad():
+        for graph, module in modules.items():
+            hooks.callback(module.register_forward_pre_hook(note(graph)).remove)
+        program.run(recorded_inputs(bundle, 1)[0], draw_noise(program.noise, 1, np.random.default_rng(0)))
     return given

@@ -46,10 +46,8 @@ def refuse_hidden_state(bundle: Bundle, modules: Mapping[str, nn.Module]) -> Non
         SourceError: naming the attribute.
     """
     sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
-    program, encode = (
-        Program(bundle.manifest.program, sessions, seed=0),
-        ObservationEncoder(bundle.manifest.spec, bundle),
-    )
+    program = Program(bundle.manifest.program, sessions, seed=0)
+    encode = ObservationEncoder(bundle.manifest.spec, bundle)
     for observation in observations_for(bundle, 2):
         program.run(encode(observation))
     for session in sessions.values():

@@ -28,7 +28,6 @@ class Origin:
     Args:
         folder: the policy's folder, which the user named or trusted.
         factory: ``path.py:make`` or ``package.module:make``.
-        arguments: arguments of the factory.
         weights: glob of the shards that vlatool loads; empty when the factory does.
         code: file beside the factory -> its SHA-256 when the source bundle was made.
         environment: ``make`` and ``tasks`` of the environment that the policy's description names.

@@ -210,7 +210,6 @@ def write_modules(
         out: an empty directory.
         edits: all edits since the factory.
         modules: graph name -> module after the edits; none where the weights are those of the policy's shards.
-        training: how they were trained, if they were.
         program: how they run; as in the source when None.
         played: observations that they were trained on, which the bundle keeps.
     """

@@ -31,7 +31,7 @@ IMPORTS = (
 )  # fmt: skip
 """What the first export of a process imports, half of its time; names that a release has no more cost that alone."""
 OPSET = 20
-"""Of the default domain, unless another one is asked for."""
+"""Opset of the default domain, unless another one is asked for."""
 EXTERNAL_DATA_BYTES = 1_500_000_000
 """Weights above this go into a file beside the graph: protobuf ends at 2 GiB."""
 

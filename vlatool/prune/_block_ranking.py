@@ -27,11 +27,7 @@ BlockId = tuple[str, str, int]
 
 
 class BlockRanking:
-    """Effect of blocks on the action, on recorded observations.
-
-    Args:
-        source: Bundle with the program and the encoding of observations.
-    """
+    """Effect of blocks on the action, on recorded observations."""
 
     def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> None:
         self._program = BatchedProgram(source.manifest.program, modules)
@@ -104,12 +100,10 @@ class BlockRanking:
 
     @contextlib.contextmanager
     def _forward_hooks(self, blocks: Collection[BlockId], hook: Callable[[BlockId], Any]) -> Iterator[None]:
-        handles = [self._blocks[block].register_forward_hook(hook(block), with_kwargs=True) for block in blocks]
-        try:
+        with contextlib.ExitStack() as hooks:
+            for block in blocks:
+                hooks.callback(self._blocks[block].register_forward_hook(hook(block), with_kwargs=True).remove)
             yield
-        finally:
-            for handle in handles:
-                handle.remove()
 
 
 def _block_input(given: Any, named: Any) -> Any:

@@ -25,7 +25,6 @@ class Stack:
     Args:
         lists: Graph name -> name of the list of blocks in ``named_modules``; graphs may share one list.
         blocks: Name of each block in the list, usually its index.
-        importance: Importance of each block.
         keep: Indices of the blocks to keep.
         ms: Milliseconds of one block.
     """

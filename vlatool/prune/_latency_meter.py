@@ -34,7 +34,6 @@ class LatencyMeter:
         source: The policy before the edits.
         scratch: An empty directory.
         engine: Engine of the runtime; the default one when empty.
-        threads: Number of intra-op threads.
         made_by: Entry for the manifests of the exports.
     """
 
@@ -80,12 +79,7 @@ class LatencyMeter:
 
 
 class LatencyPredictor(LatencyMeter):
-    """Exports a policy after edits and predicts its latency on a board, in float32.
-
-    Args:
-        profile: Profile of the board.
-        others: Arguments of ``LatencyMeter``.
-    """
+    """Exports a policy after edits and predicts its float32 latency on a board; takes what ``LatencyMeter`` takes."""
 
     def __init__(self, profile: Profile, *others: Any) -> None:
         self._profile = profile

@@ -22,7 +22,6 @@ def output_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Coll
     They are found in autograd's graph, backwards from the action; the set is empty where the action has no gradients.
 
     Args:
-        source: Bundle with the program and an observation.
         layers: Layers with a ``weight``, such as Linear and convolution layers.
     """
     torch = require("torch", "build")

@@ -55,12 +55,7 @@ def observe_products(observe: Callable[[Tensor, Tensor], None]) -> Any:
 
 
 def input_rows(named_arguments: Mapping[str, Any], *, is_linear: bool) -> Tensor:
-    """Return the rows that a weight is multiplied with: (N, inputs).
-
-    Args:
-        named_arguments: Arguments of the product by name.
-        is_linear: Whether the layer is linear instead of a convolution.
-    """
+    """Return the rows that a weight is multiplied with: (N, inputs)."""
     inputs, weight = named_arguments["input"], named_arguments["weight"]
     if is_linear:
         rows: Tensor = inputs.reshape(-1, inputs.shape[-1])

@@ -24,10 +24,8 @@ def reduction_record(goal: float, work: Macs, whole: Sequence[int], kept: Sequen
 
     Args:
         goal: Share of the multiply-accumulates to remove.
-        work: Counter of multiply-accumulates.
         whole: Units of each group before pruning.
         kept: Units of each group that stay.
-        walks: Walks of the graphs.
 
     Returns:
         ``goal`` and ``reached`` (shares), ``macs`` (before, after), ``keeps`` (operator, or inputs and outputs ->

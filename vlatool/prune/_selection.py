@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.errors import RecipeError
 from vlatool.graph.nodes import matches
 
 
@@ -24,13 +24,24 @@ class Selection:
     protected: tuple[str, ...] = ()
     parts: tuple[str, ...] = ()
 
+    @classmethod
+    def protecting(
+        cls, words: tuple[str, ...], parts: Mapping[str, Sequence[str]],
+        include: tuple[str, ...] = (), exclude: tuple[str, ...] = (),
+    ) -> Selection:  # fmt: skip
+        """Return the selection where names with these words are protected, and parts that a description names so.
+
+        Args:
+            parts: Name of a part, such as ``action_head`` -> globs of modules.
+        """
+        globs = [glob for name, globs in parts.items() if _has_word(name, words) for glob in globs]
+        return cls(include, exclude, words, tuple(globs))
+
     def check(self, names: Sequence[str], what: str) -> None:
         """Refuse a pattern that matches nothing."""
         for pattern in (*self.include, *self.exclude):
             if not any(matches(name, (pattern,)) for name in names):
-                raise RecipeError(
-                    f"No {what} matches '{pattern}'; {suggest(pattern, list(names))}.", fix_for(pattern, list(names))
-                )
+                raise RecipeError.unknown(f"No {what} matches '{pattern}'", pattern, names)
 
     def selects(self, names: Iterable[str]) -> bool:
         """Return whether a part with these names may be removed: one of them is included, and none is excluded."""
@@ -41,15 +52,6 @@ class Selection:
     def protects(self, name: str) -> bool:
         """Return whether a part stays unless it is included."""
         return _has_word(name, self.protected) or matches(name, self.parts)
-
-
-def protected_parts(parts: Mapping[str, Sequence[str]], words: Sequence[str]) -> tuple[str, ...]:
-    """Return the globs of the parts in a policy's description with a protected word in their names.
-
-    Args:
-        parts: Name of a part, such as ``action_head`` -> globs of modules.
-    """
-    return tuple(pattern for name, globs in parts.items() if _has_word(name, words) for pattern in globs)
 
 
 def _has_word(name: str, words: Sequence[str]) -> bool:

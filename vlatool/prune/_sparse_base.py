@@ -18,7 +18,7 @@ from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._output_layers import output_layers
 from vlatool.prune._product_observer import is_product_layer, observe_products
-from vlatool.prune._selection import Selection, protected_parts
+from vlatool.prune._selection import Selection
 from vlatool.runtime.engine import usable_engines
 from vlatool.stage.base import Context
 
@@ -43,10 +43,9 @@ class SparsePruning(ModuleStage):
 
     ratio: float = Field(0.5, gt=0, lt=1, description="share of each layer's weights that becomes zero")
     pattern: Pattern = Field(
-        "unstructured",
-        description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half",
+        "unstructured", description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half"
     )
-    samples: int = Field(32, ge=1, description="recorded observations to look at")
+    samples: int = Field(32, ge=1, description="recorded observations to use")
     include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")
     exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
 
@@ -186,7 +185,7 @@ def select_layers(
                 found.setdefault(id(part.weight), ((graph, name), part))
     named = dict(found.values())
     full = {(graph, name): f"{graph}.{name}" if len(modules) > 1 else name for graph, name in named}
-    selection = Selection(include, exclude, PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS))
+    selection = Selection.protecting(PROTECTED_WORDS, source.manifest.parts, include, exclude)
     selection.check([*full.values(), *(name for _, name in named)], "layer")
     outputs = output_layers(modules, source, named.values()) if not include else set()
     prunable = {

@@ -22,7 +22,6 @@ class Trials:
     """Measurements of each choice, over all of its runs.
 
     Args:
-        meter: Meter of latencies.
         wholes: Milliseconds of the unpruned policy in earlier runs.
     """
 

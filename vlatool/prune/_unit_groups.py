@@ -37,7 +37,6 @@ class UnitGroup:
         leaf: Factor of ``vlatool.module.axes``.
         members: Axes of weights that contain the units.
         step: Number of units to remove at a time.
-        importance: Importance of each unit, by index.
         keep: Indices of the units to keep.
     """
 
@@ -64,11 +63,7 @@ class UnitGroup:
         self.keep = sorted([*self.keep, *units])
 
     def cheapest_units(self, min_share: float) -> tuple[float, list[int]]:
-        """Return the total importance of the least important units, and their indices; none when all must stay.
-
-        Args:
-            min_share: Least share of the units that stays.
-        """
+        """Return the total importance of the least important units, and their indices; none when all must stay."""
         count = self.remaining % self.step or self.step
         if self.remaining - count < max(1, round(self.size * min_share)):
             return 0.0, []
@@ -95,7 +90,6 @@ def find_groups(walks: Mapping[str, Walk], selection: Selection, multiple: int, 
     """Return all groups of removable units; none where operators keep all of them.
 
     Args:
-        selection: Selection of weights.
         multiple: Number of neurons or channels to remove at a time; heads go one by one.
     """
     groups = []
@@ -132,7 +126,6 @@ def rank_units(
     Args:
         rank: ``gate``: the expected squared change of the action when a unit is scaled; ``magnitude``: the norms of
             the weights that write and that read it; ``random``.
-        source: Bundle with recorded observations.
     """
     if rank == "random":
         random = np.random.default_rng(SEED)
@@ -177,13 +170,7 @@ class Macs:
                     self._add(graph, walk, leaves, keepers, runs[graph] * macs)
 
     def savings(self, number: int, size: int, sizes: Sequence[int]) -> int:
-        """Return the multiply-accumulates saved by reducing one group.
-
-        Args:
-            number: Index of the group.
-            size: Number of its units afterwards.
-            sizes: Number of units of each group.
-        """
+        """Return the multiply-accumulates saved by reducing one group to ``size`` units, from ``sizes`` of all."""
         less = {number: size}
         terms = (self._terms[term][:2] for term in self._terms_of_group[number])
         return sum(

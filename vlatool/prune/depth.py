@@ -15,7 +15,7 @@ from vlatool.module.edits import BLOCKS, Edit, refuse_traced
 from vlatool.module.feeds import unrecorded_note
 from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._block_ranking import BlockId, BlockRanking, StackId
-from vlatool.prune._selection import Selection, protected_parts
+from vlatool.prune._selection import Selection
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -46,10 +46,10 @@ class Depth(ModuleStage):
 
     keeps_weights: ClassVar[bool] = True
 
-    ratio: float = Field(0.5, gt=0, lt=1, description="share of the blocks of each stack that goes, at most")
-    blocks: int | None = Field(None, ge=1, description="blocks of each stack that stay, in the place of --ratio")
+    ratio: float = Field(0.5, gt=0, lt=1, description="largest share of the blocks of each stack to remove")
+    blocks: int | None = Field(None, ge=1, description="blocks of each stack to keep, instead of --ratio")
     keep: tuple[int, ...] | None = Field(
-        None, min_length=1, description="numbers of the blocks that stay, such as 0,2,4, in the place of a ranking"
+        None, min_length=1, description="numbers of the blocks to keep, such as 0,2,4, instead of a ranking"
     )
     rank: Literal["error", "gate", "cosine", "even"] = Field("error", description="how blocks are ranked")
     samples: int = Field(32, ge=1, description="recorded observations to rank on")
@@ -144,9 +144,7 @@ class Depth(ModuleStage):
                 "class, each with an output like its input.",
                 "prune widths instead: vlatool prune neurons",
             )
-        selection = Selection(
-            self.include, self.exclude, PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS)
-        )
+        selection = Selection.protecting(PROTECTED_WORDS, source.manifest.parts, self.include, self.exclude)
         selection.check(names, "stack of blocks")
         selected = {(graph, name): size for (graph, name), size in sizes.items() if selection.selects((name,))}
         if not selected:

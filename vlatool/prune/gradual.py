@@ -39,12 +39,13 @@ class Gradual(ImitationStage):
 
     ratio: float = Field(0.5, gt=0, lt=1, description="share of each layer's weights that is zero in the end")
     pattern: Pattern = Field(
-        "unstructured",
-        description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half",
+        "unstructured", description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half"
     )
-    learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
-    until: float = Field(0.6, gt=0, le=1, description="share of the steps after which no more weights become zero")
-    interval: int = Field(10, ge=1, description="steps from one time that weights become zero to the next")
+    learning_rate: float = Field(
+        1e-4, gt=0, le=1, description="peak learning rate, after warm-up and before cosine decay"
+    )
+    until: float = Field(0.6, gt=0, le=1, description="share of the steps during which weights are pruned")
+    interval: int = Field(10, ge=1, description="training steps between two pruning steps")
     include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")
     exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
 

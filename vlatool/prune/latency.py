@@ -34,7 +34,7 @@ from vlatool.prune._latency_costs import (
     role_of,
 )
 from vlatool.prune._latency_meter import LatencyMeter, LatencyPredictor
-from vlatool.prune._selection import Selection, protected_parts
+from vlatool.prune._selection import Selection
 from vlatool.prune._trials import Trials
 from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, no_units, rank_units, trace_walks
 from vlatool.prune.depth import PROTECTED_WORDS
@@ -68,14 +68,14 @@ class LatencyPruning(ModuleStage):
     threads: int = Field(1, ge=1, le=1024, description="intra-op threads")
     rank: Rank = Field("gate", description="how units are ranked")
     blocks: bool = Field(
-        True, description="whether blocks may go whose weights all may: the trunk's, and those included"
+        True, description="also remove blocks whose weights may all be removed: those of the trunk, and those included"
     )
     samples: int = Field(32, ge=1, description="recorded observations to rank on")
-    multiple: int = Field(16, ge=1, description="neurons and channels that stay are a multiple of this")
-    least: float = Field(0.125, gt=0, le=1, description="share of each group that stays in any case")
+    multiple: int = Field(16, ge=1, description="keep a multiple of this many neurons and channels")
+    least: float = Field(0.125, gt=0, le=1, description="minimum share of each group to keep")
     include: tuple[str, ...] = Field((), description="globs of weights to prune; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
-    chosen: str = Field("", description="what an earlier run chose, as its manifest has it: nothing is measured then")
+    chosen: str = Field("", description="choice of an earlier run, from its manifest; nothing is measured then")
 
     def on(self, profile: Profile) -> Self:
         """Return the stage that predicts for a board, or measures where the board is this machine.
@@ -175,7 +175,7 @@ class LatencyPruning(ModuleStage):
         """Return the stacks that may lose blocks, with the importance of each block; none for a policy without any."""
         if not self.blocks or self.rank != "gate":
             return []
-        protected = Selection((), (), PROTECTED_WORDS, protected_parts(source.manifest.parts, PROTECTED_WORDS))
+        protected = Selection.protecting(PROTECTED_WORDS, source.manifest.parts)
         found = [
             Stack(lists, tuple(name for name, _ in blocks.named_children()))
             for lists, blocks in stacks_of(modules)
@@ -246,10 +246,7 @@ class _Selector:
     """Selects units and blocks to remove by their measured costs.
 
     Args:
-        stacks: Stacks of removable blocks.
-        work: Counter of multiply-accumulates of the groups.
         prices: Role of a group -> milliseconds for a multiply-accumulate.
-        least: Least share of each group that stays.
     """
 
     def __init__(

@@ -34,7 +34,7 @@ class Neurons(ModuleStage):
     """
 
     ratio: float = Field(0.25, gt=0, lt=1, description="share of the neurons of each hidden layer to remove")
-    multiple: int = Field(8, ge=1, description="the neurons that stay are a multiple of this, for vector units")
+    multiple: int = Field(8, ge=1, description="keep a multiple of this many neurons, for vector units")
     include: tuple[str, ...] = Field((), description="globs of module names (of the first Linear); all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of module names to leave as they are")
 

@@ -34,7 +34,7 @@ class Steps(ModuleStage):
 
     keeps_weights: ClassVar[bool] = True
 
-    to: int = Field(ge=1, le=1000, description="steps that stay")
+    to: int = Field(ge=1, le=1000, description="steps to keep")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Check that the program repeats a graph, in steps that can be larger."""

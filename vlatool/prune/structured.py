@@ -31,11 +31,11 @@ class Structured(ModuleStage):
     takes it unchanged).
     """
 
-    ratio: float = Field(0.3, gt=0, lt=1, description="share of the multiply-accumulates that goes")
+    ratio: float = Field(0.3, gt=0, lt=1, description="share of the multiply-accumulates to remove")
     rank: Rank = Field("gate", description="how units are ranked")
     samples: int = Field(32, ge=1, description="recorded observations to rank on")
-    multiple: int = Field(16, ge=1, description="neurons and channels that stay are a multiple of this")
-    least: float = Field(0.125, gt=0, le=1, description="share of each group that stays in any case")
+    multiple: int = Field(16, ge=1, description="keep a multiple of this many neurons and channels")
+    least: float = Field(0.125, gt=0, le=1, description="minimum share of each group to keep")
     include: tuple[str, ...] = Field((), description="globs of weights to prune; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
 

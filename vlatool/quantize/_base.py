@@ -7,7 +7,7 @@ import fnmatch
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -18,7 +18,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.data import NamedRecording, calibration_recording, named_recording, observations_for
-from vlatool.errors import BundleError, RecipeError, fix_for, suggest
+from vlatool.errors import BundleError, RecipeError
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import foreign_errors, load, read, save, split_phases
 from vlatool.graph.layers import Layer, find_layers
@@ -70,13 +70,7 @@ class Quantization(Transform):
             return
         if not source.manifest.graphs:
             raise no_graph_error(source, "quantize")
-        for pattern in self.graphs:
-            if not fnmatch.filter(source.manifest.graphs, pattern):
-                raise RecipeError(
-                    f"No graph matches '{pattern}'; {suggest(pattern, source.manifest.graphs)}.",
-                    fix_for(pattern, source.manifest.graphs),
-                )
-        for name in self.chosen_graphs(source):
+        for name in self.matching_graphs(source.manifest.graphs):
             graph = source.manifest.graphs[name]
             quantized = [kind.replace(" weights", " (weights)") for kind in graph.precision if kind not in FLOATS]
             precisions = quantized or [graph.compute]
@@ -134,6 +128,11 @@ class Quantization(Transform):
             recorded=self.is_recorded(bundle),
         )  # fmt: skip
 
+    def inputs(self) -> tuple[Path, ...]:
+        """The calibration file, when one is given."""
+        calibration: Path | None = getattr(self, "calibration", None)
+        return (calibration,) if calibration else ()
+
     @property
     def recording(self) -> NamedRecording | None:
         """Recording of the golden observations; the bundle's own when None."""
@@ -153,7 +152,17 @@ class Quantization(Transform):
 
     def chosen_graphs(self, bundle: Bundle) -> list[str]:
         """Return the names of the graphs to quantize."""
-        names = bundle.manifest.graphs
+        return self.matching_graphs(bundle.manifest.graphs)
+
+    def matching_graphs(self, names: Collection[str]) -> list[str]:
+        """Return which of some graphs to quantize.
+
+        Raises:
+            RecipeError: when a pattern matches none.
+        """
+        for pattern in self.graphs:
+            if not fnmatch.filter(names, pattern):
+                raise RecipeError.unknown(f"No graph matches '{pattern}'", pattern, names)
         return [name for name in names if not self.graphs or any(fnmatch.fnmatch(name, glob) for glob in self.graphs)]
 
     def selected_layers(self, bundle: Bundle, ops: Iterable[str], **kinds: bool) -> dict[str, list[Layer]]:
@@ -196,14 +205,11 @@ class Quantization(Transform):
 
         for pattern in (*self.include, *self.exclude):
             if not any(meets(name, (pattern,)) for name in candidates):
-                raise RecipeError(
-                    f"No node matches '{pattern}'; {suggest(pattern, candidates[:200])}.",
-                    fix_for(pattern, candidates[:200]),
-                )
+                raise RecipeError.unknown(f"No node matches '{pattern}'", pattern, candidates[:200])
         parts = bundle.manifest.parts
         for part in self.parts:
             if part not in parts:
-                raise RecipeError(f"The policy has no part '{part}'; {suggest(part, parts)}.", fix_for(part, parts))
+                raise RecipeError.unknown(f"The policy has no part '{part}'", part, parts)
         globs = tuple(pattern for part in self.parts for pattern in parts[part])
         kept = {name for name in candidates if not self.include or meets(name, self.include)}
         if self.parts:
@@ -221,10 +227,7 @@ def check_ops(ops: Iterable[str]) -> None:
     """Raise a user error for an operator that no method quantizes."""
     for name in ops:
         if name not in QUANTIZED_OPS:
-            raise RecipeError(
-                f"The operator '{name}' cannot be quantized; {suggest(name, QUANTIZED_OPS)}.",
-                fix_for(name, QUANTIZED_OPS),
-            )
+            raise RecipeError.unknown(f"The operator '{name}' cannot be quantized", name, QUANTIZED_OPS)
 
 
 def describe_float_layers(name: str, model: Any) -> list[str]:
@@ -246,7 +249,6 @@ def fit_range_to_host(stage: StageT, engine: str) -> StageT:
     """Return a stage with ``reduce_range`` where int8 products saturate on this host, unless the option was given.
 
     Args:
-        stage: Stage with the option.
         engine: Engine that will run the bundle; the default one when empty.
     """
     if "reduce_range" in stage.model_fields_set or int8_arithmetic(engine) in (EXACT, UNKNOWN):
@@ -261,11 +263,7 @@ def silenced_quantizer() -> Iterator[Path]:
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
-        with (
-            scratch_directory() as scratch,
-            contextlib.redirect_stdout(io.StringIO()),
-            warnings.catch_warnings(),
-        ):
+        with scratch_directory() as scratch, contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield scratch
     finally:

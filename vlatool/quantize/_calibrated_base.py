@@ -45,10 +45,6 @@ class CalibratedQuantization(Quantization):
     map: tuple[str, ...] = Field((), description=MAP_HELP)
     samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
 
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file."""
-        return (self.calibration,) if self.calibration else ()
-
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is calibration data."""
         super().check(source, profile)

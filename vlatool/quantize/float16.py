@@ -50,11 +50,7 @@ class Float16(Quantization):
 
     calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
     map: tuple[str, ...] = Field((), description=MAP_HELP)
-    samples: int = Field(16, ge=1, description="samples on which values beyond float16 are looked for")
-
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file."""
-        return (self.calibration,) if self.calibration else ()
+    samples: int = Field(16, ge=1, description="samples in which to look for values beyond float16")
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Find values beyond float16, then convert every selected graph."""

@@ -37,10 +37,11 @@ class Qat(ImitationStage):
     keeps: ClassVar[int] = MAX_PLAYED
 
     weights: Literal["int8", "int4"] = Field("int8", description="int8 with int8 activations; int4 weights alone")
-    learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
+    learning_rate: float = Field(
+        1e-4, gt=0, le=1, description="peak learning rate, after warm-up and before cosine decay"
+    )
     layout: LayoutName = Field(
-        "ort",
-        description="of the bundle, as the method that follows takes it; that of --profile's board unless given",
+        "ort", description="layout of the bundle for the method that follows; that of --profile's board unless given"
     )
 
     def compute_context(self) -> contextlib.AbstractContextManager[Any]:

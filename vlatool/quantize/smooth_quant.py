@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from vlatool.bundle.bundle import Bundle
@@ -22,10 +21,9 @@ from vlatool.quantize.calibration.samples import recorded_moments
 from vlatool.quantize.int8.smoothing_groups import ConstantEdit, SmoothingGroup, find_groups
 from vlatool.quantize.int8.smoothing_scales import PeakExcess, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.runtime.golden import load_golden
+from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of
-
-Array = NDArray[Any]
 
 OPS = ("MatMul", "Gemm")
 REPORT = "reports/smooth_quant.json"
@@ -59,7 +57,7 @@ class SmoothQuant(CalibratedQuantization):
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
 
     alpha: Annotated[str, BeforeValidator(_alpha)] = Field(
-        "0.5", description="0 to 1: how much moves into the weights; auto: by the estimated int8 error of each layer"
+        "0.5", description="0 to 1: share of outliers moved into the weights; auto: by the int8 error of each layer"
     )
     outliers: float = Field(
         1.0, ge=1, description="smooth activations whose largest channel is this many times the median one"

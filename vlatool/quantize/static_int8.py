@@ -1,4 +1,4 @@
-"""Static int8: scales of weights and activations ahead of time."""
+"""Static int8: weights and activations with scales that are fixed ahead of time."""
 
 from __future__ import annotations
 
@@ -39,15 +39,7 @@ from vlatool.quantize.int8.frame_normalization import fold_normalization
 from vlatool.quantize.int8.integer_matmul import use_integer_matmul
 from vlatool.quantize.int8.quantizer_hoisting import hoist_quantizers
 from vlatool.quantize.int8.reductions import keep_reduced_axes
-from vlatool.runtime.engine import (
-    DEFAULT_ENGINE,
-    STANDARD_LAYOUT,
-    Engine,
-    Int8Layout,
-    class_for,
-    engine_class,
-    layouts,
-)
+from vlatool.runtime.engine import DEFAULT_ENGINE, STANDARD_LAYOUT, Engine, Int8Layout, class_for, engine_class, layouts
 from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
@@ -107,7 +99,7 @@ class StaticInt8(CalibratedQuantization):
 
     @property
     def engine(self) -> str:
-        """Engine of the layout; empty for any engine that runs standard operators, and for the default one."""
+        """Engine of the layout; empty for the default engine, and for a layout of standard operators."""
         name = layouts()[self.layout][1]
         return "" if name == DEFAULT_ENGINE else name
 
@@ -127,28 +119,28 @@ class StaticInt8(CalibratedQuantization):
         )  # fmt: skip
 
     def on(self, profile: Profile) -> Self:
-        """Use layout and activations of the board's preferred engine."""
+        """Use the layout and activation type of the board's preferred engine."""
         options = dict(class_for(profile.engine).int8)
         if saturates(profile.units[profile.engines[profile.engine].unit].isa):
             options["reduce_range"] = True
         return self.model_copy(update={name: how for name, how in options.items() if name not in self.model_fields_set})
 
     def on_this_host(self) -> Self:
-        """Use weights without saturation where this host saturates; the standard layout may be for any board."""
+        """Use weights that cannot saturate if this host's products do; the standard layout may be for any board."""
         if self.layout == STANDARD_LAYOUT:
             return self
         return fit_range_to_host(self, self.engine)
 
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Report that the weights are meant for processors without VNNI."""
+        """Return the note that the weights are meant for processors without VNNI."""
         return (REDUCE_RANGE_NOTE,) if self.reduce_range else ()
 
     def used_packages(self) -> tuple[str, ...]:
-        """Packages of the stage, with the engine of the layout."""
+        """Return the packages of the stage, with the engine of the layout."""
         return (*self.packages, engine_class(self.engine).package) if self.engine else self.packages
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Check that operators and layout fit the options, and that there is calibration data."""
+        """Check that operators, layout and engine support the options, and that there is calibration data."""
         check_ops(self.ops)
         library: type[Engine] = engine_class(self.engine)
         if self.compute not in library.computes:
@@ -204,7 +196,7 @@ class StaticInt8(CalibratedQuantization):
         """Return value -> quantization range (low, high).
 
         Args:
-            unsigned: Values that are uint8 where others are symmetric.
+            unsigned: Names of values that are uint8 when others are symmetric.
         """
         kind = self.style.activations
         symmetric = {name: kind in ("int8", "symmetric") and name not in unsigned for name in statistics}
@@ -224,7 +216,7 @@ class StaticInt8(CalibratedQuantization):
         return layers, values
 
     def _layers_after_split(self, model: Any, layers: list[Layer]) -> list[Layer]:
-        """Return the layers after Gemm became MatMul."""
+        """Return the layers as they are once each Gemm has become a MatMul."""
         if not self.int8_layout.integer:
             return layers
         names = {layer.name for layer in layers}
@@ -233,7 +225,7 @@ class StaticInt8(CalibratedQuantization):
 
 
 def _values_read_by_sums_only(layers: Mapping[str, list[Layer]]) -> dict[str, set[str]]:
-    """Return graph -> values that only sums of two activations read: a sum without a range stays float32."""
+    """Return graph -> values that only sums of two activations read; a sum without a range stays float32."""
     read = {
         name: [{value for layer in chosen if (layer.kind == "Add") is sums for value in layer.activations}
                for sums in (True, False)]
@@ -243,12 +235,12 @@ def _values_read_by_sums_only(layers: Mapping[str, list[Layer]]) -> dict[str, se
 
 
 def _finite_layers(layers: list[Layer], statistics: Mapping[str, Statistics]) -> list[Layer]:
-    """Return the layers with finite activations: a mask of -infinity, or an input that takes it, excludes others."""
+    """Return the layers with finite activations: without those that read a mask or an input with infinity."""
     infinite = {name for name, seen in statistics.items() if not seen.finite}
     return [layer for layer in layers if infinite.isdisjoint(layer.activations)]
 
 
 def _capable_layouts(fits: Callable[[Int8Layout, type[Engine]], bool]) -> str:
-    """Return the names of the layouts that fit, joined by "or"."""
+    """Return the names of the suitable layouts, joined by "or"."""
     names = [name for name, (layout, engine) in layouts().items() if fits(layout, engine_class(engine))]
     return " or ".join(names) or "none"

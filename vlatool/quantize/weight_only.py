@@ -66,10 +66,6 @@ class WeightOnly(WeightOptions):
         change = {"layout": STANDARD_LAYOUT} if standard and "layout" not in self.model_fields_set else {}
         return self.model_copy(update=change)
 
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file, when one is given."""
-        return (self.calibration,) if self.calibration else ()
-
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Check that there is something to quantize, and calibration data for the methods that need it."""
         if self.calibration and not self.calibration.exists():

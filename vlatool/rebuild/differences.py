@@ -97,13 +97,7 @@ def _short(value: Any) -> str:
 
 def same_bytes(one: Path, two: Path) -> bool:
     """Compare two files byte by byte, a block at a time."""
-    if one.stat().st_size != two.stat().st_size:
-        return False
-    with one.open("rb") as left, two.open("rb") as right:
-        while block := left.read(BLOCK):
-            if block != right.read(BLOCK):
-                return False
-    return True
+    return one.stat().st_size == two.stat().st_size and _first_difference(one, two) == one.stat().st_size
 
 
 def explain(one: Path, two: Path) -> str:
@@ -125,6 +119,7 @@ def explain(one: Path, two: Path) -> str:
 
 
 def _first_difference(one: Path, two: Path) -> int:
+    """Return the position of the first byte that differs, or at which one file ends."""
     position = 0
     with one.open("rb") as left, two.open("rb") as right:
         while True:

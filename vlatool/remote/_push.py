@@ -62,7 +62,6 @@ class Payload:
     """All that is pushed for one run.
 
     Args:
-        items: the files.
         bundles: directory of each bundle on the target, in order.
     """
 

@@ -146,7 +146,6 @@ def missing_reasons(report: Report, shown: Callable[[str], bool], *, further: bo
     """Return a sentence for each reason for which numbers could not be had; variants are named unless it holds for all.
 
     Args:
-        report: The report.
         shown: Says of the name of a measurement whether its reason is asked for.
         further: Add what is not a measurement of a row, from its details.
     """

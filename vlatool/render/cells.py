@@ -32,8 +32,6 @@ def matrix(report: Report, shown: Sequence[Quantity], origin: str, where: str | 
     """Return a table of one kind of numbers from one place: a number a line, a variant a column.
 
     Args:
-        report: The report.
-        shown: The quantities.
         origin: Measured or predicted.
         where: Only the numbers from there.
     """
@@ -78,8 +76,6 @@ def records_table(report: Report, title: str, bars_of: str = "") -> Table | None
     """Return the details of that title: a record a line, that of several variants under each other.
 
     Args:
-        report: The report.
-        title: Title of the details.
         bars_of: Name of the number that gets a bar.
     """
     records = [

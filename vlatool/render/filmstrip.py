@@ -31,7 +31,6 @@ class Shot:
     """The episode of one variant.
 
     Args:
-        variant: Name of the variant.
         pictures: Pictures of the reset and after each step, uint8 (H, W, 3); iterated more than once.
         count: Number of the pictures.
         size: Height and width of each.
@@ -149,7 +148,6 @@ class _Pen:
         Args:
             x, y: Its left end, or its right one, and its top.
             text: One line.
-            colour: Colour of the ink.
             width: Largest width in pixels.
             right: Whether it ends at ``x``.
         """

@@ -112,8 +112,6 @@ def write_video(video: Video, path: Path, *, force: bool = False) -> str:
     """Write a video; the file appears whole or not at all, and not over one that came meanwhile.
 
     Args:
-        video: The video to write.
-        path: Path of the file.
         force: See ``check_video``.
 
     Returns:

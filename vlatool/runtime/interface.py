@@ -1,7 +1,7 @@
 """What a control loop calls: a policy, which infers chunks of actions, and a controller, which acts on an observation.
 
-Whatever wraps a policy (records it, changes its actions) is a ``Policy`` itself, and whatever acts with one a
-``Controller``; so wrappers compose in any order, and callers need nothing beside these methods.
+Anything that wraps a policy (to record it, or to change its actions) is itself a ``Policy``, and anything that acts
+with one is a ``Controller``. So wrappers compose in any order, and callers need only these methods.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ Array = NDArray[Any]
 
 
 class Action(NamedTuple):
-    """What the policy wants the robot to do.
+    """Result of an inference: what the robot should do.
 
     Args:
         chunk: (T, A) float32 in the units of the spec, or (T,) int64 indices of discrete actions.
-        labels: For discrete actions, the name of each index; for others, the name of each element.
-        latency_ms: From the call of ``infer`` to this object, in milliseconds.
+        labels: Name of each index for discrete actions, otherwise of each element.
+        latency_ms: Time from the call of ``infer`` to this result, in milliseconds.
         sequence: Number of this inference since the last reset, from 0.
-        outputs: Every output of the spec by name, as the graph gave it (not un-normalised).
+        outputs: Every output of the spec by name, as the graph returned it (not un-normalised).
     """
 
     chunk: Array
@@ -40,7 +40,7 @@ class Policy(Protocol):
 
     @property
     def spec(self) -> PolicySpec:
-        """What it takes and gives, and the control rate."""
+        """Inputs, outputs and control rate."""
 
     def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
         """Return the next action chunk; see ``vlatool.runtime.policy.BundlePolicy.infer``."""

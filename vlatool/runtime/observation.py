@@ -10,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.errors import DataError, SpecError
-from vlatool.runtime.assets import Assets, asset_path, read_asset
+from vlatool.errors import DataError
+from vlatool.runtime.assets import Assets, asset_path
 from vlatool.runtime.statistics import load_normaliser
-from vlatool.runtime.tokenizer import Tokenizer
+from vlatool.runtime.tokenizer import Tokenizer, tokenizer_content
 
 MAX_SMALL_VALUES = 256
 NOT_FINITE = (
     "check where it comes from: a sensor, a recording, an environment; a policy that handles such values is exported "
     "with finite: false in its spec"
 )
-MISSING = "put the file there, or correct its name in the spec"
 Array = NDArray[Any]
 Encoder = Callable[[Any], Array]
 
@@ -144,11 +143,7 @@ def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
 
 
 def _text_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
-    try:
-        content = read_asset(assets, tensor.tokenizer, "tokenizer_bytes")
-    except OSError as error:
-        where = f"{asset_path(assets, tensor.tokenizer)} ({error.strerror})"
-        raise SpecError(f"The tokenizer of '{tensor.name}' cannot be read: {where}.", MISSING) from error
+    content = tokenizer_content(assets, tensor.tokenizer, tensor.name)
     tokenizer = Tokenizer(asset_path(assets, tensor.tokenizer), tensor.max_tokens, tensor.name, content)
 
     def encode(value: Any) -> Array:

@@ -29,19 +29,19 @@ from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import Program, Session
 
 FLOAT_ROUNDING = 1e-3
-"""Relative difference of a golden action in float32 that sums in another order explain; seen up to 6e-7."""
+"""Relative difference of a float32 golden action that a different order of summation explains; observed: up to 6e-7."""
 FIRST_RUN_S = 60.0
-"""How long an inference of the warm-up may take before it is stopped: far more than a policy that a robot could use."""
+"""Time limit of one inference in the warm-up: far more than any policy that a robot could use would take."""
 
 
 class BundlePolicy:
     """An open bundle. ``infer`` maps an observation to an ``Action``; ``reset`` starts a new episode.
 
-    It may be opened in one thread and used in another. Calls from several threads at once take turns, so that each gets
-    the answer to its own observation: an error instead would hit a control loop at random, whenever calls happen to
-    overlap, and a lock costs it less than a microsecond. Calls that overlap on a policy that keeps values from step to
-    step are refused nevertheless: they would mix two episodes, which no order makes right. One policy for each thread
-    also spares them the waiting.
+    It may be opened in one thread and used in another. Simultaneous calls from several threads take turns, so that each
+    gets the answer to its own observation: an error instead would hit a control loop at random, whenever calls happen
+    to overlap, while a lock costs less than a microsecond. For a policy that keeps values from step to step,
+    overlapping calls are refused, because they would mix two episodes in any order. With one policy for each thread,
+    no thread has to wait.
     """
 
     def __init__(self, bundle: Bundle, program: Program, engine: str) -> None:
@@ -56,10 +56,10 @@ class BundlePolicy:
         self._action = self.spec.action.name
         self._direct = program.plain and self._outputs.certain
         self._sequence = 0
-        self._turn = threading.RLock()  # a signal handler may call while this thread has it
+        self._turn = threading.RLock()  # a signal handler may call while this thread holds it
         self._busy = False
         self.limit_s: float | None = None
-        """Seconds that an inference may take before it is stopped; without a limit when None."""
+        """Time limit of an inference in seconds, after which it is stopped; no limit when None."""
         self.golden_error: float | None = None
         self.golden_chunk_error: float | None = None
 
@@ -92,18 +92,18 @@ class BundlePolicy:
     def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
         """Return the next action chunk.
 
-        An inference that raises counts as if it had never been: kept values, noise and the sequence number stay.
+        An inference that raises has no effect: kept values, noise and the sequence number stay as they were.
 
         Args:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
-                An ``EncodedObservation``, which ``encode`` returns, is taken as it is.
-            noise: Value name -> float32 array, instead of what the program would draw.
+                An ``EncodedObservation``, as ``encode`` returns it, is used unchanged.
+            noise: Value name -> float32 array that replaces the noise that the program would draw.
 
         Raises:
             DataError: when the observation or the noise does not fit.
             GraphError: when the engine fails or takes longer than ``limit_s``, or an output or a kept value is not
                 finite or not as declared.
-            UsageError: when another inference of a policy that keeps values is under way, or one of this thread.
+            UsageError: when another inference is in progress, of a policy that keeps values or in the same thread.
         """
         start = time.perf_counter_ns()
         if self._busy:
@@ -129,13 +129,13 @@ class BundlePolicy:
         return outputs, self._decode(outputs[self._action])
 
     def decode(self, raw: Array) -> Array:
-        """Return the chunk of an action as the graph gave it: (T, A) in the units of the spec, or (T,) indices."""
+        """Return the chunk of the graph's raw action: (T, A) in the units of the spec, or (T,) indices."""
         return self._decode(raw)[0]
 
     def _check_overlap(self) -> None:
-        """Refuse a call during an inference where taking turns would not make it right."""
+        """Refuse a call during an inference if waiting for it would not help."""
         fix = "open one policy for each thread"
-        if self._turn.acquire(blocking=False):  # this thread has the turn already, or it has just become free
+        if self._turn.acquire(blocking=False):  # this thread holds the lock already, or it has just been released
             self._turn.release()
             if self._busy:
                 raise UsageError(
@@ -151,10 +151,10 @@ class BundlePolicy:
         """Start a new episode: forget kept values, restart the noise.
 
         Args:
-            seed: Of the noise of this episode; that of the policy when None, so that all episodes draw the same.
+            seed: Seed of this episode's noise; the policy's own when None, so that all episodes draw the same noise.
 
         Raises:
-            UsageError: when the seed is not a whole number from 0, or this thread's own inference is under way.
+            UsageError: when the seed is not a whole number from 0, or an inference of this thread is in progress.
         """
         check_whole("seed", seed, 0, optional=True)
         with self._turn:
@@ -165,10 +165,10 @@ class BundlePolicy:
 
     @contextlib.contextmanager
     def _stopped_after(self, seconds: float) -> Iterator[None]:
-        """Stop the engine when the inference of this block takes longer.
+        """Stop the engine if the inference in this block takes longer.
 
         Raises:
-            GraphError: when it did.
+            GraphError: when it was stopped.
         """
         limited = [session for session in self.program.sessions.values() if hasattr(session, "deadline")]
         for session in limited:
@@ -188,12 +188,12 @@ class BundlePolicy:
         """Run the golden observations one after the other, as they were recorded, and compare the actions.
 
         Args:
-            inferences: At least this many, and each golden observation once; none when 0.
-            tolerance: Largest relative L2 difference, of outputs and of chunks; those in the manifest when None.
-            first_run_s: Seconds that each may take.
+            inferences: Minimum number of inferences, at least one for each golden observation; 0 for none at all.
+            tolerance: Largest relative L2 difference of outputs and of chunks; those in the manifest when None.
+            first_run_s: Time limit of each inference in seconds.
 
         Raises:
-            BundleError: when a program that keeps values has but one golden step.
+            BundleError: when a program that keeps values has only one golden step.
             DataError: when the golden file cannot be read.
             GraphError: when the difference is larger or not a number, or an inference takes longer.
         """
@@ -201,10 +201,10 @@ class BundlePolicy:
         self.check_golden(tolerance)
 
     def replay_golden(self, inferences: int, first_run_s: float = FIRST_RUN_S) -> None:
-        """Run the golden observations as ``warm_up`` does, and note how far the actions are from the recorded ones.
+        """Run the golden observations as ``warm_up`` does, and store how far the actions are from the recorded ones.
 
         Raises:
-            BundleError, DataError, GraphError: as ``warm_up`` does, but for no difference.
+            BundleError, DataError, GraphError: as ``warm_up`` does, but not for a difference.
         """
         stored = golden_arrays(self.bundle)
         steps = golden_steps(self.bundle, stored)
@@ -234,10 +234,10 @@ class BundlePolicy:
         self.golden_error, self.golden_chunk_error = _worst(errors), _worst(of_chunks)
 
     def check_golden(self, tolerance: float | None = None) -> None:
-        """Check the differences of the warm-up against what is allowed.
+        """Check the differences that the warm-up stored against the tolerances.
 
         Args:
-            tolerance: Largest relative L2 difference, of outputs and of chunks; those in the manifest when None.
+            tolerance: Largest relative L2 difference of outputs and of chunks; those in the manifest when None.
 
         Raises:
             GraphError: when a difference is larger or not a number.
@@ -256,22 +256,22 @@ class BundlePolicy:
                 )
 
     def _made_for(self) -> str:
-        """Return which engine the bundle was made for, when another one runs it."""
+        """Return a fix that names the bundle's engine, if a different one runs it."""
         engine = self.bundle.manifest.engine or DEFAULT_ENGINE
         if engine == self.engine:
             return ""
         return f"the bundle was made for {engine}: load it with engine={engine!r}, or make one for {self.engine}"
 
     def chunk_error(self, got: Array, expected: Array) -> float:
-        """Return the relative L2 difference of two chunks in physical units; infinite for other sizes.
+        """Return the relative L2 difference of two chunks in physical units; infinite when their sizes differ.
 
-        Each element counts from the offset of its statistics, in units of their spread: a gripper near zero is a large
-        offset less a large number, beside which mere rounding would look like another action, and small elements would
+        Each element is taken from the offset of its statistics, in units of their spread. Otherwise rounding would look
+        like another action where a gripper near zero is the difference of two large numbers, and small elements would
         not show beside large ones.
 
         Args:
-            got: (T, A) in the units of the spec.
-            expected: What was recorded of it, the same.
+            got: Chunk (T, A) in the units of the spec.
+            expected: Recorded chunk of the same shape and units.
         """
         normaliser = self._decode.normaliser
         if normaliser is None or got.shape != expected.shape:
@@ -284,7 +284,7 @@ class BundlePolicy:
 
     @property
     def golden_tolerances(self) -> tuple[float, float]:
-        """Largest relative L2 difference that the manifest allows, of outputs and of chunks in physical units."""
+        """Largest relative L2 differences that the manifest allows: of outputs, and of chunks in physical units."""
         manifest = self.bundle.manifest
         own = manifest.golden_tolerance or GOLDEN_TOLERANCE
         return own, manifest.golden_chunk_tolerance or own
@@ -293,8 +293,8 @@ class BundlePolicy:
     def golden_explained(self) -> float:
         """Largest difference of a golden action that rounding explains.
 
-        What is rounded to few bits may differ as much as the manifest allows, which holds what the engine was seen to
-        differ by where the bundle was made.
+        A quantized policy may differ as much as the manifest allows: its tolerance is the difference that was measured
+        between engine and graphs when the bundle was made.
         """
         floats = all(set(graph.precision) <= {FLOAT32} and graph.compute in ("", FLOAT32)
                      for graph in self.bundle.manifest.graphs.values())  # fmt: skip
@@ -302,18 +302,17 @@ class BundlePolicy:
 
 
 Policy = BundlePolicy
-"""The name of the class before ``vlatool.runtime.interface.Policy``, the protocol, was there."""
+"""Former name of the class, from before the protocol ``vlatool.runtime.interface.Policy`` existed."""
 
 
 def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
-    """Refuse a bundle that a stage found something wrong with.
+    """Refuse a bundle in which a stage found something wrong.
 
     Args:
-        bundle: An open bundle.
-        accept: Names of findings that are overruled.
+        accept: Names of accepted findings.
 
     Raises:
-        GraphError: naming the first finding that is not overruled.
+        GraphError: naming the first finding that is not accepted.
     """
     allowed = set(accept)
     for finding in bundle.manifest.findings:
@@ -326,13 +325,13 @@ def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
 
 
 def _worst(errors: Iterable[float]) -> float | None:
-    """Return the largest (NaN counts as larger than all), None when there is none."""
+    """Return the largest error (NaN counts as the largest), or None if there is none."""
     known = list(errors)
     return next(filter(math.isnan, known), max(known, default=None))
 
 
 def relative_error(got: Array, expected: Array) -> float:
-    """Return ``|got - expected|₂ / |expected|₂`` (the absolute norm when that is zero); infinite for other sizes."""
+    """Return ``|got - expected|₂ / |expected|₂`` (``|got|₂`` if expected is zero); infinite when sizes differ."""
     wide = np.asarray(expected, np.float64).reshape(-1)
     flat = np.asarray(got, np.float64).reshape(-1)
     if flat.shape != wide.shape:

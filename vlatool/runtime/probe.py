@@ -11,23 +11,34 @@ import math
 import os
 import resource
 import shlex
-import signal
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vlatool import errors
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, VlatoolError
+from vlatool.files.messages import from_json, to_json
+from vlatool.machine.processes import NO_MEMORY, python_code, signal_name
 from vlatool.runtime.contract import allowed_mb
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 
 START_S = 60.0
 """What the child may take beside its first run: Python, the engine's library, opening the graphs on a slow board."""
-NO_MEMORY = ("MemoryError", "bad_alloc", "bad allocation", "ailed to allocate", "ut of memory", "annot allocate")
-"""What Python, C++ and the engines say when a limit is reached."""
-CHILD = "import sys; sys.path[:0] = {path!r}; from vlatool.runtime import probe; probe.main()"
+CHILD = "from vlatool.runtime import probe; probe.main()"
+
+
+@dataclass(frozen=True)
+class Job:
+    """Question to the child; see ``probe``."""
+
+    path: Path
+    engine: str
+    threads: int | None
+    first_run_s: float
+    memory_mb: float
 
 
 def probe(
@@ -57,13 +68,11 @@ def probe(
         VlatoolError: what the bundle raises, of the same class.
     """
     allowed = allowed_mb(Bundle.open(path, verify=False).manifest, memory_mb)
-    job = {
-        "path": str(path), "engine": engine, "threads": threads, "first_run_s": first_run_s, "memory_mb": allowed,
-    }  # fmt: skip
+    job = Job(path, engine, threads, first_run_s, allowed)
     try:
         done = subprocess.run(
-            [sys.executable, "-I", "-c", CHILD.format(path=_search_path())],
-            input=json.dumps(job), capture_output=True, text=True, check=False, timeout=START_S + first_run_s,
+            python_code(CHILD), input=json.dumps(to_json(job)), timeout=START_S + first_run_s,
+            capture_output=True, text=True, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise _too_long(path, START_S + first_run_s) from None
@@ -72,14 +81,14 @@ def probe(
 
 def main() -> None:
     """Answer one question: the child's side."""
-    job = json.loads(sys.stdin.readline())
-    size = int(job["memory_mb"] * 1e6)
+    job = from_json(Job, json.loads(sys.stdin.readline()))
+    size = int(job.memory_mb * 1e6)
     resource.setrlimit(resource.RLIMIT_DATA, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    seconds = math.ceil((START_S + job["first_run_s"]) * len(os.sched_getaffinity(0)))
+    seconds = math.ceil((START_S + job.first_run_s) * len(os.sched_getaffinity(0)))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))  # should the parent not live to end this process
     try:
-        answer = _run(**job)
+        answer = _run(job)
     except VlatoolError as error:
         answer = {"error": type(error).__name__, "message": error.message, "fix": error.fix}
     except MemoryError:
@@ -87,9 +96,9 @@ def main() -> None:
     sys.stdout.write("\n" + json.dumps(answer) + "\n")
 
 
-def _run(path: str, engine: str, threads: int | None, first_run_s: float, memory_mb: float) -> dict[str, Any]:
-    policy = Policy.open(Bundle.open(path), engine=engine, threads=threads, seed=0, memory_mb=memory_mb)
-    policy.replay_golden(1, first_run_s)
+def _run(job: Job) -> dict[str, Any]:
+    policy = Policy.open(Bundle.open(job.path), engine=job.engine, threads=job.threads, seed=0, memory_mb=job.memory_mb)
+    policy.replay_golden(1, job.first_run_s)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     refused = None
     try:
@@ -100,12 +109,6 @@ def _run(path: str, engine: str, threads: int | None, first_run_s: float, memory
         "golden_error": policy.golden_error, "golden_chunk_error": policy.golden_chunk_error,
         "golden_tolerances": policy.golden_tolerances, "refused": refused, "peak_rss_mb": peak * 1024 / 1e6,
     }  # fmt: skip
-
-
-def _search_path() -> list[str]:
-    """Return where this process finds modules, without the current directory and the script's."""
-    here = str(Path(__file__).parents[2])
-    return [here, *(entry for entry in sys.path[1:] if entry and entry != here and Path(entry).is_absolute())]
 
 
 def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) -> dict[str, Any]:
@@ -123,7 +126,9 @@ def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) 
         kind = getattr(errors, str(answer["error"]), GraphError)
         raise kind(message, str(answer.get("fix", "")))
     if done.returncode < 0:
-        raise GraphError(f"{path}: the first run ends its process with {_signal(-done.returncode)}.", "do not load it")
+        raise GraphError(
+            f"{path}: the first run ends its process with {signal_name(done.returncode)}.", "do not load it"
+        )
     if done.returncode or not answer:
         last = (message.strip() or f"exit code {done.returncode}").splitlines()[-1]
         raise GraphError(
@@ -138,9 +143,3 @@ def _too_long(path: Path, seconds: float) -> GraphError:
         f"{path}: no first action after {seconds:g} s, so the process was ended.",
         "allow a slow policy more with load(..., first_run_s=...) or vlatool inspect --probe --first-run SECONDS",
     )
-
-
-def _signal(number: int) -> str:
-    with contextlib.suppress(ValueError):
-        return signal.Signals(number).name
-    return f"signal {number}"

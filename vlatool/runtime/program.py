@@ -41,7 +41,7 @@ class Program:
         self.steps = tuple(steps)
         self.sessions = sessions
         self._seed = seed
-        self._schedules = [_schedules(step) for step in self.steps]
+        self._schedules = [schedule_arrays(step) for step in self.steps]
         self._plain = self._plain_step()
         self._noisy = any(step.noise for step in self.steps)
         self.reset()
@@ -176,7 +176,8 @@ def draw(noise: Mapping[str, Any], random: np.random.Generator) -> Array:
     return random.standard_normal(shape, np.float32)
 
 
-def _schedules(step: ProgramStep) -> dict[str, list[Array]]:
+def schedule_arrays(step: ProgramStep) -> dict[str, list[Array]]:
+    """Return the schedules of a step: value name -> an array of shape (1,) for each repeat."""
     schedules = {}
     for name, numbers in step.schedule.items():
         whole = all(isinstance(number, int) for number in numbers)

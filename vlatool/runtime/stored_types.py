@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vlatool.runtime.external_data import LENGTH, SEARCH_BYTES, VARINT, OpenFile, asked_of, messages, parts, varint
+from vlatool.runtime.external_data import SEARCH_BYTES, VARINT, OpenFile, asked_of, fields, messages, parts
 
 FLOAT8 = (17, 18, 19, 20)
 """``TensorProto.DataType``: E4M3FN, E4M3FNUZ, E5M2, E5M2FNUZ."""
@@ -75,7 +75,7 @@ def _short(model: bytes | OpenFile, start: int, end: int) -> bool:
 
 def _holds(model: bytes | OpenFile) -> bool:
     tensors = (span for message, *span in messages(model, _may_hold) if message == "TensorProto")
-    return any(_data_type(model[start : min(end, start + SEARCH_BYTES)]) in FLOAT8 for start, end in tensors)
+    return any(_data_type(model, start, end) in FLOAT8 for start, end in tensors)
 
 
 def _may_hold(model: bytes | OpenFile, start: int, end: int) -> bool:
@@ -83,16 +83,6 @@ def _may_hold(model: bytes | OpenFile, start: int, end: int) -> bool:
     return end - start > SEARCH_BYTES or any(mark in model[start:end] for mark in MARKS)
 
 
-def _data_type(tensor: bytes) -> int:
-    """Return the type that a tensor names before its data; 0 when it names none there."""
-    at = 0
-    while at < len(tensor):
-        tag, at = varint(tensor, at, 5)
-        field, kind = tag >> 3, tag & 7
-        if kind not in (VARINT, LENGTH):
-            return 0
-        value, at = varint(tensor, at, 10)
-        if field == DATA_TYPE and kind == VARINT:
-            return value
-        at += value if kind == LENGTH else 0
-    return 0
+def _data_type(model: bytes | OpenFile, start: int, end: int) -> int:
+    """Return the type that a tensor names, most often before its data; 0 when it names none."""
+    return next((number for field, _, _, number in fields(model, start, end) if field == DATA_TYPE), 0)

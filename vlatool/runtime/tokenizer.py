@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vlatool.errors import DataError, SpecError, VlatoolError, require
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit
-from vlatool.runtime.assets import read_asset
+from vlatool.runtime.assets import Assets, asset_path, read_asset
 from vlatool.runtime.token_growth import growth
 
 SAVE = "save it with tokenizer.save(FILE) of the tokenizers library, or write a vocabulary: kind: words"
@@ -44,7 +44,7 @@ class Tokenizer:
         self.name = name
         self._growth = 1
         self._cache: dict[str, NDArray[np.int64]] = {}
-        content = _content(path, name) if content is None else content
+        content = tokenizer_content(path.parent, path.name, name) if content is None else content
         data = read_json(content, f"The tokenizer {path} of '{name}'", SpecError, SAVE)
         if not isinstance(data, dict):
             raise SpecError(f"The tokenizer of '{name}' must be a mapping: {path}.", SAVE)
@@ -86,12 +86,17 @@ class Tokenizer:
         return row
 
 
-def _content(path: Path, name: str) -> bytes:
+def tokenizer_content(assets: Assets, file: str, name: str) -> bytes:
+    """Return the content of the tokenizer of an input.
+
+    Raises:
+        SpecError: when it cannot be read.
+    """
     try:
-        return read_asset(path.parent, path.name, "tokenizer_bytes")
+        return read_asset(assets, file, "tokenizer_bytes")
     except OSError as error:
         raise SpecError(
-            f"The tokenizer of '{name}' cannot be read: {path} ({error.strerror}).",
+            f"The tokenizer of '{name}' cannot be read: {asset_path(assets, file)} ({error.strerror}).",
             "put the file there, or correct its name in the spec",
         ) from error
 

@@ -1,4 +1,4 @@
-"""Policies with random weights and realistic shapes, for latency and memory work; one file for each."""
+"""Policies with random weights and realistic shapes, to study latency and memory; one file for each."""
 
 from __future__ import annotations
 

@@ -52,8 +52,6 @@ def sinusoid(time: Tensor, width: int, shortest: float = 4e-3, longest: float = 
     Args:
         time: (B,) float32 in [0, 1].
         width: Even.
-        shortest: Shortest period.
-        longest: Longest period.
 
     Returns:
         (B, width) float32.

@@ -32,7 +32,6 @@ def build(
     """Return the module in eval mode with the weights of ``seed``; neither reads nor moves the global random state.
 
     Args:
-        architecture: Builds the module on torch's current device.
         dtype: Name of a floating torch dtype; weights are drawn in float32 and rounded to it.
         device: Where the module lives, the CPU when None. ``"meta"`` costs no memory and leaves the weights undefined.
         prefix: Full name of the module inside the policy, when it is a part: ``"language.layers.7"``.

@@ -31,23 +31,19 @@ class BasicBlock(nn.Module):
 
 
 class ResNetFeatures(nn.Module):
-    """ResNet with two basic blocks a stage and a linear head.
+    """ResNet-18: two basic blocks a stage, and a linear head to 1000 features."""
 
-    Args:
-        widths: Channels of each stage; (64, 128, 256, 512) is ResNet-18.
-    """
-
-    def __init__(self, widths: tuple[int, ...] = (64, 128, 256, 512), features: int = 1000) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self.pixels = Pixels(IMAGENET)
-        self.stem = nn.Sequential(_convolution(3, widths[0], 7, 2), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
-        blocks, inputs = [], widths[0]
-        for stage, width in enumerate(widths):
-            blocks += [BasicBlock(inputs, width, 1 if stage == 0 else 2), BasicBlock(width, width, 1)]
+        self.stem = nn.Sequential(_convolution(3, 64, 7, 2), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        blocks, inputs = [], 64
+        for width in (64, 128, 256, 512):
+            blocks += [BasicBlock(inputs, width, width // inputs), BasicBlock(width, width, 1)]
             inputs = width
         self.blocks = nn.Sequential(*blocks)
         self.pool = nn.AdaptiveAvgPool2d(1)
-        self.head = nn.Linear(inputs, features)
+        self.head = nn.Linear(inputs, 1000)
 
     def forward(self, image: Tensor) -> Tensor:
         """(B, H, W, 3) uint8 -> (B, features)."""

@@ -98,7 +98,6 @@ class Past:
 
     Args:
         keys: (B, layers, shared_heads, S, D), or (B, shared_heads, S, D) of one layer.
-        values: As the keys.
         here: (S, 1) bool, True where the new key and value go.
     """
 

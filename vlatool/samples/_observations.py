@@ -21,7 +21,6 @@ def observations(spec: PolicySpec, ranges: Ranges, count: int, random: np.random
     Args:
         spec: Inputs without free axes; pixels uint8, numbers float32, or text.
         ranges: Inputs that are uniform in a range; other numbers are standard normal.
-        random: Source of all randomness.
 
     Returns:
         Input name -> (count, ...) in the place of the batch axis; text as unicode (count,).

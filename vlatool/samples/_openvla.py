@@ -26,10 +26,8 @@ class OpenShape:
     Args:
         first: DINOv2-L with a class token and four registers; without its last block, which OpenVLA does not use.
         second: SigLIP-SO400M, without its last block too.
-        language: Llama-2-7B.
         vocabulary: Number of token ids that mean something; id 0 is padding.
         rows: Rows of the embedding and the head (padded vocabulary).
-        bins: Number of bins of an action element.
         action: Elements of the action, each one token.
     """
 
@@ -140,7 +138,6 @@ class OpenDecode(nn.Module):
             tokens: (1, action) int64, chosen up to ``position``.
             position: (1,) int64, from 0 to action - 2.
             keys: (1, layers, heads, slots, D) in the dtype of the weights.
-            values: As the keys.
             mask: (1, prompt) bool.
 
         Returns:

@@ -22,9 +22,7 @@ class SmolShape:
     Args:
         vision: Encoder without registers.
         shuffle: Side of the square of patches that becomes one token.
-        language: Layers of the prefix.
         expert_width: Width of the action tokens.
-        expert_hidden: Hidden width of each feed-forward of the expert.
         vocabulary: Number of token ids; id 0 is padding.
         steps: Euler steps from noise to actions.
     """

@@ -86,7 +86,6 @@ class Step(nn.Module):
             x: (1, chunk, action) float32, noisy actions.
             time: (1,) float32, from 1 down to 1 / steps.
             keys: (1, layers, shared_heads, prefix, D) float32, rotated.
-            values: As the keys.
             mask: (1, prefix) bool, False at padding.
 
         Returns:

@@ -49,7 +49,6 @@ class VisionShape:
     Args:
         registers: Learned tokens in front of the patches (class token included).
         gains: Whether blocks have learned gains (DINOv2).
-        colours: Mean and deviation of the channels.
     """
 
     pixels: int

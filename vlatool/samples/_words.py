@@ -53,19 +53,8 @@ def vocabulary() -> dict[str, object]:
         0
     """
     listed = (
-        ARTICLES,
-        VERBS,
-        OBJECTS,
-        COLOURS,
-        SIZES,
-        MATERIALS,
-        SIDES,
-        RELATIONS,
-        PHRASES,
-        JOINTS,
-        MANNERS,
-        PARTICLES,
-    )
+        ARTICLES, VERBS, OBJECTS, COLOURS, SIZES, MATERIALS, SIDES, RELATIONS, PHRASES, JOINTS, MANNERS, PARTICLES,
+    )  # fmt: skip
     words = dict.fromkeys(word for group in listed for entry in group for word in entry.split())
     return {"kind": "words", "pad": PAD, "unknown": UNKNOWN, "words": {word: 2 + i for i, word in enumerate(words)}}
 

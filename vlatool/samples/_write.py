@@ -23,7 +23,6 @@ def write_sample(name: str, out: Path, seed: int = 0) -> None:
     Args:
         name: A sample, with dashes or underscores: ``vit-s``.
         out: Fresh, writable directory.
-        seed: Seed of the weights and of the observations.
 
     Raises:
         UsageError: when there is no such sample.

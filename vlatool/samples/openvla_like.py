@@ -29,12 +29,7 @@ PROGRAM: list[dict[str, object]] = [
     {
         "graph": "decode",
         "feeds": {"tokens": "tokens", "position": "position", "keys": "keys", "values": "values", "mask": "mask"},
-        "gives": {
-            "action": "action",
-            "tokens_next": "tokens_next",
-            "keys_next": "keys_next",
-            "values_next": "values_next",
-        },
+        "gives": {name: name for name in ("action", "tokens_next", "keys_next", "values_next")},
         "repeat": 6,
         "carry": {"tokens_next": "tokens", "keys_next": "keys", "values_next": "values"},
         "schedule": {"position": [0, 1, 2, 3, 4, 5]},

@@ -21,4 +21,4 @@ def make(seed: int = 0, device: str | None = None) -> nn.Module:
     from vlatool.samples._build import build
     from vlatool.samples._convolution import ResNetFeatures
 
-    return build(lambda: ResNetFeatures(), seed, device=device)
+    return build(ResNetFeatures, seed, device=device)

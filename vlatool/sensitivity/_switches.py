@@ -32,7 +32,6 @@ def add_switches(
         layers: Layers from ``find_layers`` of that file.
         ranges: Value name -> (low, high), for every value of ``calibrated_values``; when None, ranges are computed at
             run time (uint8, DynamicQuantizeLinear).
-        style: Quantization style of the layers.
     """
     selected = list(layers)
     quantized = load(path)
@@ -63,7 +62,6 @@ class _Pairs(OnnxGraph):
         """Return the nodes before an input of a layer, and the name of their output; none for an unquantized input.
 
         Args:
-            index: Index of the input.
             source: Input of the copied QuantizeLinear.
             suffix: Suffix that makes the names of the copies unique.
         """

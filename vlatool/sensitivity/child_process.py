@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
+from vlatool.files.messages import from_json, to_json
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.sensitivity.layers import LayerError, sensitivities
 from vlatool.stage.base import Context
@@ -25,10 +25,8 @@ def sensitivities_in_child(
 
     Args:
         bundle: A float32 bundle with a recording.
-        stage: Stage that selects the layers and their style.
         recorded: Number of observations of that recording to choose from.
         samples: Number of observations to measure on, spread over these.
-        seconds: See ``sensitivities``.
 
     Raises:
         VlatoolError: errors of ``sensitivities``; GraphError when the engine crashes the child.
@@ -38,14 +36,14 @@ def sensitivities_in_child(
         "samples": samples, "seconds": seconds,
     }  # fmt: skip
     reply = children.call(f"{__name__}:run", job, context.progress, "measuring the layers", PRELOAD, own=True)
-    return [LayerError(**layer) for layer in json.loads(reply)]
+    return from_json(list[LayerError], json.loads(reply), "layers")
 
 
-def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:
+def run(job: Mapping[str, Any], tell: children.OnProgress) -> str:
     """Measure the layers of a job in this process; return them as JSON, with possible infinities and NaN."""
     bundle = Bundle.open(Path(job["bundle"]), verify=False)
     observations, limit = recorded_observations(bundle, job["recorded"]), job["samples"]
     selected = observations[:: max(1, len(observations) // limit)][:limit]
     stage = StaticInt8(**job["options"])
     layers = sensitivities(bundle, stage, None, selected, Context(tell), seconds=job["seconds"])
-    return json.dumps([asdict(layer) for layer in layers])
+    return json.dumps(to_json(layers))

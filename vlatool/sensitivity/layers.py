@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
@@ -25,13 +24,12 @@ from vlatool.machine.engine_calls import engine_call
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.engines import of_branches
-from vlatool.runtime.interface import Action
+from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.sensitivity._switches import add_switches
 from vlatool.stage.base import Context, SampleSet
 
-Array = NDArray[Any]
 LayerId = tuple[str, str]
 """Graph name and layer name."""
 
@@ -42,7 +40,6 @@ class LayerError:
 
     Args:
         name: Node name, for example ``blocks.3.attn.out/MatMul``; names joined by ``+`` for a group.
-        graph: Name of its graph.
         error: Relative L2 error of the raw action output, mean over the observations.
         elements: Label -> mean |error| in physical units (un-normalised); empty for discrete actions.
         flips: Share of steps whose gripper element changes sign, or (discrete) whose largest logit is another one; 0
@@ -152,18 +149,10 @@ class Switchboard:
     """A float32 policy in which any combination of layers can be computed in int8; a context manager.
 
     Args:
-        stage: Stage that selects the layers and their style.
         ranges: Ranges from ``ranges_of``.
-        threads: Number of intra-op threads; the cores that this process may use when None.
     """
 
-    def __init__(
-        self,
-        bundle: Bundle,
-        stage: StaticInt8,
-        ranges: Mapping[str, Mapping[str, Range]],
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, bundle: Bundle, stage: StaticInt8, ranges: Mapping[str, Mapping[str, Range]]) -> None:
         self._opened = contextlib.ExitStack()
         folder = self._opened.enter_context(scratch_directory())
         self._tape = _OutputTape()
@@ -182,7 +171,7 @@ class Switchboard:
                     path = folder / f"{name}.onnx"
                     save(model, path)
             with engine_call(of_branches(), f"opened the graph '{name}' with switches"):
-                self._sessions[name] = _SwitchableSession(of_branches()(path, threads), flags, self._tape)
+                self._sessions[name] = _SwitchableSession(of_branches()(path), flags, self._tape)
         self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), DEFAULT_ENGINE)
 
     def __enter__(self) -> Switchboard:
@@ -223,15 +212,10 @@ class Switchboard:
         self._state = {}
 
     def errors(
-        self,
-        groups: Sequence[Sequence[LayerId]],
-        observations: Sequence[Mapping[str, Any]],
-        context: Context,
-        *,
-        ordered: bool = True,
+        self, groups: Sequence[Sequence[LayerId]], observations: Sequence[Mapping[str, Any]], context: Context, *,
         seconds: float = math.inf,
-    ) -> list[LayerError]:
-        """Return the error of each group of layers, the worst first when ``ordered``; see ``sensitivities``.
+    ) -> list[LayerError]:  # fmt: skip
+        """Return the error of each group of layers, the worst first; see ``sensitivities``.
 
         Raises:
             DataError: when there is no observation.
@@ -253,7 +237,7 @@ class Switchboard:
                 context.progress(f"int8 in layer {index + 1} of {len(groups)}, all else in float32", done)
                 rows[index].append(_compare(spec, self.run(group, observation), reference))
         layers = [self._error(group, row) for group, row in zip(groups, rows, strict=True)]
-        return sorted(layers, key=lambda layer: -layer.error) if ordered else layers
+        return sorted(layers, key=lambda layer: -layer.error)
 
     def _error(self, group: Sequence[LayerId], rows: list[tuple[Array, ...]]) -> LayerError:
         spec = self.policy.spec.action

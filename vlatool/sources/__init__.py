@@ -1,4 +1,4 @@
-"""Sources: ways of obtaining a policy, one file each; and which one reads what a person names."""
+"""Sources: ways of obtaining a policy, one file each, and the choice of the source for what the user types."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ __all__ = ["Source", "brings_calibration", "is_bundle", "open_source", "source_b
 
 
 def open_source(typed: str) -> Bundle | Source:
-    """Return what a person types as SOURCE: a bundle, or the stage that reads a policy, whose code may run then.
+    """Open what the user types as SOURCE: a bundle, or the stage that reads a policy, whose code is then trusted.
 
     Raises:
         BundleError: when the bundle is damaged.
-        SourceError: when it is neither.
+        SourceError: when it is neither a bundle nor a policy.
     """
     return Bundle.open(typed) if is_bundle(typed) else source_stage(typed)
 
 
 def source_stage(typed: str) -> Source:
-    """Return the stage that reads a policy which a person names; its code may run then.
+    """Return the stage that reads the policy that the user types; the policy's code is then trusted.
 
     Raises:
-        SourceError: when no source reads it, or it is wrong.
+        SourceError: when no source reads it, or the policy is invalid.
     """
     return source_of_policy(typed).trust_code()
 
 
 def source_bundle(source: Bundle | Source, cache: Path, context: Context) -> Bundle:
-    """Return a bundle as it is, and the source bundle of a policy."""
+    """Return a bundle unchanged, or the source bundle of a policy."""
     if isinstance(source, Bundle):
         return source
     source.check(None, None)

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vlatool.errors import SourceError, fix_for, require, suggest
+from vlatool.errors import SourceError, require
 
 Shapes = Mapping[str, tuple[int | str, ...]]
 INFERRED_BYTES = 1_500_000_000
@@ -152,10 +152,7 @@ def _check_given(inputs: list[Any], shapes: Shapes) -> None:
     known = {value.name: value for value in inputs}
     for name, given in shapes.items():
         if name not in known:
-            raise SourceError(
-                f"--shape names '{name}', which is not an input of the file; {suggest(name, known)}.",
-                fix_for(name, known),
-            )
+            raise SourceError.unknown(f"--shape names '{name}', which is not an input of the file", name, known)
         own = [_length(axis, index) for index, axis in enumerate(_axes(known[name]))]
         fits = len(own) == len(given) and all(
             isinstance(axis, str) or axis == length for axis, length in zip(own, given, strict=True)

@@ -1,1 +1,1 @@
-"""Stages: what they are, how they run, finish and are kept."""
+"""Stages: what they are, how they run, finish and are cached."""

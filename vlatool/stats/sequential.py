@@ -122,7 +122,6 @@ def judge_jointly(
 
     Args:
         measure: Called with the number of the process, from 0; returns a log ratio for each statistic.
-        statistics: Number of statistics.
         margin: The largest slowdown that passes, a share.
         interim_analyses: After how many processes they are judged, ascending.
         alpha: Chance of a false verdict over all interim analyses, on either side.

@@ -87,11 +87,6 @@ class Decision:
         """Whether no more pairs are to be played."""
         return self.verdict != GO_ON
 
-    @property
-    def saved_share(self) -> float:
-        """Share of the episodes that need not be played."""
-        return 1 - self.pairs / self.most
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -166,8 +161,8 @@ class Plan:
             >>> comparison.judge(lost=3, won=2, pairs=200).verdict
             'go on'
             >>> found = comparison.judge(lost=2, won=1, pairs=300)
-            >>> found.verdict, round(found.low, 3), round(found.high, 3), found.saved
-            ('pass', -0.02, 0.029, 0.7)
+            >>> found.verdict, round(found.low, 3), round(found.high, 3)
+            ('pass', -0.02, 0.029)
         """
         verdict = self.verdict(lost, won, pairs, size)
         return Decision(verdict, *self.interval(lost, won, pairs, size), self.limit, lost, won, pairs, self.most)
@@ -379,7 +374,6 @@ def exact_drop(
 
     Args:
         lost, won, pairs: Counts; pairs from 1.
-        confidence: Confidence of the interval.
         size: Independent pairs that they are worth (``starts.independent``); all of them when None.
 
     Example:

@@ -1,4 +1,4 @@
-"""Telemetry of a board: power, energy, temperatures, clocks and throttling beside a run.
+"""Telemetry of a board during a run: power, energy, temperatures, clocks and throttling.
 
 One file for each source. ``open_all`` gives the readers of this machine and what it lacks; ``Recorder`` samples them.
 """

@@ -154,20 +154,14 @@ class CommandReader(Reader):
         self._run = run
 
 
-def gauge(name: str, value: float | None, unit: str, note: str = "") -> list[Reading]:
+def gauge(name: str, value: float | None, unit: str, note: str = "", kind: Kind = "gauge") -> list[Reading]:
     """Return one gauge; an empty list without a finite value."""
-    return _finite(name, value, unit, "gauge", None, note)
+    return [] if value is None or not math.isfinite(value) else [Reading(name, value, unit, kind, note=note)]
 
 
-def counter(name: str, value: float | None, unit: str, wraps: float | None = None, note: str = "") -> list[Reading]:
+def counter(name: str, value: float | None, unit: str, note: str = "") -> list[Reading]:
     """Return one counter; an empty list without a finite value."""
-    return _finite(name, value, unit, "counter", wraps, note)
-
-
-def _finite(name: str, value: float | None, unit: str, kind: Kind, wraps: float | None, note: str) -> list[Reading]:
-    if value is None or not math.isfinite(value):
-        return []
-    return [Reading(name, value, unit, kind, wraps, note)]
+    return gauge(name, value, unit, note, "counter")
 
 
 def number(root: Path, path: str, factor: float) -> float | None:

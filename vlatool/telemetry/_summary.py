@@ -78,8 +78,6 @@ class Energy:
         seconds: Time between the first and the last sample.
         label: Description of the consumer, with exclusions.
         source: ``counter`` or ``power samples`` (trapezoid rule).
-        names: Names of the added readings.
-        samples: Number of samples of each reading.
     """
 
     joules: float
@@ -101,8 +99,6 @@ class Summary:
             and have labels. Empty when unmeasured.
         throttled: Whether a throttle counter moved or a throttle bit was set; None when unknown.
         throttling: Descriptions of what throttled.
-        gauges: Name -> gauge.
-        counters: Name -> change.
         unmeasured: What could not be measured, and why.
     """
 

@@ -30,7 +30,6 @@ class Total:
     """Readings that add up to the power of something.
 
     Args:
-        names: Readings to add.
         unit: ``J`` for energy counters, ``W`` for power.
         label: Description of the sum, with exclusions.
     """

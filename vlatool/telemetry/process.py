@@ -31,7 +31,6 @@ class ProcessReader(Reader):
     have ended included from the moment they were seen. Steal time is that of the whole machine, over all its cores.
 
     Args:
-        root: The root of the file system.
         process: An object of psutil instead of ``/proc``.
         number: ID of another process to read; 0 for this one.
     """

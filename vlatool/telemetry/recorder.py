@@ -23,7 +23,6 @@ class Recorder:
 
     Args:
         readers: Readers, and absent ones, from ``open_all``.
-        period_s: Seconds between two samples.
         clock: Clock of monotonic seconds.
 
     Raises:

@@ -59,7 +59,7 @@ def mean_loss(frames: Frames, indices: NDArray[Any], loss: Loss, rows: int, devi
     """Return the mean loss of rows, without gradients.
 
     Args:
-        indices: indices of them, as ``Frames.sample`` gives.
+        indices: those of the rows, as ``Frames.sample`` gives.
     """
     total, count = 0.0, frames.row_count(indices)
     with require("torch", "build").no_grad(), device.computing(), device.casting():
@@ -72,7 +72,7 @@ def draw_of(taught: Batches, alpha: float, loss: Loss | None, shown: Frames) -> 
     """Return what draws the batches of a training; the teacher's are the same whether there is an expert or not.
 
     Args:
-        taught: taught of what the teacher labelled.
+        taught: batches of what the teacher labelled.
         alpha: share of the teacher in the loss.
         loss: loss against an expert's actions; None without an expert.
         shown: rows with what the expert did.

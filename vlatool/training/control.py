@@ -9,7 +9,8 @@ import numpy as np
 
 from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError
-from vlatool.training.frames import BLOCK_ROWS, Array, new_array
+from vlatool.runtime.interface import Array
+from vlatool.training.frames import BLOCK_ROWS, new_array
 from vlatool.training.rounds import LABEL
 
 

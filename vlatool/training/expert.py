@@ -15,8 +15,9 @@ from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError, require
 from vlatool.files.rows import in_memory
 from vlatool.module.batched_program import BatchedProgram, draw_noise
+from vlatool.runtime.interface import Array
 from vlatool.runtime.statistics import load_normaliser
-from vlatool.training.frames import BLOCK_ROWS, Array, Frames, new_array
+from vlatool.training.frames import BLOCK_ROWS, Frames, new_array
 from vlatool.training.rounds import EXPERT, NOISE, Observations, next_round, write_observations
 from vlatool.training.sequences import Sequences, episode_begins, outputs_and_labels, select_episodes
 
@@ -52,7 +53,6 @@ class Expert:
         """Choose observations, and write them with the expert's actions unless an earlier run did.
 
         Args:
-            recording: recorded observations to choose from.
             share: share of them, at least one.
             seed: seed of the choice; a smaller share is a part of a larger one.
             encode: observation -> what the policy takes.

@@ -10,12 +10,11 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.data import BEGINS
 from vlatool.errors import DataError
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 BLOCK_ROWS = 256
 """Number of rows that are copied at a time."""
 

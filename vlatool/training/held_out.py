@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FOLDER = "held-out"
 SHARE = 0.1
-"""Of the episodes, or of the stretches where episodes are not recorded."""
+"""Share of the episodes, or of the stretches where episodes are not recorded, that is held out."""
 STRETCHES = 20
 """Parts of a recording without episodes: neighbours look alike, and stay together."""
 
@@ -55,7 +55,6 @@ class HeldOut:
         """Split the recording, and write what is held out unless an earlier run did.
 
         Args:
-            recording: recording of the student's bundle.
             write: function called with observations and the folder for them.
             other: called with the folder where there are not two observations to split; says whether it wrote others.
 
@@ -86,7 +85,7 @@ class HeldOut:
         Args:
             alpha: share of the teacher.
             loss: loss of a batch, against the teacher.
-            expert: expert of a batch, against the expert's actions; None where no expert is asked.
+            expert: loss of a batch, against the expert's actions; None where no expert is asked.
         """
         total = alpha * self.loss(loss, rows, device) if alpha else 0.0
         if expert is None:

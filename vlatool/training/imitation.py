@@ -11,7 +11,7 @@ from pydantic import Field
 
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.errors import RecipeError
 from vlatool.module.batched_program import BatchedProgram
 from vlatool.training.feature_distillation import with_hints
 from vlatool.training.flow import CHUNK, check_loops, flow_loss
@@ -31,28 +31,25 @@ class ImitationStage(TrainingStage):
     """Trains a student to do what its teacher does, from the same observation and the same noise."""
 
     loss: str = Field("auto", description="kl (discrete actions), l1, l2 or huber; kl or l1 when auto")
-    temperature: float = Field(2.0, gt=0, le=100, description="of kl")
-    delta: float = Field(0.1, gt=0, le=1000, description="of huber")
+    temperature: float = Field(2.0, gt=0, le=100, description="temperature of the loss kl")
+    delta: float = Field(0.1, gt=0, le=1000, description="threshold of the loss huber")
     targets: Literal["chunk", "flow"] = Field(
         "chunk",
-        description="what is compared: the action at the end of all denoising steps, or one step of each observation, "
-        "from where the teacher stood (flow)",
+        description="target of the loss: the action after all denoising steps, or one step for each observation, from "
+        "the teacher's state (flow)",
     )
     features: float = Field(
-        0.0, ge=0, le=1e6, description="weight in the loss of what blocks give, compared with the teacher's; 0 for none"
+        0.0, ge=0, le=1e6, description="weight of the loss between the outputs of blocks and the teacher's; 0 for none"
     )
     attention: float = Field(
-        0.0, ge=0, le=1e6, description="weight of which tokens are alike in what blocks give; 0 for none"
+        0.0, ge=0, le=1e6, description="weight of the loss between token similarities in block outputs; 0 for none"
     )
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The loss is known, and fits the action."""
         known = registry.names("losses")
         if self.loss != "auto" and self.loss not in known:
-            raise RecipeError(
-                f"Unknown loss '{self.loss}'; {suggest(self.loss, ['auto', *known])}.",
-                fix_for(self.loss, ["auto", *known]),
-            )
+            raise RecipeError.unknown(f"Unknown loss '{self.loss}'", self.loss, ["auto", *known])
         super().check(source, profile)
         if source is not None and self.loss == "kl" and source.manifest.spec.action.kind != "discrete":
             raise RecipeError("The loss kl compares discrete actions; the policy's are continuous.", "try --loss l1")

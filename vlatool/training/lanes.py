@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vlatool.runtime.interface import Array
 from vlatool.training.device import on_device
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,6 @@ def side_by_side(begins: Array, count: int) -> Iterator[Lanes]:
 
     Args:
         begins: (N,) whether an episode begins with a row.
-        count: count of lanes.
     """
     firsts = np.flatnonzero(begins)
     ends = np.array([*firsts[1:], len(begins)])

@@ -33,24 +33,11 @@ class RankProcesses:
         self._errors: list[BaseException] = []
 
     @contextlib.contextmanager
-    def training(self, rounds: int, rows: int, until: int) -> Iterator[None]:
-        """Let the others train while the block runs.
-
-        Args:
-            until: number of steps after which to stop.
-
-        Raises:
-            VlatoolError: the error of one of them, or how it ended.
-        """
-        with self.calling("train", {"rounds": rounds, "rows": rows, "until": until}):
-            yield
-
-    @contextlib.contextmanager
     def calling(self, function: str, job: Mapping[str, Any]) -> Iterator[None]:
         """Call a function of ``rank_process`` in all others while the block runs.
 
         Raises:
-            VlatoolError: as ``training``.
+            VlatoolError: the error of one of them, or how it ended.
         """
         calls = [self._submit(child, function, {**job, "rank": rank}) for rank, child in enumerate(self._children, 1)]
         try:

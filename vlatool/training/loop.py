@@ -50,8 +50,6 @@ class Settings:
     Args:
         weight_decay: weight decay of weights with two axes or more, decoupled (AdamW).
         average: decay of the exponential moving average of the weights, which is the result.
-        device: device and precision.
-        checkpoint_s: seconds between checkpoints.
         shard: whether each process holds a part of the weights alone.
     """
 
@@ -80,9 +78,7 @@ class Trainer:
     trained is what runs on the robot.
 
     Args:
-        folder: folder for checkpoints.
         group: the processes that train together; the first one writes checkpoints.
-        constraint: what holds of the weights after each step.
     """
 
     def __init__(

@@ -25,7 +25,6 @@ class Pair:
     """A block of the student, and the teacher's that it is compared with.
 
     Args:
-        stack: stack of both.
         numbers: numbers of the blocks in it, the student's and the teacher's.
     """
 
@@ -61,7 +60,7 @@ def teacher_blocks(count: int, of: int, kept: Sequence[int] | None = None) -> li
     layers so: ``g(m) = m N / M``).
 
     Args:
-        count: count of the student's blocks.
+        count: number of the student's blocks.
         of: number of the teacher's blocks.
         kept: indices of the teacher's blocks that the student's are, if known.
 

@@ -28,7 +28,6 @@ class Objective:
         judged: what of it says how good the student is on rows that it has not seen; all of it when None.
         along: name -> module that is trained along, and no part of the student.
         about: what else is to be known of the training, as JSON values.
-        constraint: what holds of the weights after each step.
         expert: the same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
         unroll: how far the training goes back in time, where the student keeps values; ``loss`` then takes stretches
             of episodes instead of rows.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,8 @@ from vlatool.training.loop import Draw, Trainer
 from vlatool.training.objective import Objective
 from vlatool.training.stage import TrainingStage
 from vlatool.training.torchrun import check_shared, current_launch, open_store
+from vlatool.user_code.children import OnProgress
 
-OnProgress = Callable[[str, float | None], None]
 FILE_SYSTEM_TIMEOUT_S = 120.0
 """Seconds until a shared file system must show what the first process wrote."""
 

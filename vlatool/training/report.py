@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from typing import Any
 
@@ -32,26 +32,35 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
     """
     training = json.loads(made.file(TRAINING).read_bytes())
     stage = str(made.manifest.made_by["stage"])
-    losses, steps = training["losses"], len(training["losses"])
     took = TRAINING_TIME.quantity(stage).measurement(seconds)
     row = Row(
         made.manifest.name,
         measurements=(took,),
-        raw={series.LOSSES.name(stage): losses},
+        raw={series.LOSSES.name(stage): training["losses"]},
         details={
             tables.ROUNDS.name(stage): [_round(round_) for round_ in training["rounds"]],
             tables.TEACHER.name(stage): [teacher_record(training)],
         },
     )
-    few = max(1, steps // 20)
-    first, last = sum(losses[:few]) / few, sum(losses[-few:]) / few
-    result = f"{training['loss']} {first:.4g} -> {last:.4g} in {steps} steps and {duration(seconds)}."
+    result = f"{course(training)} and {duration(seconds)}."
     report = Report(
         "training", f"{made.manifest.name}: {stage}", rows=(row,), command=command,
         summary=(*along_lines(training), result, *teacher_lines(training)),
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"), environment=fingerprint(),
     )  # fmt: skip
     write_reports(report, made.path / REPORTS)
+
+
+def course(training: Mapping[str, Any]) -> str:
+    """Say how the loss fell."""
+    first, last = _loss_ends(training["losses"])
+    return f"{training['loss']} {first:.4g} -> {last:.4g} in {len(training['losses'])} steps"
+
+
+def _loss_ends(losses: Sequence[float]) -> tuple[float, float]:
+    """Return the mean of the first, and of the last twentieth of the losses."""
+    few = max(1, len(losses) // 20)
+    return sum(losses[:few]) / few, sum(losses[-few:]) / few
 
 
 def along_lines(training: Mapping[str, Any]) -> tuple[str, ...]:
@@ -66,9 +75,7 @@ def along_lines(training: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _warning(training: Mapping[str, Any]) -> tuple[str, ...]:
     """Say whether a student that keeps values does worse along episodes than before, or than in its windows."""
-    about, losses = training["along"], training["losses"]
-    few = max(1, len(losses) // 20)
-    in_windows = sum(losses[-few:]) / few
+    about, (_, in_windows) = training["along"], _loss_ends(training["losses"])
     if about["after"] > about["before"]:
         worse = "it is further from its teacher than before the training"
     elif about["after"] > ADVICE_RATIO * in_windows:

@@ -15,9 +15,10 @@ from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, require
 from vlatool.module.batched_program import PATH, BatchedProgram, draw_noise
 from vlatool.module.origin import origin_of
+from vlatool.runtime.interface import Array
 from vlatool.stage.base import Context
 from vlatool.training.device import on_device
-from vlatool.training.frames import Array, Frames, begins_file, new_array
+from vlatool.training.frames import Frames, begins_file, new_array
 from vlatool.training.lanes import reset, side_by_side
 
 if TYPE_CHECKING:

@@ -13,8 +13,9 @@ import numpy as np
 from vlatool.data import BEGINS, Recording
 from vlatool.errors import DataError, require
 from vlatool.module.batched_program import BatchedProgram
+from vlatool.runtime.interface import Array
 from vlatool.training.device import on_device
-from vlatool.training.frames import Array, Frames
+from vlatool.training.frames import Frames
 from vlatool.training.lanes import Lanes, reset
 from vlatool.training.rounds import NOISE, tensors
 

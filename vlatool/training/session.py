@@ -58,7 +58,7 @@ class Plan:
         student_episodes: student episodes that the student plays at each pause.
         pauses: numbers of the steps before which it does.
         noise: what disturbs the actions in them, see ``EpisodesJob``.
-        first_seed: first seed of the first episode of each task; the others follow.
+        first_seed: seed of the first episode of each task; the others follow.
         patience: pauses in a row without an improvement after which training ends; 0 for never.
         accumulate: parts of a batch, computed one after the other.
         user_rows: rows that are taken from the function of the policy's that yields batches.
@@ -85,12 +85,7 @@ class Plan:
 
 
 class Session:
-    """Trains a student; its progress is stored in a folder, from which a killed run resumes.
-
-    Args:
-        plan: what is played when.
-        processes: other processes that train, too.
-    """
+    """Trains a student; its progress is stored in a folder, from which a killed run resumes."""
 
     def __init__(
         self,
@@ -183,7 +178,8 @@ class Session:
             self._write_round(0, about)
 
     def _train(self, end: int) -> None:
-        with self._processes.training(self._frames.count, len(self._frames), end):
+        job = {"rounds": self._frames.count, "rows": len(self._frames), "until": end}
+        with self._processes.calling("train", job):
             self._trainer.look(partial(self._objective.look, self._frames, self._expert.frames))
             self._trainer.train(end, self._draw, self._report)
             self._trainer.save()

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
 from vlatool.bundle.bundle import MANIFEST, REPORTS, Bundle
@@ -30,7 +29,7 @@ from vlatool.training.generalization_gap import gap_lines
 from vlatool.training.launcher import launch_processes
 from vlatool.training.loop import Settings, seconds_of
 from vlatool.training.objective import Objective
-from vlatool.training.report import along_lines, write_training_report
+from vlatool.training.report import along_lines, course, write_training_report
 from vlatool.training.rounds import scene_of
 from vlatool.training.session import Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
@@ -67,13 +66,15 @@ class TrainingStage(ModuleStage):
     )
     steps: int = Field(1500, ge=1, description="updates of the weights")
     batch: int = Field(256, ge=1, description="observations in an update")
-    learning_rate: float = Field(5e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
-    weight_decay: float = Field(0.01, ge=0, le=10, description="of AdamW")
+    learning_rate: float = Field(
+        5e-4, gt=0, le=1, description="peak learning rate, after warm-up and before cosine decay"
+    )
+    weight_decay: float = Field(0.01, ge=0, le=10, description="weight decay of AdamW")
     average: float = Field(0.995, ge=0, lt=1, description="decay of the moving average of the weights")
     episodes: int = Field(1200, ge=0, description="episodes that the teacher plays first, over all tasks")
     student_episodes: int = Field(300, ge=0, description="episodes that the student plays each time")
     every: int = Field(250, ge=1, description="steps between the student's episodes")
-    noise: float = Field(0.1, ge=0, le=1, description="disturbs the actions in these episodes: share of their spread")
+    noise: float = Field(0.1, ge=0, le=1, description="noise of actions in these episodes, relative to their spread")
     from_batches: int | None = Field(
         None, ge=0, description="rows from the function that policy.yaml names under training; 8192 where no episodes "
         "are played first, else none",
@@ -87,19 +88,19 @@ class TrainingStage(ModuleStage):
         None, ge=0, description="observations before each window that bring these values up to date, without "
         "gradients; all since the episode began unless given",
     )  # fmt: skip
-    seed: int = Field(0, ge=0, description="of batches and noise")
+    seed: int = Field(0, ge=0, description="random seed of batches and noise")
     precision: Literal["auto", "float32", "bfloat16"] = Field(
-        "auto", description="of matrix products in training; bfloat16 where the device has it"
+        "auto", description="precision of matrix products in training; auto: bfloat16 if the device has it"
     )
-    device: DeviceChoice = Field("auto", description="what computes: a GPU where torch finds one, else the processor")
-    threads: int = Field(0, ge=0, description="of torch, over all processes; all cores of this process when 0")
-    processes: int = Field(1, ge=1, le=64, description="that share each batch, and the threads")
+    device: DeviceChoice = Field("auto", description="device of the training; auto: a GPU if torch finds one")
+    threads: int = Field(0, ge=0, description="threads of torch, over all processes; all cores of this process when 0")
+    processes: int = Field(1, ge=1, le=64, description="processes that share each batch and the threads")
     shard: bool = Field(
         False, description="let each of several processes hold a part of weights, gradients and moments alone (FSDP2)"
     )
-    accumulate: int = Field(1, ge=1, description="parts of a batch that follow each other: less memory, the same loss")
+    accumulate: int = Field(1, ge=1, description="parts of a batch, run one by one: less memory, the same loss")
     patience: int = Field(
-        0, ge=0, description="stop when so many rounds in a row were no better (success, or held-out loss); 0 for never"
+        0, ge=0, description="stop after this many rounds without improvement (success, or held-out loss); 0 for never"
     )
 
     def inputs(self) -> tuple[Path, ...]:
@@ -221,16 +222,14 @@ class TrainingStage(ModuleStage):
     def summary(self, made: Bundle) -> tuple[str, ...]:
         """Return sentences on the training data and the losses."""
         training = json.loads(made.file(TRAINING).read_bytes())
-        losses, last = training["losses"], max(1, len(training["losses"]) // 20)
         seen = sum(round_["observations"] for round_ in training["rounds"])
-        first, end = np.mean(losses[:last]), np.mean(losses[-last:])
         played = ", ".join(
             f"{round_['actor']} {round_['successes'] / round_['episodes']:.1%} of {round_['episodes']}"
             for round_ in training["rounds"] if round_.get("episodes")
         )  # fmt: skip
         return (
             *along_lines(training),
-            f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
+            f"{course(training)} on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
             *gap_lines(training["rounds"]),
             *_hint_lines(training.get("hints", {})),

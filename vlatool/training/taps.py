@@ -40,11 +40,7 @@ class Form:
 
 
 class Taps:
-    """Records the outputs of blocks.
-
-    Args:
-        blocks: blocks of it.
-    """
+    """Records the outputs of blocks."""
 
     def __init__(self, program: BatchedProgram, blocks: Iterable[BlockName]) -> None:
         self.program = program

@@ -69,7 +69,6 @@ class Teacher:
     """A policy in torch that fits the student's.
 
     Args:
-        bundle: its source bundle.
         edits: what was done to its structure.
     """
 

@@ -50,7 +50,6 @@ class Launch:
     Args:
         rank, size: its number of all processes.
         local_rank, local_size: the same of those on its machine.
-        address, port: address and port of the store.
     """
 
     rank: int

@@ -5,7 +5,8 @@ The function is user code, as an environment is: it runs in a child process, whi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +21,17 @@ from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 from vlatool.training.frames import begins_file
 from vlatool.training.rounds import write_observations
-from vlatool.user_code.children import call
+from vlatool.user_code.children import OnProgress, call
 
 MODULE = "vlatool.training.user_batches"
 PRELOAD = ("numpy", MODULE)
 DEFAULT_ROWS = 8192
 """Default number of rows."""
 EPISODE = "episode"
-"""Of a batch whose rows are steps: the number of the episode of each; where it changes, the policy is reset."""
+"""Name of the episode numbers in a batch whose rows are steps; where the number changes, the policy is reset."""
 MAX_BATCH_ROWS = 256
 """Rows of a batch that the function is asked for, at most."""
 GUIDE = "docs/guides/your-own-policy.md shows one"
-OnProgress = Callable[[str, float | None], None]
 
 
 def requested_rows(asked: int | None, source: Bundle, plays: bool) -> int:
@@ -81,60 +81,52 @@ def write(job: Mapping[str, Any], tell: OnProgress) -> None:
     size = min(MAX_BATCH_ROWS, job["count"])
     batches = iterate_function(origin.training, origin.folder, {"seed": job["seed"], "size": size})
     encode = ObservationEncoder(source.manifest.spec, source)
-    rows = _Rows(batches, origin.training, encode, job["count"], size, tell, along=job["along"])
+    names = [*encode.names, *([EPISODE] if job["along"] else [])]
+    rows = _Rows(batches, origin.training, encode, job["count"], size, tell, names)
     write_observations(rows.encode, rows, Path(job["target"]))
     if job["along"]:
         np.save(begins_file(Path(job["target"])), np.diff(rows.episodes, prepend=rows.episodes[0] - 1) != 0)
 
 
+@dataclass
 class _Rows:
     """The rows of batches, one after the other.
 
     Args:
-        batches: what the function yields.
         function: its name, for messages.
-        encode: the policy's own.
-        count: rows in all.
         size: rows of a batch, at most.
-        along: whether batches also hold the number of the episode of each row.
+        names: what a batch holds: the inputs, and ``episode`` where it numbers the episode of each row.
     """
 
-    def __init__(
-        self,
-        batches: Iterator[Any],
-        function: str,
-        encode: ObservationEncoder,
-        count: int,
-        size: int,
-        tell: OnProgress,
-        *,
-        along: bool,
-    ) -> None:
-        self._batches, self._function, self._encode = batches, function, encode
-        self._count, self._size, self._tell = count, size, tell
-        self._row = ""
-        self._names = [*encode.names, *([EPISODE] if along else [])]
-        self.episodes: list[int] = []
+    batches: Iterator[Any]
+    function: str
+    encoder: ObservationEncoder
+    count: int
+    size: int
+    tell: OnProgress
+    names: Sequence[str]
+    episodes: list[int] = field(default_factory=list)
+    _row: str = ""
 
     def __len__(self) -> int:
-        return self._count
+        return self.count
 
     def __iter__(self) -> Iterator[Mapping[str, Any]]:
         done = 0
-        for number, batch in enumerate(self._batches, 1):
-            columns = self._columns(f"{number} of '{self._function}'", batch)
-            for row in range(min(len(next(iter(columns.values()))), self._count - done)):
-                self.episodes += [int(columns[EPISODE][row])] if EPISODE in self._names else []
-                self._row = f"Row {row} of batch {number} of '{self._function}'"
+        for number, batch in enumerate(self.batches, 1):
+            columns = self._columns(f"{number} of '{self.function}'", batch)
+            for row in range(min(len(next(iter(columns.values()))), self.count - done)):
+                self.episodes += [int(columns[EPISODE][row])] if EPISODE in self.names else []
+                self._row = f"Row {row} of batch {number} of '{self.function}'"
                 yield {name: column[row] for name, column in columns.items()}
                 done += 1
-            self._tell(f"{done} of {self._count} rows of {self._function}", done / self._count)
-            if done == self._count:
+            self.tell(f"{done} of {self.count} rows of {self.function}", done / self.count)
+            if done == self.count:
                 return
         if not done:
-            raise DataError(f"'{self._function}' yields nothing; wanted {self._count} rows.", f"let it yield; {GUIDE}")
+            raise DataError(f"'{self.function}' yields nothing; wanted {self.count} rows.", f"let it yield; {GUIDE}")
         raise DataError(
-            f"'{self._function}' ends after {done} rows; wanted {self._count}.",
+            f"'{self.function}' ends after {done} rows; wanted {self.count}.",
             f"let it go on, or take fewer: --from-batches {done}",
         )
 
@@ -145,14 +137,14 @@ class _Rows:
             DataError: when it is not what the policy takes.
         """
         try:
-            return self._encode(observation)
+            return self.encoder(observation)
         except DataError as error:
             raise DataError(f"{self._row}: {error.message}", error.fix) from error
 
     def _columns(self, name: str, batch: Any) -> dict[str, Any]:
         """Return the inputs of a batch, each with a row for each observation."""
-        takes = f"the policy takes {', '.join(self._encode.names)}."
-        if EPISODE in self._names and isinstance(batch, Mapping) and EPISODE not in batch:
+        takes = f"the policy takes {', '.join(self.encoder.names)}."
+        if EPISODE in self.names and isinstance(batch, Mapping) and EPISODE not in batch:
             raise DataError(
                 f"Batch {name} has no '{EPISODE}', and the policy keeps values from step to step: rows are steps of "
                 "episodes.",
@@ -162,10 +154,10 @@ class _Rows:
             raise DataError(
                 f"Batch {name} is a {type(batch).__name__}; it must be a mapping of names to arrays: {takes}", GUIDE
             )
-        if missing := [key for key in self._names if key not in batch]:
+        if missing := [key for key in self.names if key not in batch]:
             has = ", ".join(map(str, batch)) or "nothing"
             raise DataError(f"Batch {name} has no '{missing[0]}' (it has: {has}); {takes}", GUIDE)
-        columns = {key: _array(f"'{key}' in batch {name}", batch[key]) for key in self._names}
+        columns = {key: _array(f"'{key}' in batch {name}", batch[key]) for key in self.names}
         if EPISODE in columns and (columns[EPISODE].ndim != 1 or columns[EPISODE].dtype.kind not in "iu"):
             got = f"{columns[EPISODE].dtype} {list(columns[EPISODE].shape)}"
             raise DataError(f"'{EPISODE}' in batch {name} is {got}; wanted a whole number for each row.", GUIDE)
@@ -175,9 +167,9 @@ class _Rows:
             raise DataError(
                 f"Batch {name} has different numbers of rows: {sizes}.", "each input needs a row an observation"
             )
-        if not 1 <= (count := next(iter(rows.values()))) <= self._size:
+        if not 1 <= (count := next(iter(rows.values()))) <= self.size:
             raise DataError(
-                f"Batch {name} has {count} rows; allowed: 1 to {self._size}, the 'size' that it was asked for.",
+                f"Batch {name} has {count} rows; allowed: 1 to {self.size}, the 'size' that it was asked for.",
                 "yield batches of 'size' rows or fewer, and none that is empty",
             )
         return columns

@@ -1,1 +1,1 @@
-"""A user's code: whose may run, and the child processes that run it."""
+"""User code: whose may run, and the child processes that run it."""

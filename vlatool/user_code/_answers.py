@@ -18,7 +18,7 @@ from vlatool import errors
 from vlatool.errors import GraphError, InputError, MissingExtra, SourceError, VlatoolError
 from vlatool.files.json import parse_json
 from vlatool.files.limits import LIMITS_VARIABLE, limit
-from vlatool.files.printable import MAX_CHARACTERS, truncate
+from vlatool.files.printable import MAX_CHARACTERS, file_of, truncate
 from vlatool.machine.engine_calls import EngineCall, engine_crash
 from vlatool.machine.processes import signal_name
 
@@ -86,11 +86,21 @@ def _is_valid(line: Mapping[str, Any]) -> bool:
     return False
 
 
+def error_record(error: BaseException) -> dict[str, Any]:
+    """Return an error as ``result`` raises it again; nothing for what code of a user, or a bug, raised."""
+    if isinstance(error, VlatoolError):
+        return {"error": type(error).__name__, "message": str(error.message), "fix": str(error.fix)}
+    if isinstance(error, MemoryError):
+        return {"memory": True}
+    if isinstance(error, OSError) and error.errno in errno.errorcode and error.errno not in CONNECTION_ERRORS:
+        return {"errno": error.errno, "message": str(error.strerror), "file": file_of(error) or None}
+    return {}
+
+
 def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     """Return the result that an answer holds, or raise what it says that was raised.
 
     Args:
-        told: the answer.
         about: name of the code that the child runs.
         own: the child runs vlatool's code alone: what fails in it is a bug of vlatool.
 
@@ -151,7 +161,6 @@ def ending_error(status: bytes, about: str, last: ChildState) -> BaseException:
     Args:
         status: its exit code, as the server says it.
         about: name of the code that it ran.
-        last: what it did.
     """
     text = status.decode("ascii", "replace").strip()
     if not text.lstrip("-").isdigit():

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import errno
 import gc
 import importlib
 import json
@@ -24,14 +23,13 @@ from typing import IO, Any
 
 import psutil
 
-from vlatool.errors import VlatoolError
 from vlatool.files.limits import limit
-from vlatool.files.printable import file_of, message_of
+from vlatool.files.printable import message_of
 from vlatool.machine import engine_calls
 from vlatool.machine.processes import adopt_orphans, die_with_parent
 from vlatool.machine.watched_calls import note_calls_on
 from vlatool.user_code import trust
-from vlatool.user_code._answers import CONNECTION_ERRORS
+from vlatool.user_code._answers import error_record
 
 MAX_DESCRIPTORS = 4
 MAX_MESSAGE_BYTES = 1 << 16
@@ -187,23 +185,14 @@ def _answer(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
 
     try:
         return {"result": _function(request["call"])(request["job"], tell)}
-    except VlatoolError as error:
-        if os.environ.get("VLATOOL_DEBUG") and error.__cause__ is not None:
-            traceback.print_exc()
-        return {"error": type(error).__name__, "message": str(error.message), "fix": str(error.fix)}
-    except MemoryError:
-        return {"memory": True}
-    except OSError as error:
-        if error.errno not in errno.errorcode or error.errno in CONNECTION_ERRORS:
-            return _error_record(error)
-        return {"errno": error.errno, "message": str(error.strerror), "file": file_of(error) or None}
     except BaseException as error:  # the seam: a user's code may raise anything
-        return _error_record(error)
+        record = error_record(error)
+        if os.environ.get("VLATOOL_DEBUG") and (not record or ("error" in record and error.__cause__ is not None)):
+            traceback.print_exc()
+        return record or _raised_record(error)
 
 
-def _error_record(error: BaseException) -> dict[str, Any]:
-    if os.environ.get("VLATOOL_DEBUG"):
-        traceback.print_exc()
+def _raised_record(error: BaseException) -> dict[str, Any]:
     lines = message_of(error).strip().splitlines()
     told = {"raised": type(error).__name__, "message": lines[0] if lines else "", "ours": isinstance(error, Exception)}
     return {**told, "where": _bug_location(error) if isinstance(error, Exception) else ""}

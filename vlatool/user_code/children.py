@@ -31,6 +31,7 @@ from vlatool.machine.watched_calls import Page, new_page
 from vlatool.user_code import trust
 from vlatool.user_code._answers import ChildKilled as ChildKilled
 from vlatool.user_code._answers import ChildState, ending_error, plain, read
+from vlatool.user_code._answers import error_record as error_record
 from vlatool.user_code._answers import exit_error as exit_error
 from vlatool.user_code._answers import result as result
 from vlatool.user_code._child_output import BLOCK_BYTES, ChildOutput

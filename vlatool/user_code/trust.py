@@ -12,13 +12,14 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import hash_file
 from vlatool.errors import OutputError, SourceError, UsageError
+from vlatool.files.messages import from_json, to_json
 
 TRUST_VARIABLE = "VLATOOL_TRUST"
 SCHEMA = 1
@@ -62,22 +63,22 @@ def is_named(folder: Path) -> bool:
     return str(folder.resolve()) in _named
 
 
-def named_folders() -> list[list[Any]]:
+def named_folders() -> Any:
     """Return what was named, as JSON values for a child process."""
-    return [list(astuple(folder)) for folder in _named.values()]
+    return to_json([*_named.values()])
 
 
-def restore(named: Sequence[Sequence[Any]]) -> None:
+def restore(named: Any) -> None:
     """Take over the named folders of the parent process."""
     _named.clear()
-    _named.update({entry[0]: NamedFolder(*entry) for entry in named})
+    _named.update({each.folder: each for each in from_json(list[NamedFolder], named)})
 
 
 @contextlib.contextmanager
 def forget_named() -> Iterator[None]:
     """Begin a command: forget the folders that earlier commands of this process named."""
     before = named_folders()
-    restore(())
+    restore([])
     try:
         yield
     finally:

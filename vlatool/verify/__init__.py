@@ -1,4 +1,4 @@
-"""Comparison of a policy directory with the code that it was made from, and of the stages in which they differ."""
+"""Comparison of a policy directory with its original code, and the stage in which they differ."""
 
 from __future__ import annotations
 

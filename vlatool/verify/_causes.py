@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import VlatoolError
+from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import Policy
+from vlatool.verify._sample import Sample
 
-if TYPE_CHECKING:
-    from vlatool.verify._sample import Sample
-
-Array = NDArray[Any]
-Change = Callable[["Sample"], Mapping[str, Array]]
+Change = Callable[[Sample], Mapping[str, Array]]
 MAX_TRIED = 6
 """Observations on which a guess must make both equal."""
 MIN_FIT_VALUES = 16

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import NamedRecording, Recording, read_recording, recordings_of, synthetic_observations
 from vlatool.module.torch_policy import torch_policy
+from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import draw
+from vlatool.user_code.children import OnProgress
 from vlatool.verify._causes import causes
 from vlatool.verify._original import Original, as_fed
-from vlatool.verify._sample import Sample, error_of
-
-Array = NDArray[Any]
-MAX_ERROR = 1e9
+from vlatool.verify._sample import MAX_ERROR, Sample, error_of
 
 
-def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+def compare(job: Mapping[str, Any], tell: OnProgress) -> dict[str, Any]:
     """Run both on the observations of a job; return what was found, as JSON values."""
     bundle = Bundle.open(Path(job["bundle"]))
     seed, tolerance = int(job["seed"]), float(job["tolerance"])

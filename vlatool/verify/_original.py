@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError, VlatoolError
 from vlatool.files.printable import message_of
 from vlatool.module.factory import import_factory, map_user_exceptions
-
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
 
 
 class Original:
@@ -25,7 +23,6 @@ class Original:
     Args:
         factory: ``original.py:act`` or ``package.module:act``.
         folder: what a path counts from.
-        spec: spec of the policy that is compared.
     """
 
     def __init__(self, factory: str, folder: Path, spec: PolicySpec) -> None:

@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import Policy
 
-Array = NDArray[Any]
 MAX_ERROR = 1e9
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -188,22 +189,23 @@ class PathTranslation:
 
     def translate(self, value: object) -> object:
         """Return JSON values in which every text that is a path in a folder is that path on the other side."""
-        if isinstance(value, str):
-            inside = (there + value[len(here) :] for here, there in self._pairs if _is_in(value, here))
-            return next(inside, value)
-        if isinstance(value, dict):
-            return {key: self.translate(item) for key, item in value.items()}
-        return [self.translate(item) for item in value] if isinstance(value, list) else value
+        return _map_texts(value, self._translate_path)
+
+    def _translate_path(self, text: str) -> str:
+        return next((there + text[len(here) :] for here, there in self._pairs if _is_in(text, here)), text)
 
     def rewrite(self, value: object) -> object:
         """Return JSON values in which the paths are those of the other side wherever a text mentions them."""
-        if isinstance(value, str):
-            for here, there in self._pairs:
-                value = value.replace(here, there)
-            return value
-        if isinstance(value, dict):
-            return {key: self.rewrite(item) for key, item in value.items()}
-        return [self.rewrite(item) for item in value] if isinstance(value, list) else value
+        return _map_texts(value, lambda text: functools.reduce(lambda new, pair: new.replace(*pair), self._pairs, text))
+
+
+def _map_texts(value: object, change: Callable[[str], str]) -> object:
+    """Return JSON values with every text changed, but for the keys of mappings."""
+    if isinstance(value, str):
+        return change(value)
+    if isinstance(value, dict):
+        return {key: _map_texts(item, change) for key, item in value.items()}
+    return [_map_texts(item, change) for item in value] if isinstance(value, list) else value
 
 
 def _is_in(text: str, folder: str) -> bool:

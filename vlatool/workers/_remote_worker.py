@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import io
 import os
 import platform
@@ -15,15 +14,14 @@ from typing import Any
 
 from vlatool.errors import VlatoolError
 from vlatool.files.limits import LIMITS_VARIABLE
-from vlatool.files.messages import from_json, to_json
-from vlatool.files.printable import file_of
+from vlatool.files.messages import from_json
 from vlatool.machine.host import MAX_CPU_ISA, OLDER_MAX_CPU_ISA, architecture, versions
 from vlatool.machine.instruction_sets import openvino_set
 from vlatool.machine.processes import SINGLE
 from vlatool.machine.version import VERSION
 from vlatool.runtime.engine import identities
 from vlatool.user_code import trust
-from vlatool.user_code.children import Child, ChildKilled
+from vlatool.user_code.children import Child, ChildKilled, error_record
 from vlatool.workers import Work
 from vlatool.workers._file_transfer import IncomingParcel, Parcel, PathTranslation
 
@@ -52,7 +50,7 @@ class Order:
     last: str
     parcels: tuple[Parcel, ...]
     variables: Mapping[str, str]
-    translate: Any
+    named: Any
 
     @classmethod
     def of(cls, work: Work, parcels: Sequence[Parcel]) -> Order:
@@ -136,7 +134,7 @@ class RemoteWorker:
 
     def _call(self, function: str, request: Any) -> Any:
         if self._child is None:
-            trust.restore([[self._to_local.translate(value) for value in folder] for folder in self._order.translate])
+            trust.restore(self._to_local.translate(self._order.named))
             self._child = self._opened.enter_context(Child(self._order.about, self._order.preload))
         return self._child.call(function, request, lambda what, _share: self._said.append(what))
 
@@ -149,15 +147,4 @@ class RemoteWorker:
         """Return an error as ``vlatool.user_code.children.result`` reads it; ``lost`` where another worker may try."""
         if isinstance(error, ChildKilled | KeyboardInterrupt):
             return {"lost": getattr(error, "message", "its process was interrupted."), "fix": getattr(error, "fix", "")}
-        if isinstance(error, VlatoolError):
-            return {"error": type(error).__name__, "message": error.message, "fix": error.fix}
-        if isinstance(error, OSError) and error.errno in errno.errorcode:
-            return {"errno": error.errno, "message": str(error.strerror), "file": file_of(error) or None}
-        if isinstance(error, MemoryError):
-            return {"memory": True}
-        return {"raised": type(error).__name__, "message": str(error), "ours": True}
-
-
-def order_of(work: Work, parcels: Sequence[Parcel]) -> Any:
-    """Return the order for some work as JSON values."""
-    return to_json(Order.of(work, parcels))
+        return error_record(error) or {"raised": type(error).__name__, "message": str(error), "ours": True}

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import SourceError, TargetError, require, require_present
+from vlatool.files.messages import to_json
 from vlatool.files.printable import one_line
 from vlatool.user_code.children import result
 from vlatool.workers import Done, Note, OnProgress, Work, Workers
 from vlatool.workers._file_transfer import Parcel, blocks, parcel_of
-from vlatool.workers._remote_worker import RemoteWorker, order_of, this_machine
+from vlatool.workers._remote_worker import Order, RemoteWorker, this_machine
 
 ADDRESS = "RAY_ADDRESS"
 MAX_ATTEMPTS = 3
@@ -113,7 +114,7 @@ class _RayWorkers:
     def __init__(self, ray: Any, work: Work, most: int, tell: OnProgress, done: Done, note: Note) -> None:
         self._ray, self._work, self._tell, self._done, self._note = ray, work, tell, done, note
         self._parcels = [parcel_of(folder) for folder in work.folders]
-        self._order = order_of(work, self._parcels)
+        self._order = to_json(Order.of(work, self._parcels))
         self._sent: dict[int, list[Any]] = {}
         self._most = most
         self._waiting = deque(range(len(work.requests)))

@@ -1,1 +1,1 @@
-"""What a gate examines: one file for each claim, found by its name."""
+"""Claims of a gate: one file for each, found by its name."""

@@ -1,4 +1,4 @@
-"""What hardly varies, held against the baseline's and a margin."""
+"""Numbers that hardly vary between runs, held against the baseline's and a margin."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES, Decision, judge_jo
 from vlatool.stats.signed_rank import min_differences
 
 STATISTICS = ((LATENCY_RATIO, "medians"), (LATENCY_MEAN_RATIO, "means of ratios"))
-"""Statistics of the calls, and of the observations, each the median of its calls: the median and the mean."""
+"""Statistics of a process: the median of its calls, and the mean over its observations, each by its median."""
 MAX_PROCESSES = 1000
 """Number of processes beyond which it is not a useful advice that they would decide."""
 AGREE = CONFIRM - 1

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment, takes_not_finite
 from vlatool.errors import DataError, GraphError
-from vlatool.files.scratch import scratch_directory
-from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.quantize.calibration.activation_taps import SAMPLE_LABEL, ActivationTap, run_with_taps
+from vlatool.quantize.calibration.activation_taps import SAMPLE_LABEL, ValueTap, run_with_taps
 from vlatool.quantize.calibration.ranges import Statistics
 from vlatool.stage.base import Context
 
@@ -24,40 +23,32 @@ ValueNames = Mapping[str, Iterable[str]]
 """Graph name -> names of some of its values."""
 
 
-class _StatisticsTap(ActivationTap):
+class _StatisticsTap(ValueTap):
     """Updates the statistics of selected values."""
 
     def __init__(
-        self, graph: str, path: Path, scratch: Path, statistics: dict[str, Statistics], exempt: Collection[str],
+        self, graph: str, path: Path, copy: Path, statistics: dict[str, Statistics], exempt: Collection[str],
         drops_non_finite: bool
     ) -> None:  # fmt: skip
+        super().__init__(path, copy, statistics)
         self.graph, self.statistics, self._exempt, self._drops_non_finite = graph, statistics, exempt, drops_non_finite
-        super().__init__(path, scratch / f"{graph}.onnx", self._add_outputs)
 
-    def _add_outputs(self, graph: OnnxGraph) -> None:
-        known = graph.outputs.union(value.name for value in graph.graph.input)
-        graph.graph.output.extend(graph.onnx.ValueInfoProto(name=name) for name in self.statistics if name not in known)
-
-    def observe(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
-        """Update the statistics."""
-        for name, statistics in self.statistics.items():
-            array = np.asarray(feeds[name] if name in feeds else values[name])
-            if not np.isfinite(array).all():
-                if name in self._exempt:
-                    statistics.finite = False
-                    statistics.samples += 1
-                    continue
-                if self._drops_non_finite:
-                    statistics.finite = False
-                    statistics.add(np.where(np.isfinite(array), array, 0))
-                    continue
-                bad = int(np.size(array) - np.isfinite(array).sum())
-                raise DataError(
-                    f"{SAMPLE_LABEL} {self.sample} makes the tensor '{name}' of the graph '{self.graph}' not "
-                    f"finite ({bad} of {array.size} values).",
-                    "look at that sample and at the float32 policy; int8 cannot represent what float32 cannot",
-                )
+    def observe_value(self, name: str, array: NDArray[Any]) -> None:
+        """Update the statistics of a value."""
+        statistics, finite = self.statistics[name], np.isfinite(array)
+        statistics.finite = statistics.finite and bool(finite.all())
+        if finite.all():
             statistics.add(array)
+        elif name in self._exempt:
+            statistics.samples += 1
+        elif self._drops_non_finite:
+            statistics.add(np.where(finite, array, 0))
+        else:
+            raise DataError(
+                f"{SAMPLE_LABEL} {self.sample} makes the tensor '{name}' of the graph '{self.graph}' not "
+                f"finite ({int(array.size - finite.sum())} of {array.size} values).",
+                "look at that sample and at the float32 policy; int8 cannot represent what float32 cannot",
+            )
 
 
 def calibrate(
@@ -89,13 +80,11 @@ def calibrate(
     """
     statistics = {graph: {name: Statistics(channels) for name in names} for graph, names in values.items()}
     drops_non_finite = bool(takes_not_finite(bundle.manifest.spec))
-    with scratch_directory() as scratch:
-        files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in statistics}
-        taps = {
-            name: _StatisticsTap(name, file, scratch, statistics[name], (exempt or {}).get(name, ()), drops_non_finite)
-            for name, file in files.items()
-        }
-        run_with_taps(bundle, taps, observations, context, "calibrating on", numbers)
+
+    def tap(graph: str, file: Path, copy: Path) -> _StatisticsTap:
+        return _StatisticsTap(graph, file, copy, statistics[graph], (exempt or {}).get(graph, ()), drops_non_finite)
+
+    run_with_taps(bundle, statistics, tap, observations, context, "calibrating on", numbers)
     for graph, collected in statistics.items():
         unobserved = [name for name, of_value in collected.items() if not of_value.samples]
         if unobserved:

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment, observations_for, recorded_observations, takes_not_finite
-from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import read
 from vlatool.graph.layers import Layer
 from vlatool.graph.onnx_graph import OnnxGraph
-from vlatool.quantize.calibration.activation_taps import ActivationTap, run_with_taps
+from vlatool.quantize.calibration.activation_taps import ValueTap, run_with_taps
 from vlatool.stage.base import Context
 
 OBSERVATIONS = 64
@@ -26,24 +26,17 @@ MOVE_OPS = ("Reshape", "Transpose", "Flatten", "Squeeze", "Unsqueeze", "Identity
 """Operators through which an engine, or vlatool for it, may hoist a quantizer."""
 
 
-class _NonFiniteTap(ActivationTap):
+class _NonFiniteTap(ValueTap):
     """Records which of the selected values are not finite."""
 
     def __init__(self, path: Path, copy: Path, names: Iterable[str]) -> None:
+        super().__init__(path, copy, names)
         self.found: set[str] = set()
-        self._names = set(names)
-        super().__init__(path, copy, self._add_outputs)
 
-    def _add_outputs(self, graph: OnnxGraph) -> None:
-        known = graph.outputs.union(value.name for value in graph.graph.input)
-        graph.graph.output.extend(graph.onnx.ValueInfoProto(name=name) for name in sorted(self._names - known))
-
-    def observe(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
-        """Check the values that were finite so far."""
-        self.found |= {
-            name for name in self._names - self.found
-            if not np.isfinite(np.asarray(feeds[name] if name in feeds else values[name])).all()
-        }  # fmt: skip
+    def observe_value(self, name: str, array: NDArray[Any]) -> None:
+        """Check a value that was finite so far."""
+        if name not in self.found and not np.isfinite(array).all():
+            self.found.add(name)
 
 
 def finite_layers(bundle: Bundle, layers: Mapping[str, list[Layer]]) -> dict[str, list[Layer]]:
@@ -51,16 +44,11 @@ def finite_layers(bundle: Bundle, layers: Mapping[str, list[Layer]]) -> dict[str
     if not takes_not_finite(bundle.manifest.spec):
         return dict(layers)
     values = {name: _quantized_values(bundle, name, selected) for name, selected in layers.items()}
-    with scratch_directory() as scratch:
-        taps = {
-            name: _NonFiniteTap(
-                bundle.file(bundle.manifest.graphs[name].file),
-                scratch / f"{name}.onnx",
-                set().union(*of_layer.values()),
-            )
-            for name, of_layer in values.items()
-        }
-        run_with_taps(bundle, taps, _moments(bundle), Context(), "looking for NaN in")
+
+    def tap(graph: str, file: Path, copy: Path) -> _NonFiniteTap:
+        return _NonFiniteTap(file, copy, set().union(*values[graph].values()))
+
+    taps = run_with_taps(bundle, values, tap, _moments(bundle), Context(), "looking for NaN in")
     return {
         name: [layer for layer in selected if taps[name].found.isdisjoint(values[name][layer.name])]
         for name, selected in layers.items()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
+
 Method = Literal["minmax", "percentile", "entropy", "mse"]
 
 BINS = 4096

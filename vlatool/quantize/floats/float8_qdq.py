@@ -6,13 +6,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
 from vlatool.graph.layers import Layer, Style
 from vlatool.graph.qdq import QdqWriter, channel_peaks
-
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
 
 FLOAT8_MAX = 448.0
 """Largest E4M3FN number: 1.75 x 2^8. The type has no infinity; larger values must be clipped, or they become NaN."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment
-from vlatool.files.scratch import scratch_directory
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize.calibration.activation_taps import ActivationTap, run_with_taps
 from vlatool.stage.base import Context
@@ -39,10 +38,9 @@ class _PeakTap(ActivationTap):
     def __init__(self, path: Path, copy: Path, limit: float) -> None:
         self.overflows: dict[str, Overflow] = {}
         self._limit = limit
-        self._names: list[str] = []
-        super().__init__(path, copy, self._add_peaks)
+        super().__init__(path, copy)
 
-    def _add_peaks(self, graph: OnnxGraph) -> None:
+    def add_outputs(self, graph: OnnxGraph) -> None:
         """Add the largest finite magnitude of each float32 value, as one output."""
         self._names = graph.float_values()
         peaks = [f"{PEAKS}.{number}" for number in range(len(self._names))]
@@ -87,8 +85,9 @@ def find_overflows(
     Raises:
         DataError: when an observation does not fit the spec; names the sample.
     """
-    files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in graphs}
-    with scratch_directory() as scratch:
-        taps = {graph: _PeakTap(file, scratch / f"{graph}.onnx", limit) for graph, file in files.items()}
-        run_with_taps(bundle, taps, observations, context, "looking for large values in")
+
+    def tap(_graph: str, file: Path, copy: Path) -> _PeakTap:
+        return _PeakTap(file, copy, limit)
+
+    taps = run_with_taps(bundle, graphs, tap, observations, context, "looking for large values in")
     return {graph: tap.overflows for graph, tap in taps.items()}

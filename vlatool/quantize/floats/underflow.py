@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment
-from vlatool.files.scratch import scratch_directory
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize.calibration.activation_taps import ActivationTap, run_with_taps
 from vlatool.quantize.floats.float16_graph import FLOAT16, FLOAT16_MAX, nodes_touching
@@ -59,12 +58,11 @@ class GraphSizes:
 class _SizesTap(ActivationTap):
     """Records the sizes of every value."""
 
-    def __init__(self, path: Path, copy: Path) -> None:
+    def __init__(self, _graph: str, path: Path, copy: Path) -> None:
         self.measured = GraphSizes()
-        self._names: list[str] = []
-        super().__init__(path, copy, self._add_sizes)
+        super().__init__(path, copy)
 
-    def _add_sizes(self, graph: OnnxGraph) -> None:
+    def add_outputs(self, graph: OnnxGraph) -> None:
         """Add one output: peak, mean square and error relative to the peak, and minimum of each float32 value."""
         self._names = graph.float_values()
         parts = [
@@ -123,10 +121,7 @@ def measure_sizes(
     Raises:
         DataError: when an observation does not fit the spec; names the sample.
     """
-    files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in graphs}
-    with scratch_directory() as scratch:
-        taps = {graph: _SizesTap(file, scratch / f"{graph}.onnx") for graph, file in files.items()}
-        run_with_taps(bundle, taps, observations, context, "looking for small values in")
+    taps = run_with_taps(bundle, graphs, _SizesTap, observations, context, "looking for small values in")
     return {graph: tap.measured for graph, tap in taps.items()}
 
 
@@ -138,7 +133,6 @@ def underflow_nodes(model: Any, sizes: GraphSizes, excluded: set[str], strict: b
     addend keeps a value from zero, the readers of that value are included until it is no longer small.
 
     Args:
-        sizes: Sizes of its values on recorded observations.
         excluded: Nodes that stay float32 in any case.
         strict: Whether every single element counts, instead of whole tensors.
     """

@@ -15,11 +15,10 @@ from collections.abc import Collection
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.graph.onnx_graph import OnnxGraph
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 ARITHMETIC = {"Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide}
 MAX_SCALE_RATIO = 4.0
 """Largest ratio of the scales of two channels: beyond it their weights would need different steps."""

@@ -26,7 +26,6 @@ class ConstantEdit:
     Args:
         node: First output of the node that reads it.
         position: Index of the constant among the inputs of the node.
-        axis: Axis of the channels.
         start: Index of the first channel on the axis.
         power: -1 to divide by the scale.
         width: Channels, for a constant that is one number for all of them.

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
 
 MIN_PEAK_SHARE = 1e-4
 """Smallest peak of a channel, as a share of the largest one: bounds the scale of a channel without calibration data."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.quantize.streamed._block_quantization import (
     BlockFormat,
@@ -15,8 +14,8 @@ from vlatool.quantize.streamed._block_quantization import (
     dequantize,
     quantize_planes,
 )
+from vlatool.runtime.interface import Array
 
-Array = NDArray[Any]
 DAMPING = 0.01
 AWQ_EXPONENTS = tuple(step / 10 for step in range(11))
 SEARCH_ROWS = 512

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from vlatool.runtime.interface import Array
+
 RANGE_FACTORS = (1.06, 0.97)
 """Candidates of the scale search, relative to the range of a block."""
 NEGLIGIBLE_RANGE = 1e-30
@@ -297,20 +297,24 @@ def squared_error(
 
 def pack_zero_points(zero: Array, form: BlockFormat) -> Array:
     """Pack zero points (rows, blocks) uint8 in ONNX Runtime's format: (rows, ceil(blocks * bits / 8)) uint8."""
-    if form.bits == 8:
-        return zero
-    even, odd = zero[:, 0::2], zero[:, 1::2]
-    if odd.shape[1] < even.shape[1]:
-        odd = np.pad(odd, ((0, 0), (0, 1)))
-    packed: Array = even | (odd << 4)
-    return packed
+    return zero if form.bits == 8 else pack_nibbles(zero)
 
 
 def unpack_zero_points(packed: Array, count: int, form: BlockFormat) -> Array:
     """Undo ``pack_zero_points``: (rows, count) uint8."""
-    if form.bits == 8:
-        return packed
-    return np.stack([packed & 15, packed >> 4], axis=2).reshape(len(packed), -1)[:, :count]
+    return packed if form.bits == 8 else unpack_nibbles(packed, count)
+
+
+def pack_nibbles(codes: Array) -> Array:
+    """Pack the low halves of bytes in pairs along the last axis, the first one low; an odd number ends in zero."""
+    packed: Array = codes[..., 0::2] & 15
+    packed[..., : codes.shape[-1] // 2] |= codes[..., 1::2] << 4
+    return packed
+
+
+def unpack_nibbles(packed: Array, count: int) -> Array:
+    """Undo ``pack_nibbles``: (..., count)."""
+    return np.stack([packed & 15, packed >> 4], axis=-1).reshape(*packed.shape[:-1], -1)[..., :count]
 
 
 def dequantize(stored: Array, scale: Array, zero: Array, form: BlockFormat) -> Array:

@@ -66,9 +66,7 @@ class Task:
     """Conversion of one stored tensor.
 
     Args:
-        source: Location of its bytes.
         kind: ``blocks`` (MatMulNBits), ``qdq`` or ``copy``.
-        pieces: Tensors of the result.
         rows, columns: Inputs (K) and outputs (N) of the layer, when it is quantized.
         output_first: Whether the weight is stored as (N, K).
         dtype: Type of the copy: ``F32``, ``F16`` or that of the source.

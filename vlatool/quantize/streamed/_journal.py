@@ -24,7 +24,6 @@ class Journal:
     all records before it are intact, too.
 
     Args:
-        directory: Work directory.
         plan: Identifier of everything that the bytes depend on.
     """
 

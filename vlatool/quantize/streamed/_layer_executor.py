@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import GraphError
 from vlatool.quantize.streamed._graph_rewrite import Product, is_weight_use, transposes_constant
@@ -15,9 +14,9 @@ from vlatool.quantize.streamed._weightless_export import GraphTemplate
 from vlatool.quantize.streamed.records import Tools
 from vlatool.quantize.streamed.tensor_jobs import as_float32, read_bytes
 from vlatool.runtime.engines import node_session
+from vlatool.runtime.interface import Array
 from vlatool.weights.shards import FLOATS
 
-Array = NDArray[Any]
 Values = dict[str, Array]
 Multiply = Callable[[Product, Array, Tools], Array]
 """Product, activations (rows, K) of all samples, tools -> products (rows, N)."""

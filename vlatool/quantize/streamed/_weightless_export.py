@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +25,6 @@ class GraphTemplate:
     Args:
         model: An ``onnx_ir.Model`` whose initializers have shapes and dtypes, and values only when they are small.
         tensors: Initializer -> location of its bytes.
-        opset: Opset of the default domain.
     """
 
     model: Any
@@ -92,7 +88,7 @@ def _template(
                 f"The value of the constant '{name}' is unknown: it was created during the export of the graph.",
                 "create it in the module's __init__ and register it as a buffer",
             )
-    with quiet_exporter(), _silenced_logger("onnx_ir"):
+    with quiet_exporter():
         onnxscript.optimizer.optimize_ir(model, input_size_limit=FOLD_LIMIT, output_size_limit=FOLD_LIMIT)
     name_by_module(model)
     strip_notes(model)
@@ -103,15 +99,3 @@ def _template(
         else:
             kept[name] = stored_array(name, value.const_value.numpy(), file)
     return GraphTemplate(model, kept, opset)
-
-
-@contextlib.contextmanager
-def _silenced_logger(name: str) -> Iterator[None]:
-    """Silence a logger that warns about every initializer whose value stays in a shard."""
-    logger = logging.getLogger(name)
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)

@@ -21,8 +21,8 @@ class WeightOptions(Quantization):
     symmetric: bool = Field(False, description="fix the zero point in the middle")
     search: bool = Field(True, description="4 bits, rtn and awq: try several ranges for each block")
     layout: Literal["ort", "qdq"] = Field("ort", description="MatMulNBits, or blocked DequantizeLinear (opset 21)")
-    accuracy_level: int = Field(4, ge=0, le=4, description="MatMulNBits: 4 lets activations be rounded to int8, 1 not")
-    embeddings: Literal["float16", "float32"] = Field("float16", description="how tables that are looked up are kept")
+    accuracy_level: int = Field(4, ge=0, le=4, description="MatMulNBits: 4 rounds activations to int8, 1 does not")
+    embeddings: Literal["float16", "float32"] = Field("float16", description="dtype of embedding tables")
     calibration: Path | None = Field(None, description="recorded observations for gptq and awq")
     map: tuple[str, ...] = Field((), description=MAP_HELP)
     samples: int = Field(

@@ -10,17 +10,15 @@ from __future__ import annotations
 import errno
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vlatool.errors import OutputError
 from vlatool.machine.host import cache_directory
 from vlatool.quantize.streamed._journal import DATA, Journal, hash_part
 from vlatool.quantize.streamed._prefetch import Prefetcher
 from vlatool.quantize.streamed.records import Record
+from vlatool.user_code.children import OnProgress
 from vlatool.weights.shards import Reader
-
-if TYPE_CHECKING:
-    from vlatool.stage.base import OnProgress
 
 COMMIT_BYTES = 1 << 28
 """Bytes after which data and journal are flushed to the disk."""
@@ -36,7 +34,6 @@ class RecordFile:
     """The finished file.
 
     Args:
-        bytes: Size of the file.
         notes: Figures that each record's ``fill`` returned.
         resumed: Number of records that an earlier run had finished.
     """

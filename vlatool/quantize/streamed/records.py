@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.quantize.streamed._block_quantization import Scratch
+from vlatool.runtime.interface import Array
 from vlatool.weights.shards import PAGE, Reader, open_direct
 
-Array = NDArray[Any]
 O_DIRECT = getattr(os, "O_DIRECT", 0)
 
 
@@ -26,8 +25,6 @@ class Tools:
     """Resources of one process, reused from record to record.
 
     Args:
-        reader: Reader of the stored weights.
-        scratch: Buffers of the arithmetic.
         buffer: Page-aligned memory for a record.
     """
 

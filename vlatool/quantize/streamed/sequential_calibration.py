@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
@@ -33,11 +32,11 @@ from vlatool.quantize.streamed.tensor_jobs import (
     store_parameters,
 )
 from vlatool.quantize.streamed.weights_plan import WeightsPlan
+from vlatool.runtime.interface import Array
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import draw
 from vlatool.stage.base import SampleSet
 
-Array = NDArray[Any]
 MAX_STATE_SIZE, STATE_SAMPLES = 4096, 1024
 """Largest number of elements of a state observation, and number of samples for such observations."""
 Sample = tuple[Mapping[str, Any], dict[str, Any]]

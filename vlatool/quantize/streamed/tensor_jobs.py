@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vlatool.errors import GraphError
 from vlatool.quantize.streamed._block_quantization import (
@@ -20,18 +19,20 @@ from vlatool.quantize.streamed._block_quantization import (
     ParameterChoice,
     Scratch,
     dequantize,
+    pack_nibbles,
     pack_zero_points,
     planes_from_bytes,
     planes_from_rows,
     quantize_planes,
     unpack,
+    unpack_nibbles,
     unpack_zero_points,
 )
 from vlatool.quantize.streamed._graph_rewrite import PART_BYTES, Piece, Task, stores_zeros
 from vlatool.quantize.streamed.records import Record, Tools, round_to_page
+from vlatool.runtime.interface import Array
 from vlatool.weights.shards import FLOATS, StoredTensor
 
-Array = NDArray[Any]
 READ_BYTES = 1 << 22
 CHUNK_ELEMENTS = 1 << 17
 """Elements computed at once: as many as fit into a core's cache."""
@@ -43,7 +44,6 @@ class Job:
     """Computation of one record, in plain values that can be sent to another process.
 
     Args:
-        form: Format of quantized weights.
         choose: Name in ``METHODS`` of the method that finds scales and zero points.
         tolerance: Largest relative L2 error of a quantized weight.
         first, count: Range of elements, for a tensor that is copied.
@@ -164,12 +164,7 @@ def _pack_linear(codes: Array, form: BlockFormat) -> Array:
     flat = np.ascontiguousarray(codes).reshape(-1)
     if form.symmetric:
         flat = (flat.astype(np.int16) - form.midpoint).astype(np.int8).view(np.uint8)
-    if form.bits == 8:
-        return flat
-    if len(flat) % 2:
-        flat = np.append(flat, np.uint8(0))
-    packed: Array = (flat[0::2] & 15) | (flat[1::2] << 4)
-    return packed
+    return flat if form.bits == 8 else pack_nibbles(flat)
 
 
 def _planes(task: Task, form: BlockFormat, tools: Tools, digest: Any) -> Iterator[tuple[Array, slice]]:
@@ -282,9 +277,7 @@ def dequantize_record(task: Task, data: Array, form: BlockFormat) -> Array:
 
 def _unpack_linear(stored: Array, count: int, form: BlockFormat) -> Array:
     """Undo ``_pack_linear``: unsigned codes, (count,) uint8."""
-    flat = stored
-    if form.bits == 4:
-        flat = np.stack([stored & 15, stored >> 4], axis=1).reshape(-1)[:count]
+    flat = stored if form.bits == 8 else unpack_nibbles(stored, count)
     if form.symmetric:
         flat = (flat + np.uint8(form.midpoint)) & np.uint8(form.levels)
     return flat

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -10,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.errors import RecipeError
 from vlatool.quantize.streamed._graph_rewrite import (
     PART_BYTES,
     GraphRewriter,
@@ -161,14 +160,7 @@ def _tensor_identity(graph: str, source: Any) -> tuple[str, ...]:
 def _selected_products(
     products: dict[str, list[Product]], stage: WeightOptions, bundle: Bundle
 ) -> dict[str, list[Product]]:
-    for pattern in stage.graphs:
-        if not fnmatch.filter(products, pattern):
-            raise RecipeError(
-                f"No graph matches '{pattern}'; {suggest(pattern, products)}.", fix_for(pattern, products)
-            )
-    graphs = {
-        name for name in products if not stage.graphs or any(fnmatch.fnmatch(name, glob) for glob in stage.graphs)
-    }
+    graphs = stage.matching_graphs(products)
     names = [product.node.name for name in sorted(graphs) for product in products[name]]
     selected = stage.select_nodes(names, bundle, ("MatMul", "Gemm"))
     return {

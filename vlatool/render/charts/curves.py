@@ -21,7 +21,6 @@ class Curve:
     """One variant under one disturbance.
 
     Args:
-        variant: Name of the variant.
         css: Class of its colour.
         points: Strength, and how often it succeeds then; in the order of strength.
     """
@@ -36,7 +35,6 @@ def curves(groups: Sequence[tuple[str, Sequence[Curve]]], title: str, width: int
 
     Args:
         groups: Disturbance -> the curves of the variants, the worst first.
-        title: Title of the drawing.
         width: Width in pixels.
     """
     columns = min(len(groups), 3 if width > 500 else 2)

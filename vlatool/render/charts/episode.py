@@ -21,7 +21,6 @@ class Played:
     """What one variant did in the episode.
 
     Args:
-        variant: Name of the variant.
         css: Class of its colour.
         series: ``position.x``, ``action.NAME`` (or ``action``) and ``fresh`` -> a number a step.
     """

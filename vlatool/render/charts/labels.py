@@ -91,7 +91,6 @@ def labels(marks: Sequence[Mark], frame: Box, taken: Sequence[Box], longest: flo
     """Return where the names of points stand, so that none covers another one, a point, or what is taken.
 
     Args:
-        marks: The points.
         frame: Pixels inside which labels stay: left, top, right, bottom.
         taken: Boxes of what else stands in the chart.
         longest: Pixels that a name may take.

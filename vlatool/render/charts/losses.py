@@ -42,7 +42,6 @@ def loss_curve(curve: Curve, key: str, width: int) -> Canvas:
     """Return the drawing of one training.
 
     Args:
-        curve: The curve to draw.
         key: Unique key in the page.
         width: Width in pixels.
     """

@@ -44,7 +44,6 @@ class Scatter:
 
     Args:
         key: Begins the ids of the drawing.
-        title: Title of the drawing.
         points: Points, at least two.
         across, up: Titles of the axes.
         spoken: The points in words.

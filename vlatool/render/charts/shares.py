@@ -16,7 +16,6 @@ class Share:
     """How often one variant succeeds.
 
     Args:
-        variant: Name of the variant.
         css: Class of its colour.
         value, low, high: Shares from 0 to 1; ends of the interval are None when they are not known.
         count: Episodes.
@@ -41,7 +40,6 @@ def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, 
 
     Args:
         groups: Title -> the shares of the variants, the worst first.
-        title: Title of the drawing.
         key: Unique key in the page.
         width: Width in pixels.
     """

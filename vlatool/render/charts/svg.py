@@ -97,8 +97,6 @@ class Canvas:
     Args:
         key: Unique key in the page; names the title and the description.
         width, height: Size in pixels, which may grow; the drawing scales down, and up to its width.
-        title: Title of the drawing.
-        description: Description of the drawing.
     """
 
     def __init__(self, key: str, width: int, height: int, title: str, description: str) -> None:

@@ -42,7 +42,6 @@ def disturbance_chart(report: Report, caption: str) -> Chart | None:
     """Return the drawing of what disturbances cost, None where none were played.
 
     Args:
-        report: The report.
         caption: How to read the dots of a single strength.
     """
     if found := _curves(report):

@@ -1,8 +1,8 @@
-"""Controllers and wrappers, one file each: what turns the chunks of a policy into one action for each control step.
+"""Controllers and wrappers, one file each, which turn the chunks of a policy into one action for each control step.
 
-The first parameter of an entry says what it wraps, ``policy`` or ``controller``. An entry with ``infer`` is a policy
-again, one with ``act`` a controller. A controller that acts while its policy infers takes ``delay`` as well: the
-control steps that an inference takes.
+The name of an entry's first parameter says what it wraps, ``policy`` or ``controller``. An entry with ``infer`` is
+itself a policy, one with ``act`` a controller. A controller that acts while its policy infers also takes ``delay``: the
+number of control steps that an inference takes.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ KIND, DEFAULT_PLAYER, PLAYER_WITH_DELAY = "control", "chunked", "late"
 
 
 def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
-    """Return the classes around a policy from the inside outwards: its wrappers, a player, wrappers of controllers.
+    """Return the classes around a policy, innermost first: policy wrappers, one player, controller wrappers.
 
     Args:
-        names: Entries of the kind ``control``; ``chunked``, or ``late``, is added where none of them plays the policy.
-        delayed: Whether the controller is to act while the policy infers.
+        names: Names of entries of the kind ``control``; ``chunked`` or ``late`` is added if none plays the policy.
+        delayed: Whether the controller should act while the policy infers.
 
     Raises:
-        UsageError: when a name is unknown, two of them play the policy, or the one that does cannot be delayed.
+        UsageError: when a name is unknown, two entries play the policy, or the player does not support a delay.
     """
     entries = {name: registry.load(KIND, name) for name in names}
     players = [name for name, entry in entries.items() if _layer(entry) == 1]
@@ -41,11 +41,11 @@ def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
 
 
 def build_controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) -> Controller:
-    """Return a controller that acts with a policy: ``chunked``, ``late`` where there is a delay, or what is named.
+    """Return a controller that acts with a policy: ``chunked``, ``late`` if there is a delay, or the named one.
 
     Args:
-        names: Entries of the kind ``control``, each around those before it; wrappers of policies are innermost.
-        delay: Control steps that an inference takes.
+        names: Names of entries of the kind ``control``, inner ones first; policy wrappers are always innermost.
+        delay: Number of control steps that an inference takes.
 
     Raises:
         UsageError: as ``layers`` does.
@@ -61,7 +61,7 @@ def build_controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) 
 
 
 def _layer(entry: type) -> int:
-    """Return 0 for a wrapper of policies, 1 for a player of a policy, 2 for a wrapper of controllers."""
+    """Return 0 for a policy wrapper, 1 for a player of a policy, 2 for a controller wrapper."""
     return hasattr(entry, "act") * (1 + (not _takes(entry, "policy")))
 
 

@@ -14,12 +14,13 @@ from vlatool.runtime.interface import Array, Policy
 
 
 class ChunkQueue:
-    """Gives one action for each control step and infers when the executed part of the chunk is used up.
+    """Returns one action for each control step, and infers when the part of the chunk to execute is used up.
 
-    Steps that overlap are refused: the actions of one chunk are one robot's. A reset waits for the step under way.
+    Overlapping steps are refused, because the actions of a chunk belong to one robot. A reset waits for a step in
+    progress.
 
     Args:
-        execute: Actions taken from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
+        execute: Number of actions to execute from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
 
     Raises:
         UsageError: when ``execute`` is not a whole number from 0.
@@ -31,7 +32,7 @@ class ChunkQueue:
         self.execute = execute or policy.spec.execute or policy.spec.chunk
         self.fresh = False
         """Whether the last action was the first of a chunk."""
-        self._turn = threading.RLock()  # a signal handler may strike between lock and owner
+        self._turn = threading.RLock()  # a signal may arrive between acquiring the lock and setting the owner
         self._owner = 0
         self._forget()
 
@@ -41,10 +42,10 @@ class ChunkQueue:
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step: (A,) float32, or a 0-d int64 index of a discrete action.
 
-        The observation is read only when a new chunk is needed. When the inference raises, the next step tries again.
+        The observation is used only if a new chunk is needed. If the inference raises, the next step tries again.
 
         Raises:
-            UsageError: when another step is under way.
+            UsageError: when another step is in progress.
             DataError, GraphError: as the policy's ``infer`` does.
         """
         if self._owner:
@@ -63,13 +64,13 @@ class ChunkQueue:
         return self._pending.pop(0)
 
     def reset(self, seed: int | None = None) -> None:
-        """Forget the pending actions and what the policy carries from step to step.
+        """Discard the pending actions and the values that the policy keeps from step to step.
 
         Args:
-            seed: Seed of the noise of the new episode; see ``Policy.reset``.
+            seed: Seed of the new episode's noise; see ``Policy.reset``.
 
         Raises:
-            UsageError: when this thread's own step is under way, or as ``Policy.reset`` does.
+            UsageError: when a step of this thread is in progress, or as ``Policy.reset`` does.
         """
         if self._owner == threading.get_ident():
             raise UsageError("The queue is reset within its own step (a signal handler?).", "reset between two steps")

@@ -1,4 +1,4 @@
-"""A controller that acts while its policy infers: actions arrive as late in the control loop as inferences take."""
+"""A controller that acts while its policy infers: each chunk arrives as late as its inference takes."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import Array, Policy
 
 STOPPABLE_MODES = ("delta", "velocity")
-"""Modes of an action in which 0 stands for no motion."""
+"""Action modes in which 0 means no motion."""
 
 
 class LateController(ChunkQueue):
-    """Acts as a robot does that goes on while its policy infers.
+    """Acts like a robot that keeps moving while its policy infers.
 
-    When the executed part of a chunk is used up, an inference begins with the observation of that step, and its chunk
-    is used from ``delay`` steps later on. The steps until then take what is left of the last chunk, and then hold: no
-    motion where the action is a delta or a velocity (the gripper keeps its command), the last action again otherwise.
-    As many actions of the new chunk are left out as were taken from the last one meanwhile. The first chunk is waited
-    for. ``act`` runs the inference itself and withholds the chunk, so that the actions depend on ``delay`` alone.
+    When the part of a chunk to execute is used up, an inference starts with the observation of that step, and its chunk
+    is used from ``delay`` steps later on. Until then, the steps use the rest of the last chunk, and after that they
+    hold: no motion if the action is a delta or a velocity (the gripper keeps its command), else the last action again.
+    The new chunk skips as many actions as were taken from the last one meanwhile. The controller waits for the first
+    chunk. ``act`` runs the inference itself and withholds the chunk, so that the actions depend only on ``delay``.
 
     Args:
-        execute: Actions taken from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
-        delay: Control steps that an inference takes: whole ones, for one that ends within its own step is in time.
+        execute: Number of actions to execute from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
+        delay: Number of whole control steps that an inference takes; 0 if it ends within the step in which it starts.
 
     Raises:
         UsageError: when ``execute`` or ``delay`` is not a whole number from 0.
@@ -67,7 +67,7 @@ class LateController(ChunkQueue):
 
 
 def hold(action: TensorSpec, last: Array | None) -> Array:
-    """Return what a robot does that has no action: it stops where an action can say so, and repeats the last otherwise.
+    """Return the action of a robot without a new one: no motion if the mode can express that, else the last action.
 
     Raises:
         ValueError: when there is no last action.
