@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from vlatool.data._calibration_checks import calibration_checks as calibration_checks
 from vlatool.data._halves import halves as halves
+from vlatool.data._inspection import Inspection as Inspection
+from vlatool.data._inspection import inspect_steps as inspect_steps
+from vlatool.data._inspection_page import inspection_lines as inspection_lines
+from vlatool.data._inspection_page import inspection_page as inspection_page
 from vlatool.data._not_finite import takes_not_finite as takes_not_finite
 from vlatool.data._not_finite import with_not_finite as with_not_finite
 from vlatool.data._observations import Observations as Observations
@@ -27,6 +31,9 @@ from vlatool.data._reader import reader_of as reader_of
 from vlatool.data._recording import Moment as Moment
 from vlatool.data._recording import Recording as Recording
 from vlatool.data._recording import build_recording as build_recording
+from vlatool.data._samples import sample_columns as sample_columns
+from vlatool.data._samples import sample_recording as sample_recording
+from vlatool.data._sampling import is_sample as is_sample
 from vlatool.data._sampling import sampled_rows as sampled_rows
 from vlatool.data._selections import PURPOSES as PURPOSES
 from vlatool.data._selections import calibration_recording as calibration_recording

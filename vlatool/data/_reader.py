@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from vlatool import registry
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data._recording import Recording
 from vlatool.errors import DataError, UsageError, suggest
 from vlatool.registry import Claim
+
+if TYPE_CHECKING:
+    from vlatool.data._steps import Steps
 
 MAP_HELP = (
     "NAME=RECORDED where a recording has another name for an input or the action; RECORDED may be a part or several "
@@ -70,6 +73,16 @@ class Reader:
     def claims(cls, path: Path) -> Claim:
         """Return how sure this reader is that it can read a path; by the suffix, unless a subclass checks more."""
         return Claim.CERTAIN if cls.suffix and path.name.endswith(cls.suffix) else Claim.NONE
+
+    def steps(self, path: Path) -> Steps:
+        """Return what a recording holds, without a spec: for ``vlatool data``.
+
+        Raises:
+            DataError: when it is corrupt, or the reader does not say.
+        """
+        raise DataError(
+            f"{path} cannot be read without a policy.", "name it where a policy is given: --data, --calibration"
+        )
 
     def open(self, path: Path, spec: PolicySpec, names: Mapping[str, str]) -> Recording:
         """Open a recording; large arrays stay on disk (``files.rows.Rows``) and are read row by row.

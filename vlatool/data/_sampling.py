@@ -21,6 +21,8 @@ CARRIED_SAMPLES = 512
 CARRIED_BYTES = 1 << 29
 """Samples of a dataset that a bundle carries, and their size, of which large pictures are fewer."""
 MIN_CARRIED = 32
+ARCHIVE_COMMENT = b"written by vlatool"
+"""Comment of the archive, by which a file may be replaced."""
 
 
 def sampled_rows(episodes: Array, count: int, tasks: Array | None = None) -> NDArray[np.intp]:
@@ -93,10 +95,10 @@ def rows_to_carry(recording: Recording, keeps: bool) -> NDArray[np.intp]:
     episodes = np.zeros(len(recording), np.int64) if recording.episodes is None else recording.episodes
     if keeps and recording.episodes is not None and count < len(recording):
         return sampled_episodes(episodes, count)
-    return sampled_rows(episodes, count, _tasks(recording))
+    return sampled_rows(episodes, count, task_numbers(recording))
 
 
-def _tasks(recording: Recording) -> Array | None:
+def task_numbers(recording: Recording) -> Array | None:
     """Return a number for each text that the first sample of an episode has; None where there is no text."""
     texts = [values for values in recording.inputs.values() if values.dtype.kind == "U"]
     if not texts or recording.episodes is None:
@@ -126,9 +128,19 @@ def save_arrays(arrays: Mapping[str, Values], path: Path) -> None:
         OSError: when the file cannot be written.
     """
     with zipfile.ZipFile(path, "w") as archive:
+        archive.comment = ARCHIVE_COMMENT
         for name, values in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
                 header = {"descr": values.dtype.str, "fortran_order": False, "shape": tuple(map(int, values.shape))}
                 np.lib.format.write_array_header_1_0(stream, header)
                 for _, block in blocks(values):
                     stream.write(np.ascontiguousarray(block).tobytes())
+
+
+def is_sample(path: Path) -> bool:
+    """Return whether a file was written by ``save_arrays``."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.comment == ARCHIVE_COMMENT
+    except (OSError, zipfile.BadZipFile):
+        return False

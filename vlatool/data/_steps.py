@@ -35,6 +35,7 @@ class Steps:
         action: Column of the actions, one for each row; empty where there is none.
         hz: Rate that the dataset names; 0 where it names none.
         tasks: (N,) number of the task of each row; None where the dataset names none.
+        stamps: Column -> (N,) seconds at which its values were taken, on the clock of ``times``, where they differ.
         notes: Sentences on what is unusual.
     """
 
@@ -45,7 +46,8 @@ class Steps:
     action: str = ""
     hz: float = 0.0
     tasks: Array | None = None
-    notes: tuple[str, ...] = field(default=())
+    stamps: Mapping[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse columns of different lengths, and none at all."""

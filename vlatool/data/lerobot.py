@@ -255,7 +255,7 @@ def _steps(layout: _Layout, where: _Episodes) -> Steps:
         result["task"] = text_rows(where.texts, tasks, f"'task' in {layout.path}")
     notes = tuple(f"'{name}' is a depth map in a video, which is not read" for name in layout.depth_maps())
     action = "action" if "action" in result else ""
-    return Steps(layout.path, result, episodes, times, action, layout.hz, tasks, notes)
+    return Steps(layout.path, result, episodes, times, action, layout.hz, tasks, notes=notes)
 
 
 def _joined(tables: list[Table], name: str) -> Array:

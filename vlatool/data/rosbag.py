@@ -70,7 +70,10 @@ class Rosbag(StepReader):
         times = np.concatenate([bag.times - bag.times[:1] for bag in bags])
         action = next((name for name in names if _topic_word(name) in ACTIONS), "")
         notes = tuple(dict.fromkeys(note for bag in bags for note in bag.notes))
-        return Steps(path, columns, np.repeat(np.arange(len(bags)), lengths), times, action, notes=notes)
+        stamps = {name: np.concatenate([bag.stamps[name] - bag.times[:1] for bag in bags]) for name in bags[0].stamps
+                  if all(name in bag.stamps for bag in bags)}  # fmt: skip
+        episodes = np.repeat(np.arange(len(bags)), lengths)
+        return Steps(path, columns, episodes, times, action, stamps=stamps, notes=notes)
 
 
 def _topic_word(name: str) -> str:
@@ -167,6 +170,7 @@ class _Read:
 
     times: Array
     columns: Mapping[str, Values]
+    stamps: Mapping[str, Array]
     notes: tuple[str, ...]
 
 
@@ -245,7 +249,8 @@ def _resample(path: Path, series: Mapping[str, _Series]) -> _Read:
     columns |= {name: _column(path, name, one, np.zeros(int(usable.sum()), np.intp)) for name, one in once.items()}
     left_out = int((~usable).sum())
     note = f"{path}: {left_out} of {len(times)} steps are left out: a topic has no message within {MAX_AGE_S} s"
-    return _Read(times[usable], columns, (note,) if left_out else ())
+    stamps = {name: np.array(one.stamps)[nearest[name][usable]] for name, one in used.items()}
+    return _Read(times[usable], columns, stamps, (note,) if left_out else ())
 
 
 def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
