@@ -72,6 +72,14 @@ def test_a_camera_whose_lag_changes_drifts(slope: float, constant: float, drifts
     assert bool(found) is drifts
 
 
+def test_columns_of_each_type_have_their_range():
+    columns = {kind: np.arange(COUNT).astype(kind) for kind in ("uint8", "int64", "float16", "bool")}
+    found = inspect_steps(steps(**columns, text=np.array(["go"] * COUNT), empty=np.full(COUNT, np.nan)), "made")
+    ends = {each.name: (each.low, each.high, each.not_finite) for each in found.columns}
+    assert ends["uint8"] == ends["int64"] == ends["float16"] == (0, COUNT - 1, 0)
+    assert (ends["bool"], ends["text"], ends["empty"]) == ((0, 1, 0), (None, None, 0), (None, None, COUNT))
+
+
 def test_a_short_episode_and_a_lack_of_actions_are_mentioned():
     episodes = np.repeat(np.arange(4), [13, 13, 13, 1])
     found = inspect_steps(replace(steps(), episodes=episodes, action="", times=None), "made")

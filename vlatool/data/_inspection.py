@@ -119,8 +119,8 @@ def _column(name: str, values: Values, steps: Steps, firsts: Array) -> Column:
     for _, block in blocks(values):
         finite = np.isfinite(block)
         wrong += int((~finite.reshape(len(block), -1).all(axis=1)).sum())
-        low = min(low, float(np.min(block, initial=np.inf, where=finite)))
-        high = max(high, float(np.max(block, initial=-np.inf, where=finite)))
+        if finite.any():
+            low, high = min(low, float(block[finite].min())), max(high, float(block[finite].max()))
         same &= (block == first).all(axis=0)
     constant = tuple(np.flatnonzero(same).tolist()) if same.ndim <= 1 else ()
     lowest, highest = (low, high) if low <= high else (None, None)

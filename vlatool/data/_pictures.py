@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import struct
+import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -21,7 +23,7 @@ PICTURE_MODES = ("L", "RGB", "RGBA", "I;16", "I", "F")
 """Modes of Pillow whose values are handed on; others become RGB."""
 LIBRARY_ERRORS = (
     OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, NotImplementedError, RuntimeError,
-    SyntaxError, OverflowError, EOFError, MemoryError, AssertionError, struct.error,
+    SyntaxError, OverflowError, EOFError, MemoryError, AssertionError, struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
 """What libraries raise on damaged files."""
 
