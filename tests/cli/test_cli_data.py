@@ -89,3 +89,23 @@ def test_samples_for_a_policy_have_its_names_and_chunks(tmp_path: Path, float_bu
     line = ("data", "sample", tmp_path / "all.npz", "-o", tmp_path / "some.npz", "--samples", 4)
     assert run(*line, "--policy", float_bundle.path, *pairs) == 0
     assert len(read_recording(tmp_path / "some.npz", spec)) == 4
+
+
+@pytest.fixture
+def renamed(tmp_path: Path, float_bundle) -> tuple[Path, list[str]]:
+    """The bundle's own recording under other names, and the options that say so."""
+    inputs = [tensor.name for tensor in float_bundle.manifest.spec.inputs]
+    with np.load(float_bundle.path / "data/calibration.npz") as arrays:
+        np.savez(tmp_path / "other.npz", **{f"rec.{name}" if name in inputs else name: arrays[name] for name in arrays})
+    return tmp_path / "other.npz", [word for name in inputs for word in ("--map", f"{name}=rec.{name}")]
+
+
+def test_quantize_and_evaluate_take_a_recording_with_other_names(tmp_path: Path, float_bundle, renamed):
+    path, pairs = renamed
+    line = ("quantize", "static-int8", float_bundle.path, "-o", tmp_path / "int8", "--calibration", path)
+    assert run(*line) == 3
+    assert not (tmp_path / "int8").exists()
+    assert run(*line, *pairs) == 0
+    assert run("evaluate", "recorded", float_bundle.path, "--data", path) == 3
+    assert run("evaluate", "recorded", float_bundle.path, "--data", path, *pairs) == 0
+    assert run("evaluate", "recorded", float_bundle.path, *pairs) == 2, "--map without a recording"

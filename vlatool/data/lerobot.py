@@ -236,9 +236,10 @@ def _episodes_v2(layout: _Layout) -> _Episodes:
 
 def _steps(layout: _Layout, where: _Episodes) -> Steps:
     pictures = {*layout.cameras("video"), *layout.cameras("image"), *layout.depth_maps()}
-    wanted = [*(name for name in layout.features if name not in pictures), *BOOKKEEPING]
+    values = [name for name in layout.features if name not in {*pictures, *BOOKKEEPING}]
+    wanted = [*values, "episode_index", "timestamp", *(["task_index"] if "task_index" in layout.features else [])]
     tables = [read_table(file, wanted) for file in where.files]
-    columns = {name: _joined(tables, name) for name in dict.fromkeys((*wanted, "episode_index", "timestamp"))}
+    columns = {name: _joined(tables, name) for name in wanted}
     episodes = columns["episode_index"].astype(np.int64)
     _check_counts(layout, episodes)
     times = columns["timestamp"].reshape(-1).astype(np.float64)
@@ -247,7 +248,7 @@ def _steps(layout: _Layout, where: _Episodes) -> Steps:
         result[camera] = _video_rows(layout, camera, where.clips[camera], episodes, times)
     for camera in layout.cameras("image"):
         result[camera] = _picture_rows(layout, camera, where.files, [table.rows for table in tables])
-    result |= {name: columns[name] for name in layout.features if name not in {*pictures, *BOOKKEEPING}}
+    result |= {name: columns[name] for name in values}
     tasks = columns["task_index"].reshape(-1).astype(np.int64) if "task_index" in layout.features else None
     if tasks is not None and where.texts:
         if tasks.min(initial=0) < 0 or tasks.max(initial=0) >= len(where.texts):
