@@ -72,7 +72,7 @@ def float_graph(graph: RandomGraph, folder: Path) -> Bundle:
     folder.mkdir(parents=True)
     onnx.save(graph.model, str(folder / "model.onnx"))
     np.savez(folder / "recording.npz", **graph.recording())
-    return run_transform(OnnxFile(model=folder / "model.onnx"), None, folder / "float", Context())
+    return run_transform(OnnxFile(model=folder / "model.onnx"), None, folder / "float", Context()).bundle
 
 
 def trial(graph: RandomGraph, source: Bundle, word: str) -> Outcome:
@@ -84,7 +84,7 @@ def trial(graph: RandomGraph, source: Bundle, word: str) -> Outcome:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            made = run_transform(stage_of(name, given), source, source.path.parent / word, Context())
+            made = run_transform(stage_of(name, given), source, source.path.parent / word, Context()).bundle
         errors = _drifts(graph, source, made)
     except VlatoolError as error:
         return Outcome("refused", words=f"{type(error).__name__}: {error.message}")

@@ -24,7 +24,7 @@ def quantized(float_bundle: Bundle, tmp_path: Path) -> Callable[..., Bundle]:
         out = tmp_path / f"quantized-{len(made)}"
         out.mkdir()
         made.append(out)
-        return stage.run(source or float_bundle, out, Context())
+        return stage.run(source or float_bundle, out, Context()).bundle
 
     return run
 

@@ -97,7 +97,7 @@ def bundle_of(folder: Path, kind: tuple[float, float] = GOOD) -> Bundle:
 
     def make(place: Path) -> None:
         policy = folder_of(place / "policy", kind)
-        source = run_transform(TorchModule(policy=policy), None, place / "module", Context())
+        source = run_transform(TorchModule(policy=policy), None, place / "module", Context()).bundle
         run_transform(ExportOnnx(), source, place / "bundle", Context())
 
     shutil.copytree(once(f"reach-{kind[0]}-{kind[1]}", make), folder, dirs_exist_ok=True)

@@ -207,10 +207,10 @@ def recurrent_bundle(folder: Path, kind: str, **options) -> Bundle:
     """Make the source bundle of such a policy."""
     policy = write_recurrent(folder, kind, **options)
     trust.allow(policy)
-    return run_transform(TorchModule(policy=policy), None, folder.parent / f"{folder.name}-source", Context())
+    return run_transform(TorchModule(policy=policy), None, folder.parent / f"{folder.name}-source", Context()).bundle
 
 
 def exported(folder: Path, kind: str, **options) -> Bundle:
     """Make the float32 bundle of such a policy."""
     source = recurrent_bundle(folder, kind, **options)
-    return run_transform(ExportOnnx(), source, folder.parent / f"{folder.name}-float", Context())
+    return run_transform(ExportOnnx(), source, folder.parent / f"{folder.name}-float", Context()).bundle

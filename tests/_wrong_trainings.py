@@ -90,7 +90,7 @@ class Workshop(Place):
     def source(self, *swaps: tuple[str, str, str], drop: tuple[str, ...] = ()) -> Path:
         """The bundle of a changed policy, as its factory makes it."""
         policy = TorchModule(policy=self.policy(*swaps, drop=drop))
-        return run_transform(policy, None, self.root / "source", Context()).path
+        return run_transform(policy, None, self.root / "source", Context()).bundle.path
 
     def unmade(self) -> Path:
         """A description that names no code."""
@@ -106,7 +106,7 @@ class Workshop(Place):
     def student(self, *swaps: tuple[str, str, str], drop: tuple[str, ...] = (), options: Line = ALONE) -> Line:
         """Distil a changed policy after it was pruned."""
         source = Bundle.open(self.source(*swaps, drop=drop))
-        pruned = run_transform(Neurons(ratio=0.7), source, self.root / "pruned", Context())
+        pruned = run_transform(Neurons(ratio=0.7), source, self.root / "pruned", Context()).bundle
         return self.line(*options, source=pruned.path, trust=self.root / "changed")
 
     def code(self, new: str, old: str = FORWARD) -> Line:

@@ -191,7 +191,7 @@ def pruned_once(source_bundle: Bundle) -> Bundle:
     from vlatool.prune.neurons import Neurons
 
     place = once(
-        "pruned", lambda folder: run_transform(Neurons(ratio=0.7), source_bundle, folder / "bundle", Context())
+        "pruned", lambda folder: run_transform(Neurons(ratio=0.7), source_bundle, folder / "bundle", Context()).bundle
     )
     return Bundle.open(place / "bundle")
 

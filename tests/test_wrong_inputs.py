@@ -152,7 +152,7 @@ class Workshop(Place):
     def changed_after(self) -> None:
         """The weights change between the source bundle and the export."""
         policy = self.policy()
-        source = run_transform(TorchModule(policy=policy), None, self.root / "source", Context())
+        source = run_transform(TorchModule(policy=policy), None, self.root / "source", Context()).bundle
         with (policy / "weights.safetensors").open("ab") as stream:
             stream.write(b"\0")
         run_transform(ExportOnnx(), source, self.out, Context())
@@ -505,7 +505,7 @@ DATA = [
     Row("unequal numbers of samples", "different numbers of samples", 3,
         lambda at: ["evaluate", at.float, "--data", at.recording(image=lambda values: values[:3])]),
     Row("no calibration data", "carries no calibration data", 3,
-        lambda at: lambda: run_transform(StaticInt8(), uncalibrated(at), at.out, Context()), called),
+        lambda at: lambda: run_transform(StaticInt8(), uncalibrated(at), at.out, Context()).bundle, called),
     Row("an observation that lacks an input", "The observation has no 'proprio'", 3,
         lambda at: lambda: at.infer(proprio=None), called),
     Row("an observation of the wrong shape", "has the shape [1, 4]; the policy takes [1, 3]", 3,

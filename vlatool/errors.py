@@ -155,8 +155,8 @@ class FallsShort(VlatoolError):
     exit_code = 5
 
 
-NOT_POSSIBLE = (3, 4, 5)
-"""Exit codes of errors that rule out one candidate; a search continues with the others."""
+NOT_POSSIBLE = (InputError, MissingExtra, Inconclusive, FallsShort)
+"""Errors that rule out one candidate; a search continues with the others."""
 
 
 def suggest(name: str, known: Iterable[str]) -> str:

@@ -130,7 +130,7 @@ def test_a_carried_count_with_odd_values_is_made_again(change: dict[str, Any], p
 def test_a_pruned_policy_does_not_take_the_count_of_the_whole_one(policy_dir: Path, tmp_path: Path) -> None:
     carry_count(str(policy_dir), Context())
     whole = open_bundle(str(policy_dir), Context())
-    pruned = run_transform(Neurons(ratio=0.5), whole, tmp_path / "pruned", Context())
+    pruned = run_transform(Neurons(ratio=0.5), whole, tmp_path / "pruned", Context()).bundle
     assert count_workload(pruned, Context()) == torch_workload(pruned)
     assert (
         count_workload(pruned, Context()).graphs["main"].weights

@@ -43,7 +43,7 @@ def test_counting_twice_gives_the_same(source_bundle: Bundle) -> None:
 
 def remade(policy: Path, out: Path) -> Bundle:
     out.mkdir()
-    return TorchModule(policy=policy).run(None, out, Context())
+    return TorchModule(policy=policy).run(None, out, Context()).bundle
 
 
 def test_code_that_changed_since_is_refused(policy_dir: Path, tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_the_weights_of_a_loop_count_once_and_are_read_in_each_turn(tmp_path: Pa
     (folder / "policy.yaml").write_text(LOOPED_YAML)
     source = remade(folder, tmp_path / "source")
     (tmp_path / "exported").mkdir()
-    for found in (torch_workload(source), workload(ExportOnnx().run(source, tmp_path / "exported", Context()))):
+    for found in (torch_workload(source), workload(ExportOnnx().run(source, tmp_path / "exported", Context()).bundle)):
         graph = found.graphs["main"]
         assert (graph.weights, graph.reads, graph.layers) == (36 + 3, 5 * 39, 10)
         assert work_of(graph).weights == 5 * 39, "a turn of the loop reads its weights again, which takes time"

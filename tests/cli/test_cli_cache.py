@@ -17,7 +17,7 @@ from vlatool.stage.run import cached_transform
 @pytest.fixture
 def cache(tmp_path: Path, float_bundle) -> Path:
     """A cache with one stage, which was used ten days ago."""
-    made = cached_transform(DynamicInt8(), float_bundle, tmp_path / "cache", Context())
+    made = cached_transform(DynamicInt8(), float_bundle, tmp_path / "cache", Context()).bundle
     release(made.path)
     then = made.path.stat().st_mtime - 10 * 86_400
     os.utime(made.path, (then, then))

@@ -17,9 +17,10 @@ from vlatool.quantize.calibration.activation_statistics import calibrate
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, SampleSet
+from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
 from vlatool.stage.finish import save_npz
+from vlatool.stage.record import SampleSet
 from vlatool.stage.run import run_transform
 
 QUICK = {"steps": 4, "batch": 16, "episodes": 6, "student_episodes": 2, "every": 2, "threads": 1}
@@ -93,9 +94,9 @@ def ranges_of(bundle: Bundle) -> dict[str, tuple[float, float]]:
 
 
 def trained(folder: Path, stage: str, tmp_path: Path) -> Bundle:
-    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context())
-    tuned = run_transform(build_stage(stage, QUICK), source, tmp_path / "tuned", Context())
-    return run_transform(build_stage("export.onnx", {}), tuned, tmp_path / "exported", Context())
+    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context()).bundle
+    tuned = run_transform(build_stage(stage, QUICK), source, tmp_path / "tuned", Context()).bundle
+    return run_transform(build_stage("export.onnx", {}), tuned, tmp_path / "exported", Context()).bundle
 
 
 def test_ranges_cover_what_the_training_saw_and_the_recording_did_not(tmp_path: Path):
@@ -109,7 +110,7 @@ def test_ranges_cover_what_the_training_saw_and_the_recording_did_not(tmp_path: 
     low, high = ranges_of(exported)[name]
     assert (low, high) == (pytest.approx(min(played.min(), 0)), pytest.approx(played.max()))
     assert high > 10 * np.abs(near).max(), "episodes go farther than what was recorded"
-    int8 = run_transform(StaticInt8(), exported, tmp_path / "int8", Context())
+    int8 = run_transform(StaticInt8(), exported, tmp_path / "int8", Context()).bundle
     assert int8.manifest.made_by["calibration"]["samples"] == 16 + MAX_PLAYED, "half of a recording is held out"
 
 
@@ -120,11 +121,11 @@ def test_an_input_may_be_called_as_it_likes_and_a_second_training_keeps_its_own(
         (folder / name).write_text(text.replace("name: state", "name: file").replace('"state"', '"file"')
                                    .replace("def forward(self, state)", "def forward(self, file)")
                                    .replace("(state)", "(file)").replace("state[", "file["))  # fmt: skip
-    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context())
-    once = run_transform(build_stage("quantize.qat", QUICK), source, tmp_path / "once", Context())
+    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context()).bundle
+    once = run_transform(build_stage("quantize.qat", QUICK), source, tmp_path / "once", Context()).bundle
     before = (once.path / OBSERVATIONS_FILE).read_bytes()
     other = {**QUICK, "first_seed": 2_000_000}
-    twice = run_transform(build_stage("quantize.qat", other), once, tmp_path / "twice", Context())
+    twice = run_transform(build_stage("quantize.qat", other), once, tmp_path / "twice", Context()).bundle
     assert [set(bundle) for bundle in played_observations(twice)[:1]] == [{"file"}]
     assert (once.path / OBSERVATIONS_FILE).read_bytes() == before != (twice.path / OBSERVATIONS_FILE).read_bytes()
 
@@ -132,7 +133,7 @@ def test_an_input_may_be_called_as_it_likes_and_a_second_training_keeps_its_own(
 def test_a_policy_without_recordings_calibrates_on_its_training(tmp_path: Path):
     exported = trained(folder_of(tmp_path / "policy"), "quantize.qat", tmp_path)
     StaticInt8().check(exported, None)
-    int8 = run_transform(StaticInt8(), exported, tmp_path / "int8", Context())
+    int8 = run_transform(StaticInt8(), exported, tmp_path / "int8", Context()).bundle
     assert int8.manifest.made_by["calibration"]["samples"] == MAX_PLAYED
     with pytest.raises(DataError, match="carries no calibration data") as told:
         run_transform(build_stage("quantize.smooth_quant", {}), exported, tmp_path / "smooth", Context())
@@ -140,8 +141,10 @@ def test_a_policy_without_recordings_calibrates_on_its_training(tmp_path: Path):
 
 
 def test_who_has_an_environment_alone_is_told_of_qat(tmp_path: Path):
-    source = run_transform(TorchModule(policy=folder_of(tmp_path / "policy")), None, tmp_path / "source", Context())
-    exported = run_transform(build_stage("export.onnx", {}), source, tmp_path / "exported", Context())
+    source = run_transform(
+        TorchModule(policy=folder_of(tmp_path / "policy")), None, tmp_path / "source", Context()
+    ).bundle
+    exported = run_transform(build_stage("export.onnx", {}), source, tmp_path / "exported", Context()).bundle
     with pytest.raises(DataError, match=r"^reach carries no calibration data") as told:
         StaticInt8().check(exported, None)
     assert told.value.fix.endswith(", or quantize.qat, which plays episodes")

@@ -46,7 +46,9 @@ def raise_killed() -> None:
 
 def distilled(source: Bundle, out: Path, context: Context | None = None, **options: Any) -> Bundle:
     """Distil for a few steps on recordings."""
-    return run_transform(build_stage("distill.policy", {**RECORDED, **options}), source, out, context or Context())
+    return run_transform(
+        build_stage("distill.policy", {**RECORDED, **options}), source, out, context or Context()
+    ).bundle
 
 
 def training_of(made: Bundle) -> dict[str, Any]:

@@ -64,8 +64,8 @@ def policy(folder: Path, *swaps: tuple[str, str], recorded: bool = False, plays:
 
 
 def pruned(folder: Path) -> Bundle:
-    source = run_transform(TorchModule(policy=folder), None, folder.parent / "source", Context())
-    return run_transform(Neurons(ratio=0.7), source, folder.parent / "pruned", Context())
+    source = run_transform(TorchModule(policy=folder), None, folder.parent / "source", Context()).bundle
+    return run_transform(Neurons(ratio=0.7), source, folder.parent / "pruned", Context()).bundle
 
 
 def test_rows_of_the_function_are_what_the_student_learns_from(policy_dir: Path, tmp_path: Path, source_bundle: Bundle):

@@ -57,7 +57,7 @@ def test_the_shares_of_the_gradient_are_told_everywhere(
     assert about["labels"] == {"used": 6, "recorded": 24}
     words = f"{100 * shares[0]:.0f} % in step 1, {100 * shares[1]:.0f} % in step 7, {100 * shares[2]:.0f} % in step 12"
     said = f"gradient from the teacher: {words} (alpha 0.5; 6 of 24 recorded observations with the expert's action)"
-    assert said in PolicyDistillation(alpha=0.5).lines(made)
+    assert said in PolicyDistillation(alpha=0.5).summarize(made)
     page, text = ((made.path / "reports" / name).read_text() for name in ("report.html", "report.md"))
     assert words in page.replace("&#39;", "'")
     assert words in text
@@ -66,7 +66,9 @@ def test_the_shares_of_the_gradient_are_told_everywhere(
 def test_without_an_expert_the_teacher_has_all_of_it(pruned_once: Bundle, tmp_path: Path):
     made = distilled(pruned_once, tmp_path / "out", steps=2)
     assert training_of(made)["teacher"] == {"alpha": 1.0, "gradient_share": 1.0}
-    assert "gradient from the teacher: 100 % (alpha 1, the loss has no other term)" in PolicyDistillation().lines(made)
+    assert "gradient from the teacher: 100 % (alpha 1, the loss has no other term)" in PolicyDistillation().summarize(
+        made
+    )
     assert "100 % (alpha 1" in (made.path / "reports/report.html").read_text()
 
 
@@ -80,7 +82,7 @@ def test_with_alpha_0_nobody_asks_the_teacher(pruned_once: Bundle, tmp_path: Pat
     assert training["teacher"] == {"alpha": 0.0, "gradient_share": 0.0, "labels": {"used": 20, "recorded": 20}}
     assert training["rounds"] == [{"step": 0, "actor": "expert", "observations": 20}]
     assert training["judged"]["scores"] == sorted(training["judged"]["scores"], reverse=True)
-    (line,) = (line for line in PolicyDistillation().lines(made) if "gradient" in line)
+    (line,) = (line for line in PolicyDistillation().summarize(made) if "gradient" in line)
     assert line.startswith("gradient from the teacher: 0 % (alpha 0, the teacher was not asked; 20 of 20 recorded")
 
 
@@ -131,7 +133,7 @@ def test_a_control_is_never_handed_out_silently(
     pruned_once: Bundle, policy_template: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     made = distilled(pruned_once, tmp_path / "out", control="noise", steps=2)
-    assert any(line.startswith("a control, not for a robot") for line in PolicyDistillation().lines(made))
+    assert any(line.startswith("a control, not for a robot") for line in PolicyDistillation().summarize(made))
     assert "a control, not for a robot" in (made.path / "reports/report.html").read_text()
     assert made.manifest.made_by["options"]["control"] == "noise"
     sentence = "a control, not for a robot: distill.policy was run with --control noise"
@@ -143,7 +145,7 @@ def test_a_control_is_never_handed_out_silently(
     with pytest.raises(SystemExit):
         main(["inspect", str(exported.path)])
     assert f"  CONTROL    {sentence}" in capsys.readouterr().out
-    assert controls(run_transform(ExportOnnx(), pruned_once, tmp_path / "other", Context())) == ()
+    assert controls(run_transform(ExportOnnx(), pruned_once, tmp_path / "other", Context()).bundle) == ()
 
 
 @pytest.mark.parametrize("options", [

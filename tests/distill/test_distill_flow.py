@@ -32,7 +32,7 @@ LONG = {"steps": 150, "batch": 32, "learning_rate": 0.01, "average": 0.9}
 
 
 def source_of(folder: Path, out: Path) -> Bundle:
-    return run_transform(TorchModule(policy=folder), None, out, Context())
+    return run_transform(TorchModule(policy=folder), None, out, Context()).bundle
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 @pytest.fixture(scope="module")
 def narrow(whole: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """Half of the neurons of its head; read only."""
-    return run_transform(Neurons(ratio=0.5), whole, tmp_path_factory.mktemp("narrow") / "out", Context())
+    return run_transform(Neurons(ratio=0.5), whole, tmp_path_factory.mktemp("narrow") / "out", Context()).bundle
 
 
 def programs(bundle: Bundle) -> BatchedProgram:
@@ -147,14 +147,14 @@ def test_what_is_held_out_is_judged_at_the_end_of_the_loop(narrow: Bundle, tmp_p
 
 
 def test_fewer_turns_than_the_teachers_cannot_be_compared(whole: Bundle, tmp_path: Path):
-    two = run_transform(Steps(to=2), whole, tmp_path / "two", Context())
+    two = run_transform(Steps(to=2), whole, tmp_path / "two", Context()).bundle
     with pytest.raises(RecipeError, match="its loop has 2 turns, the teacher's 4"):
         distilled(two, tmp_path / "out", targets="flow")
 
 
 def test_a_policy_without_a_loop_has_no_turns(tmp_path: Path):
     source = source_of(write_deep(tmp_path / "policy"), tmp_path / "source")
-    pruned = run_transform(Neurons(ratio=0.5), source, tmp_path / "pruned", Context())
+    pruned = run_transform(Neurons(ratio=0.5), source, tmp_path / "pruned", Context()).bundle
     with pytest.raises(RecipeError, match="repeats no graph: --targets flow compares turns"):
         distilled(pruned, tmp_path / "out", targets="flow")
 

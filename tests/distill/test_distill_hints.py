@@ -35,7 +35,7 @@ MANY = ("reshape(1, 4, 2)", "reshape(-1, 4, 2)")
 
 
 def source_of(folder: Path, out: Path) -> Bundle:
-    return run_transform(TorchModule(policy=folder), None, out, Context())
+    return run_transform(TorchModule(policy=folder), None, out, Context()).bundle
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shallow(place: Path) -> Bundle:
     """Two of four blocks; read only."""
     source = source_of(write_deep(place / "policy", MANY), place / "source")
-    return run_transform(Depth(keep=(0, 2)), source, place / "shallow", Context())
+    return run_transform(Depth(keep=(0, 2)), source, place / "shallow", Context()).bundle
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_they_pull_the_features_to_the_teachers(shallow: Bundle, tmp_path: Path)
     assert "hints" not in training_of(plain)
     names = load_modules(shallow)["main"].state_dict().keys()
     assert load_file(hinted.path / "module/main.safetensors").keys() == names
-    lines = build_stage("distill.policy", {}).lines(hinted)
+    lines = build_stage("distill.policy", {}).summarize(hinted)
     assert "features of blocks (student:teacher): main blocks 0:1 1:3" in lines
 
 
@@ -148,7 +148,7 @@ def test_a_student_with_fewer_heads_and_neurons_is_compared_too(batches: bool, t
     folder = write_deep(tmp_path / "policy", *([MANY] if batches else []), layers=2)
     narrow = run_transform(
         Structured(ratio=0.3, samples=2, multiple=1), source_of(folder, tmp_path / "s"), tmp_path / "n", Context()
-    )
+    ).bundle
     made = distilled(narrow, tmp_path / "out", **HINTS, steps=3)
     assert [each["blocks"] for each in training_of(made)["hints"].values()] == [
         [["main", "blocks", 0, 0], ["main", "blocks", 1, 1]]
@@ -220,7 +220,7 @@ def flow(place: Path, prefix: int = 2) -> Bundle:
 
 def test_blocks_that_run_in_each_step_of_a_flow_are_compared_where_both_take_as_many(tmp_path: Path):
     source = flow(tmp_path)
-    pruned = run_transform(Depth(keep=(0,), include=("acting",)), source, tmp_path / "pruned", Context())
+    pruned = run_transform(Depth(keep=(0,), include=("acting",)), source, tmp_path / "pruned", Context()).bundle
     made = distilled(pruned, tmp_path / "out", **HINTS, steps=3)
     features, attention = training_of(made)["hints"].values()
     assert features["blocks"] == [["head", "acting", 0, 1], ["prefix", "seeing", 0, 0], ["prefix", "seeing", 1, 1]]
@@ -228,7 +228,7 @@ def test_blocks_that_run_in_each_step_of_a_flow_are_compared_where_both_take_as_
     assert attention["left_out"] == [
         ["prefix", "seeing", "they give [1, 16] for one observation, where tokens are [1, tokens, width]"]
     ]
-    fewer = run_transform(Steps(to=1), source, tmp_path / "fewer", Context())
+    fewer = run_transform(Steps(to=1), source, tmp_path / "fewer", Context()).bundle
     made = distilled(fewer, tmp_path / "one", features=1.0, steps=3)
     features = training_of(made)["hints"]["features"]
     assert {stack for _, stack, *_ in features["blocks"]} == {"seeing"}
@@ -237,19 +237,19 @@ def test_blocks_that_run_in_each_step_of_a_flow_are_compared_where_both_take_as_
 
 def unlike(place: Path) -> Bundle:
     """A flow whose only stack runs four times in the teacher and once in the student."""
-    return run_transform(Steps(to=1), flow(place, prefix=1), place / "fewer", Context())
+    return run_transform(Steps(to=1), flow(place, prefix=1), place / "fewer", Context()).bundle
 
 
 def tiny(place: Path) -> Bundle:
     """A policy of one block."""
     source = source_of(write_deep(place / "p", layers=1), place / "s")
-    return run_transform(Neurons(ratio=0.7), source, place / "n", Context())
+    return run_transform(Neurons(ratio=0.7), source, place / "n", Context()).bundle
 
 
 def deep(place: Path, *swaps: tuple[str, str]) -> Bundle:
     return run_transform(
         Depth(keep=(0, 2)), source_of(write_deep(place / "p", *swaps), place / "s"), place / "d", Context()
-    )
+    ).bundle
 
 
 LOOP = "        return self.head(self.blocks(tokens).mean(1)).reshape(1, 4, 2)"

@@ -48,7 +48,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def pruned(source_bundle: Bundle, tmp_path: Path) -> Bundle:
-    return run_transform(Neurons(ratio=0.7), source_bundle, tmp_path / "pruned", Context())
+    return run_transform(Neurons(ratio=0.7), source_bundle, tmp_path / "pruned", Context()).bundle
 
 
 def error(bundle: Bundle, whole: Bundle) -> float:
@@ -59,7 +59,7 @@ def error(bundle: Bundle, whole: Bundle) -> float:
 
 def distilled(source: Bundle, out: Path, told: list[str] | None = None, **options: object) -> Bundle:
     context = Context() if told is None else Context(lambda what, _share: told.append(what))
-    return run_transform(build_stage("distill.policy", {**SHORT, **options}), source, out, context)
+    return run_transform(build_stage("distill.policy", {**SHORT, **options}), source, out, context).bundle
 
 
 def test_it_recovers_what_pruning_lost(pruned: Bundle, source_bundle: Bundle, tmp_path: Path):
@@ -83,11 +83,11 @@ def test_teacher_and_student_play_and_the_result_is_exported_and_made_again(
         (0, "teacher", 4), (5, "student", 2), (10, "student", 2),
     ]  # fmt: skip
     assert len(training["losses"]) == 12
-    first, second, *_ = PolicyDistillation(**SHORT).lines(made)
+    first, second, *_ = PolicyDistillation(**SHORT).summarize(made)
     assert first.startswith("l1 ")
     assert " in 12 steps on " in first
     assert second.startswith("episodes that succeeded, with noise: teacher ")
-    exported = run_transform(ExportOnnx(), made, tmp_path / "onnx", Context())
+    exported = run_transform(ExportOnnx(), made, tmp_path / "onnx", Context()).bundle
     assert load(exported.path).infer(recorded_observations(exported, 1)[0]).chunk.shape == (4, 2)
     assert rebuild(exported, Context(), source=str(policy_template), cache=tmp_path / "cache").identical
 
@@ -118,7 +118,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_weights(
             run_transform(stage, pruned, tmp_path / "out", Context())
         assert not (tmp_path / "out").exists()
         dies_at.pop(0)
-    made = run_transform(stage, pruned, tmp_path / "out", Context())
+    made = run_transform(stage, pruned, tmp_path / "out", Context()).bundle
     name = "module/main.safetensors"
     assert made.manifest.files[name].sha256 == whole.manifest.files[name].sha256
 
@@ -135,7 +135,7 @@ def test_a_loss_that_does_not_fit_is_refused(pruned: Bundle, tmp_path: Path, opt
 def test_a_teacher_that_does_something_else_is_refused(source_bundle: Bundle, policy_dir: Path, tmp_path: Path):
     text = (policy_dir / "policy.yaml").read_text()
     (policy_dir / "policy.yaml").write_text(text.replace("[dx, dy]", "[dy, dx]"))
-    other = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "other", Context())
+    other = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "other", Context()).bundle
     with pytest.raises(RecipeError, match="The teacher gives 'action' as "):
         distilled(source_bundle, tmp_path / "out", teacher=str(other.path))
     assert torch.get_num_threads() >= 1
@@ -149,9 +149,9 @@ def test_a_teacher_that_is_exported_is_refused(source_bundle: Bundle, float_bund
 def test_without_recordings_and_episodes_there_is_nothing_to_learn_from(policy_dir: Path, tmp_path: Path):
     (policy_dir / "calibration.npz").unlink()
     (policy_dir / "evaluation.npz").unlink(missing_ok=True)
-    source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
+    source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context()).bundle
     with pytest.raises(DataError, match="no observations to train on"):
-        distilled(run_transform(Neurons(), source, tmp_path / "pruned", Context()), tmp_path / "out", episodes=0)
+        distilled(run_transform(Neurons(), source, tmp_path / "pruned", Context()).bundle, tmp_path / "out", episodes=0)
 
 
 def test_a_policy_that_was_not_changed_has_no_teacher(source_bundle: Bundle, tmp_path: Path):
@@ -190,8 +190,8 @@ def changed_code(policy_dir: Path, old: str, new: str, place: Path) -> Bundle:
     code = (policy_dir / "policy.py").read_text()
     assert old in code
     (policy_dir / "policy.py").write_text(code.replace(old, new))
-    source = run_transform(TorchModule(policy=policy_dir), None, place / "source", Context())
-    return run_transform(Neurons(ratio=0.7), source, place / "pruned", Context())
+    source = run_transform(TorchModule(policy=policy_dir), None, place / "source", Context()).bundle
+    return run_transform(Neurons(ratio=0.7), source, place / "pruned", Context()).bundle
 
 
 def test_a_factory_that_gives_one_module_has_no_teacher(policy_dir: Path, tmp_path: Path):

@@ -80,8 +80,8 @@ def test_what_one_process_meets_ends_the_others(policy_dir: Path, tmp_path: Path
     )
     start = "        pixels = image"
     (policy_dir / "policy.py").write_text(code.replace(start, fails + start))
-    source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
-    pruned = run_transform(Neurons(ratio=0.7), source, tmp_path / "pruned", Context())
+    source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context()).bundle
+    pruned = run_transform(Neurons(ratio=0.7), source, tmp_path / "pruned", Context()).bundle
     with pytest.raises(SourceError, match="ValueError: not with me"):
         distilled(pruned, tmp_path / "out", processes=2)
     assert not psutil.wait_procs(peers(), timeout=10)[1], "none is left, and none waits to be reaped"

@@ -107,7 +107,7 @@ def test_the_report_compares_whole_episodes(learnt: tuple[Bundle, Bundle, Bundle
     assert about["after"] / scale == pytest.approx(apart(made, teacher), rel=0.5)
     said = f"l1 {about['before']:.4g} -> {about['after']:.4g} over 360 observations of 30 whole episodes"
     stage = build_stage("distill.policy", {})
-    assert any(line.startswith(said) for line in stage.lines(made))
+    assert any(line.startswith(said) for line in stage.summarize(made))
     assert read_report(made.path / "reports").summary[0].startswith(said)
 
 
@@ -128,11 +128,11 @@ def test_windows_that_begin_at_zero_lose_what_was_remembered_and_the_command_say
     forgetful = distilled(made, tmp_path / "out", **alone)
     assert apart(forgetful, teacher) > 2 * apart(made, teacher)
     stage = build_stage("distill.policy", {})
-    (said,) = [line for line in stage.lines(forgetful) if line.startswith("warning")]
+    (said,) = [line for line in stage.summarize(forgetful) if line.startswith("warning")]
     assert "over whole episodes it is further from its teacher than before the training" in said
     assert said.endswith("(--burn-in 0): leave --burn-in out")
     assert said in read_report(forgetful.path / "reports").summary
-    assert not [line for line in stage.lines(made) if line.startswith("warning")]
+    assert not [line for line in stage.summarize(made) if line.startswith("warning")]
 
 
 @pytest.mark.parametrize(("after", "in_windows", "more", "wanted"), [
@@ -263,7 +263,7 @@ def one_episode(place: Path) -> tuple[Bundle, dict[str, str]]:
         rows = recorded(3)
         np.savez(folder / "calibration.npz", **{**rows, "episode": np.zeros(len(rows["episode"]), int)})
         trust.allow(folder)
-        made.append(run_transform(TorchModule(policy=folder), None, place / f"{kind}-source", Context()))
+        made.append(run_transform(TorchModule(policy=folder), None, place / f"{kind}-source", Context()).bundle)
     return made[0], {"teacher": str(made[1].path)}
 
 
@@ -279,7 +279,7 @@ def test_a_student_that_keeps_nothing_learns_what_its_teacher_did_in_episodes(tm
 def test_qat_trains_along_episodes_and_calibrates_on_some(tmp_path: Path):
     source = recurrent_bundle(tmp_path / "delayed", "delayed", count=20)
     stage = build_stage("quantize.qat", {**FEW, "learning_rate": 1e-4})
-    made = run_transform(stage, source, tmp_path / "qat", Context())
+    made = run_transform(stage, source, tmp_path / "qat", Context()).bundle
     assert training_of(made)["along"]["after"] < 0.02
     with np.load(made.path / "data/played.npz") as played:
         assert len(played["target"]) == 120

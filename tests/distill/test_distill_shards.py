@@ -44,8 +44,8 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pruned_deep(policy: Path, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     place = tmp_path_factory.mktemp("pruned")
-    source = run_transform(TorchModule(policy=policy), None, place / "source", Context())
-    return run_transform(Neurons(ratio=0.5), source, place / "pruned", Context())
+    source = run_transform(TorchModule(policy=policy), None, place / "source", Context()).bundle
+    return run_transform(Neurons(ratio=0.5), source, place / "pruned", Context()).bundle
 
 
 def weights(made: Bundle) -> Mapping[str, Any]:

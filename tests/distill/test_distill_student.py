@@ -24,7 +24,8 @@ from vlatool.rebuild.rebuild import rebuild
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
-from vlatool.stage.run import first_steps, run_transform
+from vlatool.stage.chain import run_chain
+from vlatool.stage.run import run_transform
 from vlatool.training.supervision import parameters
 
 STUDENT = "depth=0.5,width=0.75"
@@ -100,7 +101,7 @@ def test_it_is_what_the_stages_make_one_by_one_and_is_made_again(deep: Path, tmp
 def test_its_size_is_told_beside_that_of_the_teacher(deep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     ran("distill", "policy", deep, "--student", STUDENT, "-o", tmp_path / "out", *flags())
     made = Bundle.open(tmp_path / "out")
-    whole = run_transform(TorchModule(policy=deep), None, tmp_path / "whole", Context())
+    whole = run_transform(TorchModule(policy=deep), None, tmp_path / "whole", Context()).bundle
     counted = {"student": parameters(load_modules(made)), "teacher": parameters(load_modules(whole))}
     assert training_of(made)["parameters"] == counted
     share = 100 * counted["student"] / counted["teacher"]
@@ -109,8 +110,8 @@ def test_its_size_is_told_beside_that_of_the_teacher(deep: Path, tmp_path: Path,
 
 
 def test_a_policy_that_was_edited_has_students_too(deep: Path, tmp_path: Path):
-    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context())
-    pruned = run_transform(Neurons(ratio=0.5), source, tmp_path / "pruned", Context())
+    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context()).bundle
+    pruned = run_transform(Neurons(ratio=0.5), source, tmp_path / "pruned", Context()).bundle
     ran("distill", "policy", pruned.path, "--student", "depth=0.5", "--trust", deep, "-o", tmp_path / "out", *flags())
     made = Bundle.open(tmp_path / "out")
     assert [entry["stage"] for entry in made.manifest.build][1:] == ["prune.neurons", "prune.depth", "distill.policy"]
@@ -137,20 +138,21 @@ def test_a_candidate_of_a_recipe_is_the_same(deep: Path, tmp_path: Path):
 
 
 def test_as_one_stage_it_is_refused_with_the_way_to_run_it(deep: Path, tmp_path: Path):
-    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context())
+    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context()).bundle
     stage = build_stage("distill.policy", {**SHORT, "student": STUDENT})
     with pytest.raises(RecipeError, match=r"is several stages: prune\.depth, prune\.structured, distill\.policy"):
         run_transform(stage, source, tmp_path / "out", Context())
     assert not (tmp_path / "out").exists()
-    last, pruned = first_steps(stage, source, tmp_path / "cache", Context())
-    assert run_transform(last, pruned, tmp_path / "out", Context()).manifest.made_by["stage"] == "distill.policy"
+    result, pruned = run_chain(stage, source, None, tmp_path / "out", tmp_path / "cache", Context())
+    made_by = [each.manifest.made_by["stage"] for each in (pruned, result.bundle)]
+    assert made_by == ["prune.structured", "distill.policy"]
 
 
 def test_wrong_options_are_refused_before_anything_is_pruned(deep: Path, tmp_path: Path):
-    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context())
+    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context()).bundle
     stage = build_stage("distill.policy", {**SHORT, "student": STUDENT, "loss": "hubert"})
     with pytest.raises(RecipeError, match="Unknown loss 'hubert'"):
-        first_steps(stage, source, tmp_path / "cache", Context())
+        run_chain(stage, source, None, tmp_path / "out", tmp_path / "cache", Context())
     assert not (tmp_path / "cache").exists()
 
 
@@ -162,7 +164,7 @@ def test_what_cannot_be_pruned_so_is_told_with_the_stage(
 ):
     stage = build_stage("distill.policy", {**SHORT, "student": student})
     with pytest.raises((RecipeError, FallsShort), match=says) as caught:
-        first_steps(stage, source_bundle, tmp_path / "cache", Context())
+        run_chain(stage, source_bundle, None, tmp_path / "out", tmp_path / "cache", Context())
     assert "distill.policy starts with prune." in caught.value.fix
     assert "run it first: vlatool prune " in caught.value.fix
 

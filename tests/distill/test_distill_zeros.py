@@ -30,7 +30,7 @@ def in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def sparse(source_bundle: Bundle, tmp_path: Path) -> Bundle:
-    return run_transform(Magnitude(pattern="2:4"), source_bundle, tmp_path / "sparse", Context())
+    return run_transform(Magnitude(pattern="2:4"), source_bundle, tmp_path / "sparse", Context()).bundle
 
 
 def layers(bundle: Bundle) -> dict[str, torch.Tensor]:
@@ -41,15 +41,15 @@ def layers(bundle: Bundle) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("options", [{}, {"accumulate": 2}, {"processes": 2, "threads": 2}])
 def test_zeros_of_two_of_four_stay(sparse: Bundle, tmp_path: Path, options: dict[str, int]):
     stage = build_stage("distill.policy", {**SHORT, **options})
-    made = run_transform(stage, sparse, tmp_path / "made", Context())
-    again = run_transform(stage, made, tmp_path / "again", Context())
+    made = run_transform(stage, sparse, tmp_path / "made", Context()).bundle
+    again = run_transform(stage, made, tmp_path / "again", Context()).bundle
     for before, after, last in zip(layers(sparse).values(), layers(made).values(), layers(again).values(), strict=True):
         assert not torch.equal(before, after), "the others learn"
         assert torch.equal(before == 0, after == 0)
         assert torch.equal(before == 0, last == 0)
     share = zero_share(made)
     assert share > 0.3
-    assert f"weights that pruning set to zero are still zero: {share:.1%} of all" in stage.lines(made)
+    assert f"weights that pruning set to zero are still zero: {share:.1%} of all" in stage.summarize(made)
 
 
 def test_quantization_aware_training_keeps_them(sparse: Bundle):

@@ -27,21 +27,21 @@ def tuned(source_bundle: Bundle, tmp_path: Path) -> Path:
 
 
 def test_the_weights_are_those_of_the_file(source_bundle: Bundle, tuned: Path, policy_template: Path, tmp_path: Path):
-    made = run_transform(Weights(file=tuned), source_bundle, tmp_path / "made", Context())
+    made = run_transform(Weights(file=tuned), source_bundle, tmp_path / "made", Context()).bundle
     old, new = load_modules(source_bundle)["main"].state_dict(), load_modules(made)["main"].state_dict()
     for name, value in old.items():
         torch.testing.assert_close(new[name], (value * 1.01).to(value.dtype))
     assert "tuned.safetensors sha256:" in made.manifest.made_by["options"]["file"]
-    exported = run_transform(ExportOnnx(), made, tmp_path / "exported", Context())
+    exported = run_transform(ExportOnnx(), made, tmp_path / "exported", Context()).bundle
     again = rebuild(exported, Context(), source=str(policy_template), files=(tuned,), cache=tmp_path / "cache")
     assert again.identical
 
 
 def test_another_file_is_another_bundle(source_bundle: Bundle, tuned: Path, tmp_path: Path):
-    first = run_transform(Weights(file=tuned), source_bundle, tmp_path / "one", Context())
+    first = run_transform(Weights(file=tuned), source_bundle, tmp_path / "one", Context()).bundle
     state = load_modules(first)["main"].state_dict()
     save_file({name: (value * 2).contiguous() for name, value in state.items()}, str(tuned))
-    assert run_transform(Weights(file=tuned), source_bundle, tmp_path / "two", Context()).hash != first.hash
+    assert run_transform(Weights(file=tuned), source_bundle, tmp_path / "two", Context()).bundle.hash != first.hash
 
 
 def test_what_does_not_fit_is_named(source_bundle: Bundle, tuned: Path, tmp_path: Path):

@@ -220,8 +220,8 @@ def make(task):
 def test_each_episode_has_noise_of_its_own_and_every_variant_the_same(tmp_path: Path):
     """The world is always the same: only the noise can make one episode succeed and another fail."""
     folder = write_flow(tmp_path / "flow")
-    source = run_transform(TorchModule(policy=folder), None, tmp_path / "module", Context())
-    bundle = run_transform(ExportOnnx(), source, tmp_path / "bundle", Context())
+    source = run_transform(TorchModule(policy=folder), None, tmp_path / "module", Context()).bundle
+    bundle = run_transform(ExportOnnx(), source, tmp_path / "bundle", Context()).bundle
     policy = load(bundle.path, seed=3)
     firsts = []
     for seed in range(8):

@@ -28,7 +28,7 @@ from vlatool.files.user_files import add_stamp, is_own_file
 from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.stage.cache import contents, prune
-from vlatool.stage.run import cached_measure
+from vlatool.stage.run import cached_measure, work_folder
 
 NOTED = """
     def reset(self, *, seed=None):
@@ -99,11 +99,12 @@ def interrupted_after(stage: ClosedLoop, bundle: Bundle, jobs: int) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        stage.run(bundle, Context(tell, unfinished=[]))
+        stage.run(bundle, Context(tell, work=str(work_folder(stage, bundle))))
 
 
 def run(stage: ClosedLoop, bundle: Bundle, told: list[str] | None = None) -> Report:
-    return stage.run(bundle, Context(lambda what, _: (told if told is not None else []).append(what), unfinished=[]))
+    said = [] if told is None else told
+    return stage.run(bundle, Context(lambda what, _: said.append(what), work=str(work_folder(stage, bundle))))
 
 
 def test_it_goes_on_where_it_was_to_the_same_rows(bundles, world, cache, played):

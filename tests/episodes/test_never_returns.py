@@ -157,12 +157,12 @@ def test_finished_episodes_are_taken_when_it_goes_on(tmp_path: Path, float_bundl
     folder = world(tmp_path / "world", "step()", f"os.path.exists({str(tmp_path / 'mended')!r}) or {SLEEPS}")
     jobs = [job(folder, (14, 15, 16, 17, 18)), job(folder, (16, 17), "push")]
     with Store.open(tmp_path / "store") as kept, pytest.raises(SourceError, match="at seed 17"):
-        run_jobs(float_bundle, jobs, "", Context(workers=workers, store=kept))
+        run_jobs(float_bundle, jobs, "", Context(workers=workers), store=kept)
     (tmp_path / "mended").touch()
     (folder.parent / "calls").unlink()
     again = [replace(each, timeout_s=30.0) for each in jobs]
     with Store.open(tmp_path / "store") as kept:
-        outcomes = run_jobs(float_bundle, again, "", Context(workers=workers, store=kept))
+        outcomes = run_jobs(float_bundle, again, "", Context(workers=workers), store=kept)
     seeds = [(outcome.task, outcome.seed) for outcome in outcomes]
     assert seeds == [*(("reach", seed) for seed in range(14, 19)), ("push", 16), ("push", 17)]
     played = [line.split()[2:] for line in (folder.parent / "calls").read_text().splitlines() if "reset()" in line]
@@ -180,9 +180,9 @@ def test_the_command_line_plays_on(tmp_path: Path, float_bundle: Bundle, monkeyp
     short = stage.model_copy(update={"environment_timeout": 1.0})
     assert short.key("x") == stage.key("x")
     with pytest.raises(SourceError, match="did not return within 1 s at seed 17"):
-        short.run(float_bundle, Context(unfinished=[]))
+        short.run(float_bundle, Context(work=str(tmp_path / "cache/streams/work")))
     (tmp_path / "mended").touch()
-    report = stage.run(float_bundle, Context(unfinished=[]))
+    report = stage.run(float_bundle, Context(work=str(tmp_path / "cache/streams/work")))
     assert any(note.startswith("2 of the 3 episodes are of an interrupted run") for note in report.warnings)
 
 

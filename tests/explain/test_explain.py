@@ -111,8 +111,8 @@ def fragile(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     (policy / "policy.py").write_text(POLICY_PY)
     np.savez(policy / "calibration.npz", **recording(24, 1))
     np.savez(policy / "evaluation.npz", **recording(16, 2))
-    source = run_transform(TorchModule(policy=policy), None, folder / "source", Context())
-    return run_transform(ExportOnnx(), source, folder / "float", Context())
+    source = run_transform(TorchModule(policy=policy), None, folder / "source", Context()).bundle
+    return run_transform(ExportOnnx(), source, folder / "float", Context()).bundle
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def made(fragile: Bundle, tmp_path_factory: pytest.TempPathFactory):
     def make(stage) -> Bundle:
         key = stage.key(fragile.hash)
         if key not in found:
-            found[key] = run_transform(stage, fragile, folder / key, Context())
+            found[key] = run_transform(stage, fragile, folder / key, Context()).bundle
         return found[key]
 
     return make
@@ -252,7 +252,7 @@ def test_where_openvino_is_confined_float32_is_compared_in_it_too(fragile, made,
 
 def test_attention_that_openvino_fuses_with_a_quantization_counts_as_computation(float_bundle, tmp_path):
     pytest.importorskip("openvino")
-    bundle = StaticInt8(samples=8, layout="openvino").run(float_bundle, tmp_path, Context())
+    bundle = StaticInt8(samples=8, layout="openvino").run(float_bundle, tmp_path, Context()).bundle
     names = {node.name for node in onnx.load(bundle.path / "graphs/main.onnx").graph.node}
     found = [each for each in profile(bundle, recorded_observations(float_bundle, 1), 3) if "Subgraph" in each.kind]
     assert any(each.product and each.precision == "float32" for each in found), "the products inside attention"

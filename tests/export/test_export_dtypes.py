@@ -102,14 +102,16 @@ def source(folder: Path, takes: str, members: dict[str, str], returns: str) -> B
     )
     for name in ("source", "exported", "int8"):
         (folder / name).mkdir()
-    return TorchModule(policy=folder).run(None, folder / "source", Context())
+    return TorchModule(policy=folder).run(None, folder / "source", Context()).bundle
 
 
 @pytest.mark.parametrize("case", [case for case in RIGHT if full() or case in SMALL])
 def test_what_is_exported_answers_as_the_policy_does(tmp_path: Path, case: str) -> None:
     policy = source(tmp_path, *RIGHT[case])
-    exported = ExportOnnx().run(policy, tmp_path / "exported", Context())
-    int8 = DynamicInt8().run(exported, tmp_path / "int8", Context()) if "nn.Linear" in str(RIGHT[case][1]) else None
+    exported = ExportOnnx().run(policy, tmp_path / "exported", Context()).bundle
+    int8 = (
+        DynamicInt8().run(exported, tmp_path / "int8", Context()).bundle if "nn.Linear" in str(RIGHT[case][1]) else None
+    )
     torch, graphs = torch_policy(policy, 0), load(exported.path, threads=1)
     allowed = COARSE.get(case, 0.03 if "bfloat16" in case else 1e-5)
     observations = random_observations(policy.manifest.spec, 24)

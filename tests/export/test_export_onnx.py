@@ -99,7 +99,7 @@ def source(tmp_path: Path) -> Callable[..., Bundle]:
         out.mkdir()
         (folder / "policy.py").write_text(code)
         (folder / "policy.yaml").write_text(description)
-        return TorchModule(policy=folder).run(None, out, Context())
+        return TorchModule(policy=folder).run(None, out, Context()).bundle
 
     return make
 
@@ -112,7 +112,7 @@ def plain(source) -> Callable[[str], Bundle]:
 
 def export(bundle: Bundle, out: Path, **options: object) -> Bundle:
     out.mkdir()
-    return ExportOnnx(**options).run(bundle, out, Context())
+    return ExportOnnx(**options).run(bundle, out, Context()).bundle
 
 
 def test_the_exported_policy_gives_what_torch_gives(source_bundle, float_bundle):
@@ -201,7 +201,7 @@ def test_large_weights_go_beside_the_graph(source_bundle, tmp_path: Path, monkey
 
 def test_weights_that_changed_since_the_source_was_made(policy_dir: Path, tmp_path: Path):
     (tmp_path / "source").mkdir()
-    bundle = TorchModule(policy=policy_dir).run(None, tmp_path / "source", Context())
+    bundle = TorchModule(policy=policy_dir).run(None, tmp_path / "source", Context()).bundle
     with (policy_dir / "weights.safetensors").open("r+b") as stream:
         stream.seek(-1, 2)
         stream.write(b"\x01")
@@ -351,7 +351,7 @@ def test_a_scalar_of_a_torch_policy_is_an_input_like_others(tmp_path: Path):
     bundles = {}
     for name, stage in (("s", TorchModule(policy=tmp_path)), ("e", ExportOnnx()), ("q", StaticInt8())):
         (tmp_path / name).mkdir()
-        bundles[name] = stage.run(next(reversed(bundles.values()), None), tmp_path / name, Context())
+        bundles[name] = stage.run(next(reversed(bundles.values()), None), tmp_path / name, Context()).bundle
     wide, narrow = (load(bundles[name].path, threads=1) for name in "eq")
     for rate in (1.25, np.float32(1.5), np.array([1.75])):
         observation = {"state": recorded["state"][0], "rate": rate}
@@ -382,13 +382,12 @@ def test_a_policy_in_another_float_is_exported_in_float32_and_told(tmp_path: Pat
     folders = [tmp_path / "source", tmp_path / "out"]
     for folder in folders:
         folder.mkdir()
-    source = TorchModule(policy=tmp_path).run(None, folders[0], Context())
-    context = Context()
-    exported = ExportOnnx().run(source, folders[1], context)
-    assert f"layers compute in {name}; the graph is converted to float32" in context.messages[0]
-    graph = onnx.load(exported.path / "graphs/main.onnx").graph
+    source = TorchModule(policy=tmp_path).run(None, folders[0], Context()).bundle
+    result = ExportOnnx().run(source, folders[1], Context())
+    assert f"layers compute in {name}; the graph is converted to float32" in result.messages[0]
+    graph = onnx.load(result.bundle.path / "graphs/main.onnx").graph
     assert {tensor.data_type for tensor in graph.initializer} == {1}
-    assert exported.manifest.graphs["main"].precision == {"float32": 1.0}
+    assert result.bundle.manifest.graphs["main"].precision == {"float32": 1.0}
 
 
 def test_the_error_of_a_tight_tolerance_names_the_number(source_bundle, tmp_path: Path):
@@ -476,8 +475,8 @@ def normalised(tmp_path_factory) -> Bundle:
     np.savez(folder / "calibration.npz", x=np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32))
     for name in ("source", "float"):
         (folder / name).mkdir()
-    source = TorchModule(policy=folder).run(None, folder / "source", Context())
-    return ExportOnnx().run(source, folder / "float", Context())
+    source = TorchModule(policy=folder).run(None, folder / "source", Context()).bundle
+    return ExportOnnx().run(source, folder / "float", Context()).bundle
 
 
 def test_a_layer_keeps_its_name_when_a_normalisation_is_folded_into_it(normalised):

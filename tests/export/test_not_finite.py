@@ -83,12 +83,12 @@ def source(folder: Path, body: str, description: str = YAML, **recorded: Any) ->
         np.savez(folder / "calibration.npz", **recorded)
     out = folder / "source"
     out.mkdir()
-    return TorchModule(policy=folder).run(None, out, Context())
+    return TorchModule(policy=folder).run(None, out, Context()).bundle
 
 
 def made(stage: Transform, bundle: Bundle, out: Path) -> Bundle:
     out.mkdir()
-    return stage.run(bundle, out, Context())
+    return stage.run(bundle, out, Context()).bundle
 
 
 def recording(samples: int = 24) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def test_a_normalised_state_with_infinity(tmp_path: Path):
     )
     (folder / "policy.yaml").write_text(description)
     (folder / "source").mkdir()
-    bundle = TorchModule(policy=folder).run(None, folder / "source", Context())
+    bundle = TorchModule(policy=folder).run(None, folder / "source", Context()).bundle
     exported = made(ExportOnnx(), bundle, tmp_path / "float")
     action = load(exported.path).infer({"depth": np.zeros((6, 6)), "state": [np.inf, np.nan, -np.inf]})
     assert np.isfinite(action.chunk).all()

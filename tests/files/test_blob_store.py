@@ -166,9 +166,9 @@ def recorded_policy(policy_dir: Path) -> Path:
 
 
 def chain(policy: Path, cache: Path) -> list[Bundle]:
-    source = cached_transform(TorchModule(policy=policy), None, cache, Context())
-    exported = cached_transform(ExportOnnx(samples=2), source, cache, Context())
-    return [source, exported, cached_transform(DynamicInt8(), exported, cache, Context())]
+    source = cached_transform(TorchModule(policy=policy), None, cache, Context()).bundle
+    exported = cached_transform(ExportOnnx(samples=2), source, cache, Context()).bundle
+    return [source, exported, cached_transform(DynamicInt8(), exported, cache, Context()).bundle]
 
 
 def test_the_stages_of_a_policy_share_its_recordings(recorded_policy: Path, cache: Path):
@@ -199,7 +199,7 @@ def test_a_recording_that_was_edited_in_the_cache_is_noticed_in_every_stage_and_
 
 def test_an_output_that_a_person_edits_leaves_the_cache_as_it_is(recorded_policy: Path, cache: Path, tmp_path: Path):
     _, exported, _ = chain(recorded_policy, cache)
-    out = run_transform(DynamicInt8(), exported, tmp_path / "out", Context())
+    out = run_transform(DynamicInt8(), exported, tmp_path / "out", Context()).bundle
     assert out.file("data/calibration.npz").stat().st_nlink == 1
     with out.file("data/calibration.npz").open("r+b") as stream:
         stream.write(b"edited")

@@ -74,12 +74,12 @@ def test_every_method_quantizes_them(tmp_path: Path, method: type) -> None:
     onnx.save(gemm(alpha=0.5, beta=2.0, transB=1), tmp_path / "p.onnx")
     for name in ("float", "int8"):
         (tmp_path / name).mkdir()
-    bundle = OnnxFile(model=tmp_path / "p.onnx").run(None, tmp_path / "float", Context())
+    bundle = OnnxFile(model=tmp_path / "p.onnx").run(None, tmp_path / "float", Context()).bundle
     options = {}
     if method is StaticInt8:
         np.savez(tmp_path / "c.npz", state=np.random.default_rng(0).normal(size=(64, 16)).astype("f4"))
         options["calibration"] = tmp_path / "c.npz"
-    made = method(**options).run(bundle, tmp_path / "int8", Context())
+    made = method(**options).run(bundle, tmp_path / "int8", Context()).bundle
     assert "float32" not in made.manifest.graphs["main"].precision
     load(made.path, threads=1)
 
@@ -98,6 +98,8 @@ def test_torchs_addmm_with_factors_is_a_layer(tmp_path: Path) -> None:
     )
     for name in ("source", "exported", "int8"):
         (tmp_path / name).mkdir()
-    source = TorchModule(policy=tmp_path).run(None, tmp_path / "source", Context())
-    exported = ExportOnnx().run(source, tmp_path / "exported", Context())
-    assert DynamicInt8().run(exported, tmp_path / "int8", Context()).manifest.graphs["main"].precision == {"int8": 1.0}
+    source = TorchModule(policy=tmp_path).run(None, tmp_path / "source", Context()).bundle
+    exported = ExportOnnx().run(source, tmp_path / "exported", Context()).bundle
+    assert DynamicInt8().run(exported, tmp_path / "int8", Context()).bundle.manifest.graphs["main"].precision == {
+        "int8": 1.0
+    }

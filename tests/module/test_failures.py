@@ -78,8 +78,8 @@ def export(tmp_path: Path) -> Export:
         )
         (folder / "policy.py").write_text(code)
         (folder / "policy.yaml").write_text(description)
-        source = TorchModule(policy=folder).run(None, tmp_path / "source", Context())
-        return ExportOnnx().run(source, out, Context())
+        source = TorchModule(policy=folder).run(None, tmp_path / "source", Context()).bundle
+        return ExportOnnx().run(source, out, Context()).bundle
 
     return run
 

@@ -69,7 +69,7 @@ def test_a_file_that_is_imported_by_its_name_counts_and_no_other(tmp_path: Path,
 
 def remade(policy: Path, out: Path) -> Bundle:
     out.mkdir()
-    return TorchModule(policy=policy).run(None, out, Context())
+    return TorchModule(policy=policy).run(None, out, Context()).bundle
 
 
 def test_the_environment_and_what_it_imports_are_code_too(policy_dir: Path, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def shards(tmp_path_factory) -> Path:
 
 def sourced(folder: Path, out: Path) -> Bundle:
     out.mkdir(parents=True)
-    return TorchModule(policy=folder).run(None, out, Context())
+    return TorchModule(policy=folder).run(None, out, Context()).bundle
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,9 @@ def whole(shards, tmp_path_factory) -> Bundle:
 
 @pytest.fixture(scope="module")
 def pruned(whole, tmp_path_factory) -> Bundle:
-    return run_transform(Depth(keep=KEPT, include=STACK), whole, tmp_path_factory.mktemp("pruned") / "out", Context())
+    return run_transform(
+        Depth(keep=KEPT, include=STACK), whole, tmp_path_factory.mktemp("pruned") / "out", Context()
+    ).bundle
 
 
 def action(bundle: Bundle, policy) -> np.ndarray:
@@ -91,7 +93,7 @@ def test_the_bundle_holds_the_edits_alone(pruned: Bundle):
     assert [name for name in pruned.manifest.files if name.startswith("module/")] == ["module/edits.json"]
     assert [edit.keep for edit in read_edits(pruned)] == [KEPT]
     assert takes_shards(pruned)
-    assert "stay in the shards" in Depth().lines(pruned)[0]
+    assert "stay in the shards" in stage.describe_modules(pruned)[0]
 
 
 def test_the_modules_are_those_that_are_made_in_memory(whole: Bundle, pruned: Bundle):
@@ -117,17 +119,17 @@ def test_what_is_exported_is_what_is_exported_from_memory(whole: Bundle, pruned:
     memory = stage.write_modules(whole, tmp_path / "memory", read_edits(pruned), modules, {"stage": "prune.depth"})
     assert holds_weights(memory)
     assert not takes_shards(memory)
-    one = run_transform(ExportOnnx(samples=1), memory, tmp_path / "one", Context())
+    one = run_transform(ExportOnnx(samples=1), memory, tmp_path / "one", Context()).bundle
     held = Held(monkeypatch)
     (tmp_path / "other").mkdir()
-    other = ExportOnnx(samples=1).run(pruned, tmp_path / "other", Context())
+    other = ExportOnnx(samples=1).run(pruned, tmp_path / "other", Context()).bundle
     assert held.now == 0
     np.testing.assert_array_equal(action(other, load(other.path)), action(one, load(one.path)))
 
 
 def test_weight_only_quantizes_the_blocks_that_are_kept(whole: Bundle, pruned: Bundle, tmp_path):
     def layers(bundle: Bundle, name: str) -> dict:
-        made = run_transform(WeightOnly(), bundle, tmp_path / name, Context())
+        made = run_transform(WeightOnly(), bundle, tmp_path / name, Context()).bundle
         assert action(made, load(made.path)).shape == (8, 7)
         return {each["layer"]: each for each in json.loads((made.path / LOSS_REPORT).read_text())["layers"]}
 
@@ -143,7 +145,7 @@ def test_a_choice_without_a_run_reads_nothing(whole: Bundle, tmp_path, monkeypat
     held = Held(monkeypatch)
     monkeypatch.setattr(stage, "MAX_RUN_BYTES", 0)
     (tmp_path / "even").mkdir()
-    made = Depth(rank="even", include=STACK).run(whole, tmp_path / "even", Context())
+    made = Depth(rank="even", include=STACK).run(whole, tmp_path / "even", Context()).bundle
     assert [edit.keep for edit in read_edits(made)] == [(0, 2, 4)]
     assert held.reads == 0
 
@@ -152,20 +154,20 @@ def test_cosine_from_shards_chooses_as_in_memory(whole: Bundle, tmp_path, monkey
     held = Held(monkeypatch)
     (tmp_path / "cosine").mkdir()
     ranked = Depth(rank="cosine", include=STACK, samples=2)
-    made = ranked.run(whole, tmp_path / "cosine", Context())
+    made = ranked.run(whole, tmp_path / "cosine", Context()).bundle
     assert 0 < held.most == LARGEST
     assert read_edits(made) == ranked.change(load_modules(whole), whole, Context()).edits
 
 
 @pytest.mark.parametrize("rank", ["error", "gate"])
 def test_weights_stay_in_shards_after_a_ranking_in_memory(whole: Bundle, tmp_path, rank):
-    made = run_transform(Depth(rank=rank, include=STACK, samples=2), whole, tmp_path / "out", Context())
+    made = run_transform(Depth(rank=rank, include=STACK, samples=2), whole, tmp_path / "out", Context()).bundle
     assert takes_shards(made)
     assert len(read_edits(made)[0].keep) == 3
 
 
 def test_blocks_go_twice(pruned: Bundle, whole: Bundle, tmp_path):
-    again = run_transform(Depth(keep=(1, 2), include=STACK), pruned, tmp_path / "out", Context())
+    again = run_transform(Depth(keep=(1, 2), include=STACK), pruned, tmp_path / "out", Context()).bundle
     wanted = dict(unedited_modules(whole)["main"].decoder.layers[4].named_parameters())
     got = dict(load_modules(again)["main"].decoder.layers[1].named_parameters())
     assert all(torch.equal(got[name], value) for name, value in wanted.items())
@@ -179,7 +181,7 @@ def test_other_weights_under_the_same_name_are_noticed(shards: Path, tmp_path):
     folder = Path(shutil.copytree(shards, tmp_path / "policy"))
     made = run_transform(
         Depth(keep=(0, 1), include=STACK), sourced(folder, tmp_path / "in"), tmp_path / "out", Context()
-    )
+    ).bundle
     first = sorted(folder.glob("*.safetensors"))[0]
     save_file({name: value + 1 for name, value in load_file(first).items()}, first)
     with pytest.raises(SourceError, match=r"have changed since .* was made"):
@@ -241,7 +243,7 @@ def odd(tmp_path) -> Bundle:
 
 def test_modules_of_every_kind_run_from_shards(odd: Bundle, tmp_path):
     run = Depth(rank="even", blocks=2, include=("first", "second"))
-    made = run_transform(run, odd, tmp_path / "out", Context())
+    made = run_transform(run, odd, tmp_path / "out", Context()).bundle
     assert [edit.keep for edit in read_edits(made)] == [(0, 3), (0, 3)]
     modules = stored_modules(made)
     with weights_on_demand(modules):
@@ -272,7 +274,7 @@ def test_a_stage_that_changes_weights_writes_them(pruned: Bundle, tmp_path):
                 modules["main"].head.weight.zero_()
             return stage.ModuleChanges()
 
-    made = Zeros().run(pruned, _new(tmp_path / "out"), Context())
+    made = Zeros().run(pruned, _new(tmp_path / "out"), Context()).bundle
     assert holds_weights(made)
     assert read_edits(made) == read_edits(pruned)
     assert not takes_shards(made)

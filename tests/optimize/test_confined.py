@@ -207,7 +207,7 @@ def evaluate(bundle: Path, *more: object) -> int:
 def test_what_evaluates_a_bundle_for_a_board_does_so_in_its_set(float_bundle, old_nuc, tmp_path: Path, capsys):
     pytest.importorskip("openvino")
     made = StaticInt8(samples=8, layout="openvino", reduce_range=True)
-    bundle = run_transform(made, float_bundle, tmp_path / "made", Context())
+    bundle = run_transform(made, float_bundle, tmp_path / "made", Context()).bundle
     for path, told in ((bundle.path, "AVX2"), (float_bundle.path, None)):
         assert evaluate(path, "--profile", old_nuc, "--json") == 0
         report = Report.from_json(capsys.readouterr().out)
@@ -221,7 +221,7 @@ def test_a_bundle_that_the_board_computes_otherwise_is_refused_when_it_is_evalua
     float_bundle, old_nuc, tmp_path: Path, capsys
 ):
     pytest.importorskip("openvino")
-    bundle = run_transform(StaticInt8(samples=8, layout="openvino"), float_bundle, tmp_path / "made", Context())
+    bundle = run_transform(StaticInt8(samples=8, layout="openvino"), float_bundle, tmp_path / "made", Context()).bundle
     assert evaluate(bundle.path) == 0
     assert evaluate(bundle.path, "--profile", old_nuc) == 3
     told = capsys.readouterr().err

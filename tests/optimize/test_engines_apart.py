@@ -10,7 +10,7 @@ from vlatool.machine.instruction_sets import compare_sets
 from vlatool.measures.latency import OPENVINO_FLOAT32_P50
 from vlatool.optimize.choice_apart import choose_apart, on_board
 from vlatool.optimize.judge import Judged
-from vlatool.optimize.summary import about_int8, in_int8
+from vlatool.optimize.result import about_int8, in_int8
 from vlatool.optimize.timings import IN_OPENVINO, join_rows, relabel_where
 from vlatool.report import Measurement, Row
 

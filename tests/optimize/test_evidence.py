@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 
 from vlatool.optimize import evidence
-from vlatool.optimize.evidence import in_order, with_accuracy
+from vlatool.optimize.evidence import with_episodes
 from vlatool.optimize.judge import judge
+from vlatool.optimize.ranking import in_order
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Report, Row
 from vlatool.stage.base import Context
@@ -30,7 +31,7 @@ def test_of_equally_fast_candidates_the_nearest_to_float32_is_first() -> None:
 
 @pytest.fixture
 def played(monkeypatch) -> list[str]:
-    """The bundles that played, in order; there are no recordings."""
+    """The bundles that played, in order; there are no controls."""
     names: list[str] = []
 
     def measure(_loop, bundle, *_more, **_options) -> Report:
@@ -39,18 +40,17 @@ def played(monkeypatch) -> list[str]:
         return Report("evaluate", "t", rows=(Row(bundle, measurements=(success,)),))
 
     monkeypatch.setattr(evidence, "cached_measure", measure)
-    monkeypatch.setattr(evidence, "_recorded", lambda *_: ())
-    monkeypatch.setattr(evidence, "_with_controls", lambda _loop, _bundle, own, *_: own)
+    monkeypatch.setattr(evidence, "with_chance", lambda own, _controls: own)
     monkeypatch.setattr(evidence, "compare_success", lambda _base, own: own)
     return names
 
 
-LOOP = SimpleNamespace()
+LOOP = SimpleNamespace(controls=list)
 
 
-def accuracy(enough, loop=LOOP):
+def accuracy(enough):
     rows = {each.name: each for each in [row("float32", 4.0, 0.0), *ROWS]}
-    return with_accuracy(rows, {name: name for name in rows}, loop, None, Context(), enough)
+    return with_episodes(rows, {name: name for name in rows}, LOOP, None, Context(), enough)
 
 
 def test_slower_ones_do_not_play_once_one_keeps_to_the_limits(played: list[str]) -> None:
@@ -68,9 +68,6 @@ def test_all_play_when_none_keeps_to_the_limits_or_all_are_asked_for(played: lis
     played.clear()
     accuracy(None)
     assert played == ["float32", "slow", "fast", "level", "next"]
-    played.clear()
-    accuracy(lambda *_: True, loop=None)
-    assert played == []
 
 
 def test_one_that_did_not_play_is_neither_within_nor_chosen(played: list[str]) -> None:

@@ -22,7 +22,7 @@ from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.cli._run import export_source
+from vlatool.cli._run import with_graphs
 from vlatool.errors import RecipeError, SourceError
 from vlatool.hardware.profile import load_profile
 from vlatool.optimize.plan import make_plan
@@ -76,7 +76,15 @@ def from_torch(policy_template, tmp_path_factory) -> Run:
     """The whole way, all default candidates, once; read only."""
     folder = tmp_path_factory.mktemp("optimized")
     run = optimize(
-        policy_template, folder / "out", folder / "cache", "--max-drop", "100%", "--episodes", "10", "--json"
+        policy_template,
+        folder / "out",
+        folder / "cache",
+        "--max-drop",
+        "100%",
+        "--episodes",
+        "10",
+        "--every-candidate",
+        "--json",
     )
     assert run.code == 0, run.stderr
     return run
@@ -518,9 +526,9 @@ def test_calibration_data_is_found_beside_the_description(policy_dir, model):
 
 def test_a_source_with_graphs_is_not_exported_again(model, tmp_path):
     stage = source_stage(str(model))
-    bundle = source_bundle(stage, tmp_path, Context())
-    assert export_source(stage, tmp_path, Context()).path == bundle.path
-    assert list(bundle.manifest.graphs) == ["main"]
+    source = source_bundle(stage, tmp_path, Context())
+    assert with_graphs(source, tmp_path, Context()) == source
+    assert list(source.bundle.manifest.graphs) == ["main"]
 
 
 @pytest.mark.parametrize(

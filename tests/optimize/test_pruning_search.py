@@ -11,10 +11,10 @@ import pytest
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
 from vlatool.hardware.profile import Profile, load_profile
-from vlatool.optimize.pipeline import _write_bundle
 from vlatool.optimize.plan import make_plan
 from vlatool.optimize.pruning_search import PrunedSearch, front_of, with_measured
 from vlatool.optimize.recipe import read_recipe
+from vlatool.optimize.result import write_recipe
 from vlatool.optimize.space import FLOAT32, Shape, Space
 from vlatool.optimize.study import Tried
 from vlatool.report import Measurement, Report, Row, read_report
@@ -157,10 +157,8 @@ def test_passwords_and_places_of_studies_stay_here(
         assert "sqlite://me:***@host/trials" in said
     asked = read_recipe(recipe)
     asked = asked.model_copy(update={"pruning": asked.pruning.model_copy(update={"study": url})})
-    plan = make_plan(str(policy_template), None, asked, tmp_path / "cache")
-    (tmp_path / "bundle").mkdir()
-    _write_bundle(plan, Row("float32", "chosen"), float_bundle, tmp_path / "bundle")
-    written = (tmp_path / "bundle" / "recipe.yaml").read_text()
+    write_recipe(asked, asked.candidates, "float32", tmp_path)
+    written = (tmp_path / "recipe.yaml").read_text()
     assert "trials: 2" in written
     assert "sqlite" not in written
 

@@ -182,7 +182,7 @@ def test_the_plan_of_a_trial_makes_the_bundle_that_was_tried(search, float_bundl
     trial = run._try("static_int8", ({"quantize.static_int8": {"samples": 8}},))
     stage = transforms(trial.stages)[-1]
     assert isinstance(stage, StaticInt8)
-    made = cached_transform(stage, float_bundle, tmp_path, Context())
+    made = cached_transform(stage, float_bundle, tmp_path, Context()).bundle
     assert run._error(made, Context()) == trial.error
 
 

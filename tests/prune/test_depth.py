@@ -215,11 +215,11 @@ def test_a_block_that_changes_shapes_is_named(source_bundle: Bundle):
 
 
 def test_how_many_blocks_stay_is_said(source_bundle: Bundle):
-    said: list[str] = []
-    context = Context(messages=said)
-    Depth(blocks=1, samples=4).change({"main": Net().eval()}, source_bundle, context)
-    Depth(keep=(0, 2), samples=4).change({"main": Net().eval()}, source_bundle, context)
-    assert said == ["kept 1 of 4 blocks of trunk: 0", "kept 2 of 4 blocks of trunk: 0, 2"]
+    said = [
+        Depth(samples=4, **options).change({"main": Net().eval()}, source_bundle, Context()).messages
+        for options in ({"blocks": 1}, {"keep": (0, 2)})
+    ]
+    assert said == [("kept 1 of 4 blocks of trunk: 0",), ("kept 2 of 4 blocks of trunk: 0, 2",)]
 
 
 def test_the_guide_names_all_that_is_protected():
@@ -232,7 +232,7 @@ def test_weights_that_are_not_finite_are_blamed_and_not_the_observation(policy_d
     weights = load_file(str(policy_dir / "weights.safetensors"))
     weights["blocks.0.norm.bias"][3:5] = torch.nan
     save_file(weights, str(policy_dir / "weights.safetensors"))
-    source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
+    source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context()).bundle
     says = r"weight 'blocks\.0\.norm\.bias' of 'main' is not finite in 2 of 16 values"
     with pytest.raises(SourceError, match=says):
         run_transform(Depth(keep=(0,)), source, tmp_path / "out", Context())

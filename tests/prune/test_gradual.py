@@ -41,7 +41,7 @@ def in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def grown(source: Bundle, out: Path, **options: object) -> Bundle:
-    return run_transform(build_stage("prune.gradual", {**SHORT, **options}), source, out, Context())
+    return run_transform(build_stage("prune.gradual", {**SHORT, **options}), source, out, Context()).bundle
 
 
 def error(bundle: Bundle, whole: Bundle) -> float:
@@ -60,14 +60,14 @@ def test_the_share_grows_as_a_cube():
 
 
 def test_training_makes_up_for_the_zeros(source_bundle: Bundle, policy_template: Path, tmp_path: Path):
-    at_once = run_transform(Magnitude(ratio=0.7), source_bundle, tmp_path / "once", Context())
+    at_once = run_transform(Magnitude(ratio=0.7), source_bundle, tmp_path / "once", Context()).bundle
     made = grown(source_bundle, tmp_path / "made", ratio=0.7, steps=60, batch=16, average=0.9, threads=1)
     assert error(made, source_bundle) < 0.7 * error(at_once, source_bundle)
     for bundle in (at_once, made):
         zeros = [int((values == 0).sum()) for name, values in load_file(bundle.path / "module/main.safetensors").items()
                  if name == LAYER]  # fmt: skip
         assert zeros == [round(0.7 * 32 * 16)]
-    first, *_ = Gradual(**SHORT).lines(made)
+    first, *_ = Gradual(**SHORT).summarize(made)
     assert "of the weights are zero; no tensor is smaller" in first
     assert rebuild(made, Context(), source=str(policy_template), cache=tmp_path / "cache").identical
 
@@ -106,7 +106,9 @@ def test_a_run_that_is_killed_goes_on_and_two_processes_have_the_same_zeros(
 
 
 def test_layers_of_the_same_name_in_two_graphs_are_two(tmp_path: Path):
-    source = run_transform(TorchModule(policy=write_flow(tmp_path / "flow")), None, tmp_path / "source", Context())
+    source = run_transform(
+        TorchModule(policy=write_flow(tmp_path / "flow")), None, tmp_path / "source", Context()
+    ).bundle
     modules = load_modules(source)
     modules["prefix"].body = torch.nn.Sequential(torch.nn.Linear(3, 3))
     layers = select_layers(modules, source, (), ())
@@ -146,7 +148,7 @@ def test_a_policy_that_lost_units_gets_zeros_and_keeps_them(
 ):
     narrower = run_transform(
         Structured(ratio=0.3, multiple=1, rank="magnitude"), source_bundle, tmp_path / "narrower", Context()
-    )
+    ).bundle
     made = grown(narrower, tmp_path / "made", ratio=0.7)
     tensors = [load_file(each.path / "module/main.safetensors") for each in (narrower, made)]
     assert tensors[0][LAYER].size < 32 * 16

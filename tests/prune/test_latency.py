@@ -36,7 +36,7 @@ from vlatool.runtime import load
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
-from vlatool.stage.controls import predicted_for
+from vlatool.stage.controls import reservations
 from vlatool.stage.run import run_transform
 
 FINE = {"samples": 4, "multiple": 1}
@@ -65,7 +65,7 @@ class Counted(LatencyMeter):
 def deep(policy_dir: Path, tmp_path: Path) -> Bundle:
     """The tiny policy with three blocks."""
     deepen(policy_dir)
-    return run_transform(TorchModule(policy=policy_dir), None, tmp_path / "deep", Context())
+    return run_transform(TorchModule(policy=policy_dir), None, tmp_path / "deep", Context()).bundle
 
 
 @pytest.fixture
@@ -81,10 +81,10 @@ def test_the_target_is_met_and_made_again_without_measuring(
     clock = Counted(deep)
     target = share * clock.ms(())
     stage = build_stage("prune.latency", {"target_ms": target, **FINE})
-    pruned = run_transform(stage, deep, tmp_path / "out", Context())
+    pruned = run_transform(stage, deep, tmp_path / "out", Context()).bundle
     assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
     assert json.loads(pruned.manifest.made_by["options"]["chosen"])
-    exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context())
+    exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context()).bundle
     monkeypatch.setattr(latency, "LatencyMeter", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 
@@ -138,7 +138,9 @@ def test_other_programs_that_slow_all_down_do_not_move_the_target(
     monkeypatch.setattr(latency, "LatencyMeter", Disturbed)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
-    pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
+    pruned = run_transform(
+        build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context()
+    ).bundle
     assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
 
 
@@ -154,7 +156,9 @@ def test_the_luckiest_run_of_the_whole_policy_is_not_what_it_takes(
     monkeypatch.setattr(latency, "LatencyMeter", Drifting)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
-    pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
+    pruned = run_transform(
+        build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context()
+    ).bundle
     assert 0.95 * target <= clock.ms(read_edits(pruned)) <= 1.01 * target
 
 
@@ -173,7 +177,7 @@ def test_kernels_that_like_some_widths_better_do_not_end_the_search(
     for share in small_or_full((0.65, 0.75), (0.6, 0.65, 0.7, 0.75, 0.8)):
         target = share * clock.ms(())
         stage = build_stage("prune.latency", {"target_ms": target, **FINE})
-        pruned = run_transform(stage, deep, tmp_path / f"o{share}", Context())
+        pruned = run_transform(stage, deep, tmp_path / f"o{share}", Context()).bundle
         assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
 
 
@@ -194,7 +198,9 @@ def test_one_round_that_was_held_up_is_corrected_by_the_next(
     monkeypatch.setattr(latency, "LatencyMeter", HeldUp)
     clock = Counted(deep)
     target = 0.7 * clock.ms(())
-    pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
+    pruned = run_transform(
+        build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context()
+    ).bundle
     assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
 
 
@@ -310,14 +316,14 @@ def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     monkeypatch.setattr(latency, "LatencyMeter", None)
     target = 0.7 * Counted(deep).ms(())
     stage = build_stage("prune.latency", {"target_ms": target, "board": "nuc13", **FINE})
-    pruned = run_transform(stage, deep, tmp_path / "out", Context())
+    pruned = run_transform(stage, deep, tmp_path / "out", Context()).bundle
     assert 0.96 * target <= Counted(deep).ms(read_edits(pruned)) <= target
-    assert re.fullmatch(r"predicted, not measured: .* ms or up to 4% less on nuc13", stage.lines(pruned)[-1])
+    assert re.fullmatch(r"predicted, not measured: .* ms or up to 4% less on nuc13", stage.summarize(pruned)[-1])
     assert pruned.manifest.made_by["options"]["board"] == "intel-nuc-13-pro"
-    exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context())
-    (told,) = predicted_for(exported)
+    exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context()).bundle
+    (told,) = reservations(exported)
     assert told.startswith("prune.latency chose what stays by predictions for intel-nuc-13-pro (target ")
-    assert predicted_for(deep) == ()
+    assert reservations(deep) == ()
     monkeypatch.setattr(latency, "LatencyPredictor", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 

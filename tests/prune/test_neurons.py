@@ -33,7 +33,7 @@ def actions(policy, bundle: Bundle) -> np.ndarray:
 @pytest.fixture
 def pruned(source_bundle: Bundle, tmp_path: Path) -> Bundle:
     """The tiny policy with half of its hidden neurons."""
-    return run_transform(Neurons(ratio=0.5), source_bundle, tmp_path / "pruned", Context())
+    return run_transform(Neurons(ratio=0.5), source_bundle, tmp_path / "pruned", Context()).bundle
 
 
 def test_neurons_of_least_magnitude_go(pruned: Bundle, source_bundle: Bundle):
@@ -48,7 +48,7 @@ def test_neurons_of_least_magnitude_go(pruned: Bundle, source_bundle: Bundle):
 
 
 def test_it_is_exported_run_and_made_again(pruned: Bundle, policy_template: Path, tmp_path: Path):
-    made = run_transform(ExportOnnx(), pruned, tmp_path / "exported", Context())
+    made = run_transform(ExportOnnx(), pruned, tmp_path / "exported", Context()).bundle
     got = actions(load(made.path, threads=1), made)
     assert relative_error(got, actions(torch_policy(pruned, 0), made)) < 1e-5
     assert [entry["stage"] for entry in made.manifest.build] == [
@@ -66,7 +66,7 @@ def test_it_is_smaller_and_counted_as_such(pruned: Bundle, source_bundle: Bundle
 
 
 def test_pruning_again_starts_where_it_was(pruned: Bundle, tmp_path: Path):
-    again = run_transform(Neurons(ratio=0.5), pruned, tmp_path / "again", Context())
+    again = run_transform(Neurons(ratio=0.5), pruned, tmp_path / "again", Context()).bundle
     assert [len(edit.keep) for edit in read_edits(again)] == [16, 16, 8, 8]
     assert again.manifest.parent == pruned.hash
     torch_policy(again, 0).infer(recorded_observations(again, 1)[0])
@@ -75,7 +75,7 @@ def test_pruning_again_starts_where_it_was(pruned: Bundle, tmp_path: Path):
 def test_other_weights_take_the_structure_that_is_left(pruned: Bundle, tmp_path: Path):
     stage = build_stage("distill.weights", {"file": str(pruned.path / "module/main.safetensors")})
     assert isinstance(stage, Weights)
-    tuned = run_transform(stage, pruned, tmp_path / "tuned", Context())
+    tuned = run_transform(stage, pruned, tmp_path / "tuned", Context()).bundle
     assert relative_error(actions(torch_policy(tuned, 0), tuned), actions(torch_policy(pruned, 0), pruned)) == 0
 
 

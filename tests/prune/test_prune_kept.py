@@ -33,7 +33,7 @@ def actions(bundle: Bundle) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["hidden", "writers"])
 def test_units_that_read_or_write_what_is_kept_are_not_taken_for_useless(tmp_path: Path, kind: str, options):
     source = recurrent_bundle(tmp_path / kind, kind, **options)
-    made = run_transform(Structured(ratio=0.4, multiple=1), source, tmp_path / "out", Context())
+    made = run_transform(Structured(ratio=0.4, multiple=1), source, tmp_path / "out", Context()).bundle
     whole, pruned = actions(source), actions(made)
     assert np.linalg.norm(pruned - whole) / np.linalg.norm(whole) < 0.2
 
@@ -41,7 +41,7 @@ def test_units_that_read_or_write_what_is_kept_are_not_taken_for_useless(tmp_pat
 def test_zeros_are_chosen_by_what_layers_are_given_with_it(tmp_path: Path):
     """With memory 0 all weights that read it would matter as little as any could."""
     source = recurrent_bundle(tmp_path / "hidden", "hidden")
-    made = run_transform(Wanda(ratio=0.5, include=("i",)), source, tmp_path / "out", Context())
+    made = run_transform(Wanda(ratio=0.5, include=("i",)), source, tmp_path / "out", Context()).bundle
     weight = load_modules(made)["main"].i.weight.detach()
     assert int((weight[32:, 2:] != 0).sum()) > 100
 

@@ -90,14 +90,14 @@ def test_a_policy_is_exported_with_its_zeros_and_nobody_is_told_that_it_is_faste
     method: type[SparsePruning], source_bundle: Bundle, tmp_path: Path
 ):
     stage = method(samples=4, include=("blocks.*",))
-    pruned = run_transform(stage, source_bundle, tmp_path / "pruned", Context())
+    pruned = run_transform(stage, source_bundle, tmp_path / "pruned", Context()).bundle
     linear = load_modules(pruned)["main"].blocks[0].mlp[1]
     assert float((linear.weight == 0).float().mean()) == pytest.approx(0.5, abs=0.02)
-    first, second, *_ = stage.lines(pruned)
+    first, second, *_ = stage.summarize(pruned)
     assert "of the weights are zero; no tensor is smaller" in first
     assert "nothing is faster" in second
     if method is Wanda:
-        made = run_transform(ExportOnnx(), pruned, tmp_path / "out", Context())
+        made = run_transform(ExportOnnx(), pruned, tmp_path / "out", Context()).bundle
         assert load(made.path).infer(recorded_observations(made, 1)[0]).chunk.shape == (4, 2)
 
 
@@ -112,9 +112,8 @@ def test_what_gives_the_action_stays_dense_whatever_it_is_called(source_bundle: 
     assert {"vision", "state", "blocks.0.query"} <= set(found.prunable)
     assert set(found.dense) == {"last", "head.0", "head.2"}
     assert list(select_layers(modules, source_bundle, ("last",), ()).prunable) == ["last"]
-    context = Context()
-    Magnitude().change(modules, source_bundle, context)
-    assert context.messages == ["left dense: head.0, head.2, last (--include names what else may go)"]
+    changes = Magnitude().change(modules, source_bundle, Context())
+    assert changes.messages == ("left dense: head.0, head.2, last (--include names what else may go)",)
     assert int((policy.last.weight == 0).sum()) == 0
 
 
@@ -152,7 +151,7 @@ def test_wrong_options_are_told(source_bundle: Bundle, options: dict[str, object
 def narrower(source_bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """The tiny policy without a third of its work, and so traced; read only."""
     stage = Structured(ratio=0.3, multiple=1, rank="magnitude")
-    return run_transform(stage, source_bundle, tmp_path_factory.mktemp("narrower") / "out", Context())
+    return run_transform(stage, source_bundle, tmp_path_factory.mktemp("narrower") / "out", Context()).bundle
 
 
 @pytest.mark.parametrize("method", METHODS)

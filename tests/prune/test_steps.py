@@ -39,12 +39,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def source(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    return run_transform(TorchModule(policy=folder), None, tmp_path_factory.mktemp("source") / "out", Context())
+    return run_transform(TorchModule(policy=folder), None, tmp_path_factory.mktemp("source") / "out", Context()).bundle
 
 
 @pytest.fixture(scope="module")
 def one(source: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    return run_transform(Steps(to=1), source, tmp_path_factory.mktemp("one") / "out", Context())
+    return run_transform(Steps(to=1), source, tmp_path_factory.mktemp("one") / "out", Context()).bundle
 
 
 def error(bundle: Bundle, whole: Bundle) -> float:
@@ -63,12 +63,12 @@ def test_the_program_has_larger_steps_and_runs(one: Bundle, source: Bundle, fold
     prefix, head = one.manifest.program
     assert (head.repeat, head.schedule) == (1, {"t": [1.0], "dt": [-1.0]})
     assert prefix == source.manifest.program[0]
-    exported = run_transform(ExportOnnx(), one, tmp_path / "out", Context())
+    exported = run_transform(ExportOnnx(), one, tmp_path / "out", Context()).bundle
     state = {"state": np.ones(3, np.float32)}
     ours, wanted = load(exported.path, seed=0), torch_policy(one, 0)
     assert relative_error(ours.infer(state).chunk, wanted.infer(state).chunk) < 1e-5
     assert rebuild(exported, Context(), source=str(folder), cache=tmp_path / "cache").identical
-    whole = run_transform(ExportOnnx(), source, tmp_path / "whole", Context())
+    whole = run_transform(ExportOnnx(), source, tmp_path / "whole", Context()).bundle
     with pytest.raises(DataError, match="runs fewer steps than the baseline, and no claim is made of its accuracy"):
         check(exported, whole, Gate(accuracy=None))
     check(exported, whole, Gate(accuracy=Accuracy(data=tmp_path / "any.npz")))
@@ -83,17 +83,17 @@ def sharded(folder: Path, source: Bundle, tmp_path: Path) -> Bundle:
                   place / f"{graph}.safetensors")  # fmt: skip
     description = place / "policy.yaml"
     description.write_text(description.read_text() + 'weights: "*.safetensors"\n')
-    return run_transform(TorchModule(policy=place), None, tmp_path / "sharded-source", Context())
+    return run_transform(TorchModule(policy=place), None, tmp_path / "sharded-source", Context()).bundle
 
 
 def test_weights_in_shards_stay_there(sharded: Bundle, one: Bundle, tmp_path: Path):
-    made = run_transform(Steps(to=1), sharded, tmp_path / "out", Context())
+    made = run_transform(Steps(to=1), sharded, tmp_path / "out", Context()).bundle
     assert [name for name in made.manifest.files if name.startswith("module/")] == ["module/edits.json"]
     assert made.manifest.program == one.manifest.program
     got, wanted = load_modules(made), load_modules(sharded)
     for graph, module in wanted.items():
         assert all(torch.equal(got[graph].state_dict()[name], value) for name, value in module.state_dict().items())
-    exported = run_transform(ExportOnnx(), made, tmp_path / "onnx", Context())
+    exported = run_transform(ExportOnnx(), made, tmp_path / "onnx", Context()).bundle
     assert error(made, sharded) > 0.01
     state = {"state": np.ones(3, np.float32)}
     actions = [policy.infer(state).chunk for policy in (load(exported.path, seed=0), torch_policy(made, 0))]
@@ -110,14 +110,14 @@ def test_weights_in_large_shards_are_not_read(sharded: Bundle, tmp_path: Path, m
     monkeypatch.setattr("vlatool.module.torch_policy.shard_files", lambda *_: read.append("all") or [])
     monkeypatch.setattr(stage, "MAX_RUN_BYTES", 0)
     (tmp_path / "out").mkdir()
-    made = Steps(to=2).run(sharded, tmp_path / "out", Context())
+    made = Steps(to=2).run(sharded, tmp_path / "out", Context()).bundle
     assert made.manifest.program[1].repeat == 2
     assert not read
 
 
 def test_what_many_steps_reached_is_learnt(one: Bundle, source: Bundle, tmp_path: Path):
     options = {"steps": 300, "batch": 32, "learning_rate": 0.01, "average": 0.9, "loss": "l2", "threads": 1}
-    made = run_transform(build_stage("distill.policy", options), one, tmp_path / "out", Context())
+    made = run_transform(build_stage("distill.policy", options), one, tmp_path / "out", Context()).bundle
     assert made.manifest.program == one.manifest.program
     assert error(made, source) < 0.5 * error(one, source)
 

@@ -32,7 +32,7 @@ from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
-from vlatool.stage.controls import removed_by
+from vlatool.stage.controls import reservations
 from vlatool.stage.run import run_transform
 
 FINE = {"samples": 4, "multiple": 1}
@@ -45,7 +45,9 @@ def actions(policy, bundle: Bundle) -> np.ndarray:
 @pytest.fixture(scope="module")
 def pruned(source_bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """The tiny policy with a third less work; read only."""
-    return run_transform(Structured(ratio=0.3, **FINE), source_bundle, tmp_path_factory.mktemp("s") / "out", Context())
+    return run_transform(
+        Structured(ratio=0.3, **FINE), source_bundle, tmp_path_factory.mktemp("s") / "out", Context()
+    ).bundle
 
 
 def work(bundle: Bundle) -> int:
@@ -55,7 +57,7 @@ def work(bundle: Bundle) -> int:
 def test_as_much_work_goes_as_was_asked_and_the_export_is_made_again(
     pruned: Bundle, source_bundle: Bundle, float_bundle: Bundle, policy_template: Path, tmp_path: Path
 ):
-    made = run_transform(ExportOnnx(), pruned, tmp_path / "out", Context())
+    made = run_transform(ExportOnnx(), pruned, tmp_path / "out", Context()).bundle
     assert 0.6 < work(made) / work(float_bundle) <= 0.7
     assert relative_error(actions(load(made.path, threads=1), made), actions(torch_policy(pruned, 0), made)) < 1e-5
     assert rebuild(made, Context(), source=str(policy_template), cache=tmp_path / "cache").identical
@@ -94,7 +96,7 @@ def test_widths_stay_multiples(source_bundle: Bundle):
 
 
 def test_pruning_again_keeps_what_both_keep(pruned: Bundle, tmp_path: Path):
-    again = run_transform(Structured(ratio=0.1, **FINE), pruned, tmp_path / "again", Context())
+    again = run_transform(Structured(ratio=0.1, **FINE), pruned, tmp_path / "again", Context()).bundle
     before, after = read_edits(pruned), read_edits(again)
     assert {(edit.module, edit.axis) for edit in after} >= {(edit.module, edit.axis) for edit in before}
     assert len({(edit.module, edit.axis) for edit in after}) == len(after)
@@ -119,7 +121,7 @@ def test_it_is_trained_further(pruned: Bundle, source_bundle: Bundle, tmp_path: 
     stage = PolicyDistillation(
         steps=40, batch=8, episodes=0, student_episodes=0, learning_rate=0.003, average=0.9, threads=1
     )
-    made = run_transform(stage, pruned, tmp_path / "out", Context())
+    made = run_transform(stage, pruned, tmp_path / "out", Context()).bundle
     wanted = actions(torch_policy(source_bundle, 0), source_bundle)
     before, after = (relative_error(actions(torch_policy(each, 0), source_bundle), wanted) for each in (pruned, made))
     assert after < before
@@ -146,14 +148,14 @@ def test_a_result_that_falls_short_is_refused_by_name(source_bundle: Bundle, tmp
 
 
 def test_what_was_asked_and_reached_is_said_and_recorded(pruned: Bundle, source_bundle: Bundle, tmp_path: Path):
-    context = Context()
-    again = run_transform(Structured(ratio=0.1, rank="magnitude", **FINE), pruned, tmp_path / "again", context)
+    result = run_transform(Structured(ratio=0.1, rank="magnitude", **FINE), pruned, tmp_path / "again", Context())
+    again = result.bundle
     record = again.manifest.made_by["pruned"]
     assert (record["asked"], record["without_rule"]) == (0.1, [])
     assert 0.09 <= record["reached"] <= 0.15
     assert record["reached"] == round(1 - record["macs"][1] / record["macs"][0], 4)
-    assert f"asked for 10.0% less work, reached {record['reached']:.1%} (" in context.messages[0]
-    assert [line.split(",")[0] for line in removed_by(again)] == [
+    assert f"asked for 10.0% less work, reached {record['reached']:.1%} (" in result.messages[0]
+    assert [line.split(",")[0] for line in reservations(again)] == [
         f"prune.structured: asked for {asked}% less work" for asked in ("30.0", "10.0")
     ]
 

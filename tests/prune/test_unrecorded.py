@@ -19,7 +19,7 @@ from vlatool.stage.run import run_transform
 def two_blocks(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """The tiny policy with two blocks; read only."""
     at = tmp_path_factory.mktemp("deep")
-    return run_transform(TorchModule(policy=write_deep(at / "policy", layers=2)), None, at / "out", Context())
+    return run_transform(TorchModule(policy=write_deep(at / "policy", layers=2)), None, at / "out", Context()).bundle
 
 
 @pytest.mark.parametrize(("stage", "options", "looks"), [
@@ -38,9 +38,8 @@ def test_random_observations_are_told(
         name: file for name, file in two_blocks.manifest.files.items() if recorded or name != "data/calibration.npz"
     }
     source = replace(two_blocks, manifest=replace(two_blocks.manifest, files=files))
-    context = Context()
-    build_stage(stage, {"samples": 3, **options}).change(load_modules(source), source, context)
+    changes = build_stage(stage, {"samples": 3, **options}).change(load_modules(source), source, Context())
     told = [
-        line for line in context.messages if line.startswith("nothing is recorded: chosen by 3 random observations")
+        line for line in changes.messages if line.startswith("nothing is recorded: chosen by 3 random observations")
     ]
     assert len(told) == (looks and not recorded)

@@ -243,7 +243,7 @@ def bench(tmp_path: Path, policy_template: Path, float_bundle: Bundle, int8_bund
 
 def run(asked: Asked, out: Path) -> Bundle:
     stage, bundle = asked
-    return run_transform(stage, bundle, out, Context())
+    return run_transform(stage, bundle, out, Context()).bundle
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -309,11 +309,11 @@ def test_a_graph_whose_axes_are_free_is_calibrated(tmp_path: Path) -> None:
     onnx.save(model, tmp_path / "cloud.onnx")
     np.savez(tmp_path / "mine.npz", cloud=random.standard_normal((64, 9, 3)).astype(np.float32))
     file = OnnxFile(model=tmp_path / "cloud.onnx", shape=("cloud=1,points,3",))
-    source = run_transform(file, None, tmp_path / "float", Context())
+    source = run_transform(file, None, tmp_path / "float", Context()).bundle
     for layout in ("ort", "qdq", "openvino"):
         exact = full_range_or_less() if layout == "openvino" else {}
         stage = StaticInt8(calibration=tmp_path / "mine.npz", layout=layout, **exact)
-        made = run_transform(stage, source, tmp_path / layout, Context())
+        made = run_transform(stage, source, tmp_path / layout, Context()).bundle
         for points in (9, 18):
             observation = {"cloud": random.standard_normal((points, 3)).astype(np.float32)}
             got, wanted = (load(each.path, threads=1).infer(observation).chunk for each in (made, source))

@@ -71,7 +71,7 @@ def half(float_bundle, tmp_path_factory) -> Bundle:
     """The tiny policy in float16; read only."""
     out = tmp_path_factory.mktemp("half") / "bundle"
     out.mkdir()
-    return Float16(samples=8).run(float_bundle, out, Context())
+    return Float16(samples=8).run(float_bundle, out, Context()).bundle
 
 
 def test_the_policy_runs_in_float16_near_float32(half, drift):
@@ -80,7 +80,7 @@ def test_the_policy_runs_in_float16_near_float32(half, drift):
     assert half.manifest.graphs["main"].precision == {"float16": 1.0}
     assert half.manifest.made_by["calibration"]["samples"] == 8
     assert half.manifest.made_by["float16"]["beyond"] == []
-    assert "nodes stay float32" in Float16().lines(half)[0]
+    assert "nodes stay float32" in Float16().summarize(half)[0]
 
 
 def test_inputs_and_outputs_keep_their_types_and_the_file_halves(half, float_bundle):
@@ -210,14 +210,14 @@ def test_values_beyond_float16_are_named_and_stay_in_float32(float_bundle, copie
     assert {each.sample for each in found.values()} == {0}
     out = bundle.path.with_name("half")
     out.mkdir()
-    half = Float16(samples=4).run(bundle, out, Context(progress=lambda what, _share: told.append(what)))
+    half = Float16(samples=4).run(bundle, out, Context(progress=lambda what, _share: told.append(what))).bundle
     assert drift(half) < 3e-3
     (first, *_) = half.manifest.made_by["float16"]["beyond"]
     assert first["graph"] == "main"
     assert first["value"] in found
     assert first["largest"] > 65504
     assert any(f"{first['value']} reaches" in what for what in told)
-    assert any("beyond float16" in line for line in Float16().lines(half))
+    assert any("beyond float16" in line for line in Float16().summarize(half))
     assert half.manifest.graphs["main"].precision["float32"] > 0
 
 
@@ -257,8 +257,8 @@ def halved(folder: Path, nodes: list, constants: dict[str, np.ndarray], **option
     onnx.save(model_of(nodes, constants), folder / "a.onnx")
     for name in ("float", "half"):
         (folder / name).mkdir()
-    bundle = OnnxFile(model=folder / "a.onnx").run(None, folder / "float", Context())
-    return bundle, Float16(**options).run(bundle, folder / "half", Context())
+    bundle = OnnxFile(model=folder / "a.onnx").run(None, folder / "float", Context()).bundle
+    return bundle, Float16(**options).run(bundle, folder / "half", Context()).bundle
 
 
 def drifted(bundle: Bundle, half: Bundle) -> float:
@@ -320,7 +320,7 @@ def test_an_opset_without_its_operators_is_refused(tmp_path: Path):
     onnx.save(helper.make_model(made, opset_imports=[helper.make_opsetid("", 9)], ir_version=4), tmp_path / "old.onnx")
     for name in ("float", "half"):
         (tmp_path / name).mkdir()
-    bundle = OnnxFile(model=tmp_path / "old.onnx", opset=9).run(None, tmp_path / "float", Context())
+    bundle = OnnxFile(model=tmp_path / "old.onnx", opset=9).run(None, tmp_path / "float", Context()).bundle
     with pytest.raises(GraphError, match="opset 9; float16 needs opset 10 or later") as refused:
         Float16().run(bundle, tmp_path / "half", Context())
     assert "vlatool export FILE.onnx --opset 13" in refused.value.fix
@@ -330,6 +330,6 @@ def test_what_still_moves_is_told():
     made = SimpleNamespace(manifest=SimpleNamespace(made_by={"float16": {
         "kept": 0, "subnormal_weights": 0, "beyond": [], "moved": {"main": 0.3, "other": 0.001},
     }}))  # fmt: skip
-    lines = Float16().lines(made)
+    lines = Float16().summarize(made)
     assert any("main: its outputs change by up to 0.3" in line for line in lines)
     assert not any("other" in line for line in lines)

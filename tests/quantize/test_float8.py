@@ -21,7 +21,7 @@ def eighth(float_bundle, tmp_path_factory) -> Bundle:
     """The tiny policy in float8; read only."""
     out = tmp_path_factory.mktemp("eighth") / "bundle"
     out.mkdir()
-    return Float8(samples=8).run(float_bundle, out, Context())
+    return Float8(samples=8).run(float_bundle, out, Context()).bundle
 
 
 def graph_of(bundle: Bundle):

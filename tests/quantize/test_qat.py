@@ -14,7 +14,6 @@ from torch import nn
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.cli._run import following
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, RecipeError
 from vlatool.export.onnx import ExportOnnx
@@ -36,6 +35,7 @@ from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
+from vlatool.stage.chain import stages_after
 from vlatool.stage.run import run_transform
 from vlatool.training.fake_quantization import fake_quantization, in_blocks, per_channel, per_tensor
 from vlatool.user_code import trust
@@ -120,15 +120,15 @@ def test_what_rounding_costs_is_learnt_away(policy_dir: Path, tmp_path: Path, we
         stored[f"blocks.0.{name}"][0] *= factor
     stored["blocks.0.mlp.3.weight"][:, 0] /= 60.0
     save_file(stored, policy_dir / "weights.safetensors")
-    source_bundle = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
+    source_bundle = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context()).bundle
     whole = torch_policy(source_bundle, 0)
     options = {"weights": weights, "steps": 40, "batch": 32, "average": 0.9, "episodes": 0, "student_episodes": 0,
                "learning_rate": 0.01, "loss": "l2", "threads": 1}  # fmt: skip
-    tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context())
+    tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context()).bundle
     errors = []
     for name, start in (("plain", source_bundle), ("trained", tuned)):
-        for number, (stage, given) in enumerate(Qat(weights=weights).following_stages()):
-            start = run_transform(build_stage(stage, given), start, tmp_path / f"{name}{number}", Context())
+        for number, (stage, given) in enumerate(Qat(weights=weights).chain().after.items()):
+            start = run_transform(build_stage(stage, given), start, tmp_path / f"{name}{number}", Context()).bundle
         errors.append(error(load(start.path), whole, source_bundle))
     assert errors[1] < 0.8 * errors[0]
     assert [entry["stage"] for entry in start.manifest.build][-3:-1] == ["quantize.qat", "export.onnx"]
@@ -178,13 +178,15 @@ def test_statistics_of_normalisations_stay_and_the_export_is_what_was_trained(tm
     (policy / "policy.yaml").write_text(NORMALISED_YAML)
     np.savez(policy / "calibration.npz", seen=np.random.default_rng(0).normal(size=(40, 4, 6)).astype(np.float32))
     trust.allow(policy)
-    source = run_transform(TorchModule(policy=policy), None, tmp_path / "source", Context())
+    source = run_transform(TorchModule(policy=policy), None, tmp_path / "source", Context()).bundle
     options = {"steps": 8, "batch": 6, "average": 0.5, "episodes": 0, "student_episodes": 0, "learning_rate": 0.01}
-    tuned = run_transform(build_stage("quantize.qat", {**options, "threads": 1}), source, tmp_path / "tuned", Context())
+    tuned = run_transform(
+        build_stage("quantize.qat", {**options, "threads": 1}), source, tmp_path / "tuned", Context()
+    ).bundle
     before, after = (load_modules(bundle)["main"].state_dict() for bundle in (source, tuned))
     for name, value in before.items():
         assert torch.equal(value, after[name]) is not name.endswith(("weight", "bias")), name
-    exported = run_transform(ExportOnnx(), tuned, tmp_path / "float32", Context())
+    exported = run_transform(ExportOnnx(), tuned, tmp_path / "float32", Context()).bundle
     trained = torch_policy(tuned, 0)
     assert error(load(exported.path), trained, source) < 1e-5
     assert error(trained, torch_policy(source, 0), source) > 1e-3
@@ -196,8 +198,8 @@ def test_the_policy_need_not_be_changed_before(source_bundle: Bundle):
 
 def test_an_export_of_the_tuned_policy_is_in_float32(source_bundle: Bundle, tmp_path: Path):
     options = {"steps": 2, "batch": 4, "episodes": 0, "student_episodes": 0, "threads": 1}
-    tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context())
-    exported = run_transform(ExportOnnx(), tuned, tmp_path / "exported", Context())
+    tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context()).bundle
+    exported = run_transform(ExportOnnx(), tuned, tmp_path / "exported", Context()).bundle
     assert exported.manifest.graphs["main"].precision == {"float32": 1.0}
 
 
@@ -212,7 +214,7 @@ def test_an_export_of_the_tuned_policy_is_in_float32(source_bundle: Bundle, tmp_
 def test_what_follows_is_as_the_board_runs_it_unless_it_is_said(
     given: dict[str, str], board: str, wanted: dict[str, object] | None
 ):
-    export, quantization = following(Qat(**given), load_profile(board) if board else None)
+    export, quantization = stages_after(Qat(**given), load_profile(board) if board else None)
     assert export.name() == "export.onnx"
     assert quantization.options() == (weights_of_this_host() if wanted is None else wanted)
 

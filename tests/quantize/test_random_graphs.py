@@ -158,7 +158,7 @@ def test_nodes_without_names_are_quantized_and_can_be_chosen(tmp_path):
     recording = source.path.parent / "recording.npz"
     for method in ("gptq", "awq"):
         stage = WeightOnly(method=method, calibration=recording, exclude=("MatMul_2",))
-        made = run_transform(stage, source, tmp_path / method, Context())
+        made = run_transform(stage, source, tmp_path / method, Context()).bundle
         kinds = [node.op_type for node in onnx.load(made.path / "graphs/main.onnx").graph.node]
         assert kinds.count("MatMulNBits") == kinds.count("MatMul") == 1
 
@@ -167,7 +167,7 @@ def test_nodes_without_names_are_quantized_and_can_be_chosen(tmp_path):
 def test_a_weight_that_is_read_in_two_ways_is_stored_for_each(method, tmp_path):
     source = float_graph(Written(both_ways, (1, 32)), tmp_path / "graph")
     stage = WeightOnly(method=method, calibration=source.path.parent / "recording.npz")
-    made = run_transform(stage, source, tmp_path / "out", Context())
+    made = run_transform(stage, source, tmp_path / "out", Context()).bundle
     nodes = [node for node in onnx.load(made.path / "graphs/main.onnx").graph.node if node.op_type == "MatMulNBits"]
     assert nodes[0].input[1] != nodes[1].input[1]
 
@@ -248,7 +248,7 @@ def errors_of(graph, options, tmp_path):
     source = float_graph(graph, tmp_path / "graph")
     recording = source.path.parent / "recording.npz"
     stage = StaticInt8(layout="openvino", calibration=recording, **full_range_or_less(), **options)
-    made = run_transform(stage, source, tmp_path / "out", Context())
+    made = run_transform(stage, source, tmp_path / "out", Context()).bundle
     assert made.manifest.findings == ()
     observation = {"input0": np.load(recording)["input0"][0]}
     wanted, written, given = (
@@ -282,7 +282,7 @@ def test_onnx_runtime_keeps_what_cuts_off_the_negative_before_float8(tmp_path):
     graph = Written(relu_between, (1, 4, 32))
     source = float_graph(graph, tmp_path / "graph")
     stage = Float8(calibration=source.path.parent / "recording.npz")
-    made = run_transform(stage, source, tmp_path / "float8", Context())
+    made = run_transform(stage, source, tmp_path / "float8", Context()).bundle
     assert not made.manifest.findings
     observation = {"input0": graph.recording(1, seed=1)["input0"][0]}
     wanted, got = (load(bundle.path, threads=1).infer(observation).outputs for bundle in (source, made))
@@ -297,7 +297,7 @@ def test_the_golden_observations_are_recorded_ones(word, tmp_path):
     recording = np.load(source.path.parent / "recording.npz")["input0"]
     methods = {**METHODS, "float8": ("quantize.float8", {}, 0.1)}
     stage = stage_of(methods[word][0], {**methods[word][1], "calibration": str(source.path.parent / "recording.npz")})
-    made = run_transform(stage, source, tmp_path / "made", Context())
+    made = run_transform(stage, source, tmp_path / "made", Context()).bundle
     golden = np.load(made.path / "golden/golden.npz")["in.input0"]
     assert all(any(np.array_equal(each, row) for row in recording) for each in golden)
 

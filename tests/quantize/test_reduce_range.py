@@ -42,14 +42,14 @@ def board(tmp_path: Path, isa: str) -> Profile:
 ])  # fmt: skip
 def test_without_a_board_the_host_decides(stage, how: str, reduced: bool, products) -> None:
     products(how)
-    assert stage.on_this_host().reduce_range is reduced
+    assert stage.on(None).reduce_range is reduced
     for given in (True, False):
-        assert stage.model_copy(update={"reduce_range": given}).on_this_host().reduce_range is given
+        assert stage.model_copy(update={"reduce_range": given}).on(None).reduce_range is given
 
 
 def test_the_standard_layout_may_be_for_any_board_and_stays(products) -> None:
     products(SATURATING)
-    assert not StaticInt8(layout="qdq").on_this_host().reduce_range
+    assert not StaticInt8(layout="qdq").on(None).reduce_range
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name())

@@ -230,7 +230,7 @@ def test_the_policy_computes_the_same(quantized, drift, float_bundle, options):
     how = {note["value"]: note["how"] for note in report(bundle)}
     assert list(how.values()).count("folded") >= 2
     assert ("inserted" in how.values()) == ("insert" in options)
-    assert f"{list(how.values()).count('folded')} scales folded" in SmoothQuant().lines(bundle)[0]
+    assert f"{list(how.values()).count('folded')} scales folded" in SmoothQuant().summarize(bundle)[0]
 
 
 def test_int8_of_a_policy_with_outliers_gains(quantized, drift, float_bundle, copied, resealed):

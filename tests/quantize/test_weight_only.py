@@ -56,7 +56,7 @@ def llama_dir(llama_template, tmp_path) -> Path:
 
 def sourced(folder: Path, out: Path) -> Bundle:
     out.mkdir(parents=True)
-    return TorchModule(policy=folder).run(None, out, Context())
+    return TorchModule(policy=folder).run(None, out, Context()).bundle
 
 
 @pytest.fixture(scope="module")
@@ -69,12 +69,12 @@ def llama_float(llama, tmp_path_factory) -> Bundle:
     """The same policy with no weight quantized: every graph in float32."""
     out = tmp_path_factory.mktemp("llama-float") / "bundle"
     out.mkdir()
-    return Unquantized(embeddings="float32").run(llama, out, Context())
+    return Unquantized(embeddings="float32").run(llama, out, Context()).bundle
 
 
 @pytest.fixture(scope="module")
 def llama_int4(llama, tmp_path_factory) -> Bundle:
-    return run_transform(WeightOnly(), llama, tmp_path_factory.mktemp("llama-int4") / "bundle", Context())
+    return run_transform(WeightOnly(), llama, tmp_path_factory.mktemp("llama-int4") / "bundle", Context()).bundle
 
 
 def actions(bundle: Bundle) -> np.ndarray:
@@ -156,7 +156,7 @@ def test_int4_is_no_worse_than_onnx_runtimes_own_quantizer(llama_float, symmetri
             llama_float,
             tmp_path / name,
             Context(),
-        )
+        ).bundle
         for name, search in (("plain", False), ("best", True))
     )
     assert relative_error(actions(plain), wanted) == pytest.approx(peer, rel=0.03)
@@ -166,7 +166,7 @@ def test_int4_is_no_worse_than_onnx_runtimes_own_quantizer(llama_float, symmetri
 
 @pytest.mark.parametrize("options", [{"bits": 8}, {"bits": 8, "symmetric": True, "block": 128}], ids=str)
 def test_int8_is_close_to_float(llama_float, tmp_path, options):
-    made = run_transform(WeightOnly(**options), llama_float, tmp_path / "out", Context())
+    made = run_transform(WeightOnly(**options), llama_float, tmp_path / "out", Context()).bundle
     assert 0 < relative_error(actions(made), actions(llama_float)) < 0.05
 
 
@@ -217,7 +217,7 @@ def test_a_bundle_with_external_data_is_streamed_too(float_bundle, copied, quant
 
 @pytest.mark.parametrize("method", ["gptq", "awq", "hqq"])
 def test_every_method_gives_a_policy_near_float(llama_float, llama_int4, tmp_path, method):
-    made = run_transform(WeightOnly(method=method), llama_float, tmp_path / "out", Context())
+    made = run_transform(WeightOnly(method=method), llama_float, tmp_path / "out", Context()).bundle
     wanted = actions(llama_float)
     assert 0 < relative_error(actions(made), wanted) < 1.3 * relative_error(actions(llama_int4), wanted)
     told = losses(made)
@@ -260,9 +260,9 @@ def test_states_are_taken_as_many_as_were_recorded_and_too_few_are_warned_of(tmp
     for count, options, taken in ((400, {}, 400), (400, {"samples": 20}, 20), (90, {}, 90)):
         np.savez(tmp_path / "mine.npz", x=values[:count])
         stage = WeightOnly(method="gptq", calibration=tmp_path / "mine.npz", **options)
-        made = run_transform(stage, bundle, tmp_path / f"{count}{taken}", Context())
+        made = run_transform(stage, bundle, tmp_path / f"{count}{taken}", Context()).bundle
         assert made.manifest.made_by["calibration"]["samples"] == taken
-        warned = [line for line in stage.lines(made) if "warning: wide has 207 inputs" in line]
+        warned = [line for line in stage.summarize(made) if "warning: wide has 207 inputs" in line]
         assert [f"the samples give it {taken} rows" in line for line in warned] == ([] if taken >= 207 else [True])
 
 
@@ -277,7 +277,7 @@ def test_without_calibration_data_the_other_methods_are_named(llama_dir, tmp_pat
 
 def test_globs_choose_the_layers(llama_float, tmp_path):
     stage = WeightOnly(include=("decoder.layers.*",), exclude=("*.feedforward.*",))
-    made = run_transform(stage, llama_float, tmp_path / "out", Context())
+    made = run_transform(stage, llama_float, tmp_path / "out", Context()).bundle
     names = [layer["layer"] for layer in losses(made)["layers"]]
     assert len(names) == 8
     assert all("feedforward" not in name for name in names)
@@ -286,7 +286,7 @@ def test_globs_choose_the_layers(llama_float, tmp_path):
 
 
 def test_verification_by_layers_runs_nothing(llama, llama_int4, tmp_path):
-    made = run_transform(WeightOnly(verify="layers"), llama, tmp_path / "out", Context())
+    made = run_transform(WeightOnly(verify="layers"), llama, tmp_path / "out", Context()).bundle
     assert made.manifest.golden == ""
     assert Bundle.open(made.path) == made
     wanted = llama_int4.manifest.files

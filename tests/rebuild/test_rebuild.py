@@ -27,8 +27,9 @@ from vlatool.report import Report
 from vlatool.sources import source_stage
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, SampleSet
+from vlatool.stage.base import Context
 from vlatool.stage.finish import history, save_npz
+from vlatool.stage.record import SampleSet, input_hashes
 from vlatool.stage.run import cached_transform, run_transform
 
 QUIET = Context()
@@ -48,8 +49,10 @@ def onnx_policy(float_bundle: Bundle, policy_template: Path, tmp_path_factory: p
 def dynamic_bundle(onnx_policy: Path, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """Dynamic int8 of the ONNX file, which takes no torch to make again; read only."""
     folder = tmp_path_factory.mktemp("dynamic")
-    source = run_transform(OnnxFile(model=onnx_policy / "tiny.onnx", policy=onnx_policy), None, folder / "s", QUIET)
-    return run_transform(DynamicInt8(per_channel=False), source, folder / "bundle", QUIET)
+    source = run_transform(
+        OnnxFile(model=onnx_policy / "tiny.onnx", policy=onnx_policy), None, folder / "s", QUIET
+    ).bundle
+    return run_transform(DynamicInt8(per_channel=False), source, folder / "bundle", QUIET).bundle
 
 
 @pytest.fixture
@@ -128,7 +131,7 @@ def test_two_input_files_of_one_name_are_both_recorded(policy_dir):
     shutil.copyfile(policy_dir / "evaluation.npz", policy_dir / "sub/calibration.npz")
     description = policy_dir / "policy.yaml"
     description.write_text(description.read_text() + "evaluation: sub/calibration.npz\n")
-    files = TorchModule(policy=policy_dir).input_hashes()
+    files = input_hashes(TorchModule(policy=policy_dir))
     assert files["calibration.npz"] == hash_file(policy_dir / "calibration.npz")
     assert files["calibration.npz (2)"] == hash_file(policy_dir / "evaluation.npz")
 
@@ -154,7 +157,7 @@ def test_what_was_made_again_is_written_whole(dynamic_bundle, onnx_policy, again
 def test_no_output_of_a_stage_is_taken_from_the_cache(dynamic_bundle, onnx_policy, again, tmp_path, monkeypatch):
     cache = tmp_path / "cache"
     source = OnnxFile(model=onnx_policy / "tiny.onnx", policy=onnx_policy)
-    cached = cached_transform(source, None, cache, QUIET)
+    cached = cached_transform(source, None, cache, QUIET).bundle
     before = {path: path.stat().st_mtime_ns for path in cache.rglob("*")}
     (cached.path / GRAPH).write_bytes(b"poison")
     assert again(dynamic_bundle, onnx_policy / "tiny.onnx", cache=cache).identical
@@ -173,7 +176,9 @@ def test_a_calibration_file_is_found_by_name_and_hash(float_bundle, policy_dir, 
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     data = Path(shutil.copyfile(policy_dir / "evaluation.npz", elsewhere / "mine.npz"))
-    bundle = run_transform(StaticInt8(calibration=data, samples=8), float_bundle, elsewhere / "in" / "bundle", QUIET)
+    bundle = run_transform(
+        StaticInt8(calibration=data, samples=8), float_bundle, elsewhere / "in" / "bundle", QUIET
+    ).bundle
     told = f"mine.npz sha256:{hash_file(data)[:16]}"
     assert bundle.manifest.build[-1]["options"] == {"samples": 8, "calibration": told}
     assert bundle.manifest.build[-1]["files"] == {"mine.npz": hash_file(data)}
@@ -215,8 +220,8 @@ def test_a_changed_helper_that_the_policy_imports_is_named(policy_dir, again, tm
     (policy_dir / "helper.py").write_text("SCALE = 1.0\n")
     code = (policy_dir / "policy.py").read_text()
     (policy_dir / "policy.py").write_text(f"import helper\n{code}")
-    source = cached_transform(source_stage(str(policy_dir)), None, tmp_path / "cache", Context())
-    made = cached_transform(ExportOnnx(), source, tmp_path / "cache", Context())
+    source = cached_transform(source_stage(str(policy_dir)), None, tmp_path / "cache", Context()).bundle
+    made = cached_transform(ExportOnnx(), source, tmp_path / "cache", Context()).bundle
     assert again(made, policy_dir).identical
     (policy_dir / "helper.py").write_text("SCALE = 2.0\n")
     with pytest.raises(SourceError, match=r"helper.py: got sha256:.*, recorded sha256:"):
@@ -232,7 +237,7 @@ def test_another_kind_of_source_and_another_factory_are_refused(int8_bundle, pol
 
 def test_the_source_is_found_where_it_was(policy_dir, float_bundle, again, tmp_path, monkeypatch):
     cache = tmp_path / "cache"
-    source = cached_transform(TorchModule(policy=policy_dir), None, cache, QUIET)
+    source = cached_transform(TorchModule(policy=policy_dir), None, cache, QUIET).bundle
     assert again(source, cache=tmp_path / "none").identical
     with pytest.raises(SourceError, match=r"does not say where its source is \(a policy named 'tiny'\)"):
         again(float_bundle, cache=tmp_path / "none")

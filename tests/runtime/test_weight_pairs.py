@@ -127,7 +127,7 @@ def test_a_quantized_bundle_fits_when_it_was_asked_to(
               DynamicInt8(reduce_range=True, per_channel=False)]  # fmt: skip
     for number, stage in enumerate(stages):
         (tmp_path / str(number)).mkdir()
-        made = stage.run(float_bundle, tmp_path / str(number), Context())
+        made = stage.run(float_bundle, tmp_path / str(number), Context()).bundle
         assert weights_fit(made.path / "graphs/main.onnx"), stage
     assert not weights_fit(int8_bundle.path / "graphs/main.onnx")
 

@@ -31,12 +31,12 @@ Imported = SimpleNamespace
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     out = tmp_path_factory.mktemp("flow-source")
-    return TorchModule(policy=FLOW).trust_code().run(None, out, Context())
+    return TorchModule(policy=FLOW).trust_code().run(None, out, Context()).bundle
 
 
 @pytest.fixture(scope="module")
 def exported(source: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    return ExportOnnx().run(source, tmp_path_factory.mktemp("flow-exported"), Context())
+    return ExportOnnx().run(source, tmp_path_factory.mktemp("flow-exported"), Context()).bundle
 
 
 @pytest.fixture(scope="module")

@@ -182,8 +182,8 @@ def flow(tmp_path_factory):
     (policy / "policy.yaml").write_text(FLOW_YAML)
     (policy / "policy.py").write_text(FLOW_PY)
     np.savez(policy / "calibration.npz", state=np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32))
-    source = run_transform(TorchModule(policy=policy), None, folder / "source", Context())
-    return run_transform(ExportOnnx(), source, folder / "float", Context())
+    source = run_transform(TorchModule(policy=policy), None, folder / "source", Context()).bundle
+    return run_transform(ExportOnnx(), source, folder / "float", Context()).bundle
 
 
 def test_layers_of_a_loop_are_int8_in_every_turn_and_the_noise_stays_the_same(flow, quantized):

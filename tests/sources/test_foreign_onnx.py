@@ -29,10 +29,11 @@ INT8 = {
 """File -> share of the multiply-accumulates that dynamic int8 reaches; bodies and foreign operators stay."""
 
 
-def made(name: str, folder: Path) -> tuple[Bundle, Path, Context]:
-    path, context = write(name, folder), Context()
+def made(name: str, folder: Path) -> tuple[Bundle, Path, tuple[str, ...]]:
+    path = write(name, folder)
     (folder / "out").mkdir()
-    return OnnxFile(model=path).run(None, folder / "out", context), path, context
+    result = OnnxFile(model=path).run(None, folder / "out", Context())
+    return result.bundle, path, result.messages
 
 
 def observations(bundle: Bundle, count: int) -> list[dict[str, Any]]:
@@ -76,16 +77,14 @@ def test_int8_leaves_what_it_does_not_reach_and_counts_it(tmp_path: Path, name: 
     bundle, _, _ = made(name, tmp_path)
     assert bundle.manifest.graphs["main"].precision == FLOAT32
     (tmp_path / "int8").mkdir()
-    quantized = DynamicInt8().run(bundle, tmp_path / "int8", Context())
+    quantized = DynamicInt8().run(bundle, tmp_path / "int8", Context()).bundle
     assert quantized.manifest.graphs["main"].precision.get("int8") == pytest.approx(INT8[name], abs=0.002)
 
 
 @pytest.mark.parametrize(("name", "gone"), [("bfloat16_inside", "bfloat16"), ("double_throughout", "float64")])
 def test_another_float_is_told(tmp_path: Path, name: str, gone: str) -> None:
-    _, _, context = made(name, tmp_path)
-    assert (
-        f"layers compute in {gone}; the graph is converted to float32, which all stages start from" in context.messages
-    )
+    _, _, messages = made(name, tmp_path)
+    assert f"layers compute in {gone}; the graph is converted to float32, which all stages start from" in messages
 
 
 def test_names_of_all_kinds_stay(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ def bundle_of(folder: Path, text: str, said: list[str] | None = None) -> Bundle:
     onnx.save(onnx.parser.parse_model(HEAD + text), folder / "a.onnx")
     (folder / "out").mkdir()
     tell = Context((lambda words, _share: said.append(words)) if said is not None else Context().progress)
-    return OnnxFile(model=folder / "a.onnx").run(None, folder / "out", tell)
+    return OnnxFile(model=folder / "a.onnx").run(None, folder / "out", tell).bundle
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_such_a_file_is_converted_to_another_opset(tmp_path: Path):
     text = "g (float[3,5] x, float[5] z) => (float[3,5] y) { y = Add(x, z) }"
     onnx.save(onnx.parser.parse_model(HEAD + text), tmp_path / "a.onnx")
     (tmp_path / "out").mkdir()
-    made = OnnxFile(model=tmp_path / "a.onnx", opset=18).run(None, tmp_path / "out", Context())
+    made = OnnxFile(model=tmp_path / "a.onnx", opset=18).run(None, tmp_path / "out", Context()).bundle
     assert made.manifest.graphs["main"].opset == 18
 
 

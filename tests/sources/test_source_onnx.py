@@ -20,7 +20,7 @@ from vlatool.stage.build import build_stage
 
 def build(out: Path, model: Path, **options: object) -> Bundle:
     out.mkdir()
-    return OnnxFile(model=model, **options).run(None, out, Context())
+    return OnnxFile(model=model, **options).run(None, out, Context()).bundle
 
 
 def linear(path: Path, shape: object = (1, 3), dtype: int = TensorProto.FLOAT, op: str = "MatMul") -> Path:
@@ -258,11 +258,10 @@ def test_an_old_opset_is_raised_so_that_int8_can_be_written(tmp_path: Path, opse
     model.opset_import[0].version, model.ir_version = opset, 6
     onnx.save(model, path)
     (tmp_path / "out").mkdir()
-    context = Context()
-    bundle = OnnxFile(model=path).run(None, tmp_path / "out", context)
-    assert bundle.manifest.graphs["main"].opset == 13
-    assert context.messages == [f"converted from opset {opset} to 13; the same on 32 observations"]
-    assert len(find_layers(onnx.load(bundle.path / "graphs/main.onnx"), ("MatMul",))) == 1
+    result = OnnxFile(model=path).run(None, tmp_path / "out", Context())
+    assert result.bundle.manifest.graphs["main"].opset == 13
+    assert result.messages == (f"converted from opset {opset} to 13; the same on 32 observations",)
+    assert len(find_layers(onnx.load(result.bundle.path / "graphs/main.onnx"), ("MatMul",))) == 1
 
 
 def test_an_old_opset_that_onnx_cannot_raise_stays_and_is_told(tmp_path: Path) -> None:
@@ -274,13 +273,12 @@ def test_an_old_opset_that_onnx_cannot_raise_stays_and_is_told(tmp_path: Path) -
     model.opset_import[0].version, model.ir_version = 9, 6
     onnx.save(model, path)
     (tmp_path / "out").mkdir()
-    context = Context()
-    bundle = OnnxFile(model=path).run(None, tmp_path / "out", context)
-    opset = bundle.manifest.graphs["main"].opset
+    result = OnnxFile(model=path).run(None, tmp_path / "out", Context())
+    opset = result.bundle.manifest.graphs["main"].opset
     with pytest.raises(GraphError, match="opset 9; int8 needs opset 13") as caught:
         find_layers(onnx.load(path), ("MatMul",))
     assert "--opset" in caught.value.fix
-    assert opset == 13 or context.messages[0].startswith("opset 9 stays")
+    assert opset == 13 or result.messages[0].startswith("opset 9 stays")
 
 
 @pytest.mark.parametrize("batch", ["batch", None, -1, 0])
@@ -288,7 +286,7 @@ def test_the_batch_axis_of_the_graph_is_fixed_to_one(tmp_path: Path, batch: obje
     said: list[str] = []
     path = reshaped(tmp_path / "a.onnx", (batch, 6, 4))
     (tmp_path / "out").mkdir()
-    bundle = OnnxFile(model=path).run(None, tmp_path / "out", Context(lambda text, _share: said.append(text)))
+    bundle = OnnxFile(model=path).run(None, tmp_path / "out", Context(lambda text, _share: said.append(text))).bundle
     assert shapes(bundle) == ([1, 6, 4], [1, 2, 6])
     assert "free axes get a length: x axis 0 = 1" in said
     assert graph_workload(bundle.path / "graphs/main.onnx").macs == {"float32": 6 * 4 * 2}

@@ -12,7 +12,7 @@ from vlatool.stage.base import Context
 
 def build(folder: Path, out: Path, **options: str) -> Bundle:
     out.mkdir()
-    return TorchModule(policy=folder, **options).run(None, out, Context())
+    return TorchModule(policy=folder, **options).run(None, out, Context()).bundle
 
 
 def edit(folder: Path, old: str, new: str) -> None:

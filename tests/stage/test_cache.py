@@ -43,7 +43,7 @@ def cache(tmp_path: Path) -> Path:
 @pytest.fixture
 def kept(cache: Path, float_bundle: Bundle) -> Bundle:
     """A bundle in the cache, with a report of it and a count, a day old."""
-    made = cached_transform(DynamicInt8(), float_bundle, cache, Context())
+    made = cached_transform(DynamicInt8(), float_bundle, cache, Context()).bundle
     cached_measure(Recorded(samples=2), made, cache, Context())
     (cache / "workloads").mkdir()
     write_workload(cache / "workloads" / f"{'0' * 32}.json", workload(float_bundle))
@@ -79,7 +79,7 @@ def test_what_was_removed_is_made_again(kept: Bundle, cache: Path, float_bundle:
     removed = prune(cache, older_than_s=0)
     assert len(removed.entries) == 3
     assert (removed.freed, removed.stays, contents(cache).bytes) == (freed, {}, 0)
-    assert cached_transform(DynamicInt8(), float_bundle, cache, Context()).hash == kept.hash
+    assert cached_transform(DynamicInt8(), float_bundle, cache, Context()).bundle.hash == kept.hash
 
 
 def test_a_dry_run_says_the_same_and_removes_nothing(kept: Bundle, cache: Path):
@@ -181,7 +181,7 @@ def test_what_took_long_to_flush_was_just_made(cache: Path, float_bundle: Bundle
     """Its folder is as old as the last file in it, but nobody has had the time to lock it."""
     monkeypatch.setattr("vlatool.files.directory_writer._flush", lambda folder: os.utime(folder, (0, 0)))
     monkeypatch.setattr("vlatool.stage.run.acquire", lambda path: False)
-    made = cached_transform(DynamicInt8(), float_bundle, cache, Context())
+    made = cached_transform(DynamicInt8(), float_bundle, cache, Context()).bundle
     assert prune(cache, older_than_s=DAY).entries == ()
     assert Bundle.open(made.path)
 
@@ -198,7 +198,7 @@ def test_a_shared_recording_goes_with_the_last_stage_that_holds_it(cache: Path, 
     np.savez(bundle.path / "data/calibration.npz", **observations(6000, seed=1))
     bundle = seal(bundle.path, bundle.manifest)
     stages = [DynamicInt8(), DynamicInt8(exclude=["head*"])]
-    paths = [cached_transform(stage, bundle, cache, Context()).path for stage in stages]
+    paths = [cached_transform(stage, bundle, cache, Context()).bundle.path for stage in stages]
     age(cache)
     assert contents(cache).sizes(contents(cache).entries[0])[1] > 1 << 20
     os.utime(paths[0], (0, 0))

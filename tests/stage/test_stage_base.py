@@ -20,6 +20,7 @@ from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, Measure, Stage, Transform, source_of
 from vlatool.stage.build import build_stage, stage_class, stage_kinds
+from vlatool.stage.record import made_by
 
 
 def test_a_stage_is_named_after_its_file():
@@ -190,15 +191,15 @@ def test_a_package_that_is_not_installed_does_not_break_the_key():
 
 def test_made_by_leaves_out_what_is_not_installed(monkeypatch):
     monkeypatch.setattr(DynamicInt8, "packages", ("numpy", "no-such-distribution"))
-    assert list(DynamicInt8().made_by()["versions"]) == ["numpy"]
+    assert list(made_by(DynamicInt8())["versions"]) == ["numpy"]
 
 
 def test_made_by_names_stage_options_versions_and_seed():
-    made = DynamicInt8(per_channel=False).made_by(seed=3)
+    made = made_by(DynamicInt8(per_channel=False), seed=3)
     assert (made["vlatool"], made["stage"], made["seed"]) == (__version__, "quantize.dynamic_int8", 3)
     assert made["options"] == {"per_channel": False}
     assert set(made["versions"]) == set(DynamicInt8.packages)
-    assert "seed" not in DynamicInt8().made_by()
+    assert "seed" not in made_by(DynamicInt8())
 
 
 def test_a_context_may_be_silent():
@@ -217,3 +218,7 @@ def test_a_stage_without_a_source_says_how_to_begin(source_bundle):
     assert source_of(source_bundle, "export.onnx") is source_bundle
     with pytest.raises(RecipeError, match=r"export.onnx needs a bundle to start from; begin the recipe"):
         source_of(None, "export.onnx")
+
+
+def test_options_that_were_given_stay():
+    assert StaticInt8(layout="ort").unless_given({"layout": "qdq", "attention": True}).options() == {"attention": True}

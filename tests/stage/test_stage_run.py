@@ -1,18 +1,20 @@
 """Stages run into place, and results are kept and used again."""
 
+from dataclasses import FrozenInstanceError
 from pathlib import Path
 
 import pytest
 
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, GraphError, OutputError
+from vlatool.errors import DataError, GraphError, OutputError, RecipeError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.files.directory_writer import write_directory
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.report import Report
 from vlatool.stage.base import Context
-from vlatool.stage.run import cache_directory, cached_measure, cached_path, cached_transform, run_transform
+from vlatool.stage.run import cache_directory, cached_measure, cached_path, cached_transform, run_transform, work_folder
 
 
 def stamps(folder: Path) -> dict[str, tuple[int, int]]:
@@ -30,7 +32,7 @@ class Listener:
 
 def test_a_stage_runs_into_place_and_nothing_is_left_beside_it(float_bundle, tmp_path):
     out = tmp_path / "place" / "out"
-    made = run_transform(DynamicInt8(), float_bundle, out, Context())
+    made = run_transform(DynamicInt8(), float_bundle, out, Context()).bundle
     assert Bundle.open(out).hash == made.hash
     assert made.manifest.parent == float_bundle.hash
     assert list(out.parent.iterdir()) == [out]
@@ -67,9 +69,9 @@ def test_a_stage_is_checked_before_anything_is_written(float_bundle, tmp_path):
 
 
 def test_a_second_run_reads_the_cache_and_gives_the_same_bundle(float_bundle, tmp_path):
-    first = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context())
+    first = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context()).bundle
     before = stamps(tmp_path)
-    second = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context())
+    second = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context()).bundle
     assert (second.hash, second.path) == (first.hash, first.path)
     assert stamps(tmp_path) == before
 
@@ -94,10 +96,10 @@ def test_other_options_are_another_entry(float_bundle, tmp_path):
     ids=["graph changed", "graph missing", "manifest cut", "manifest missing"],
 )
 def test_a_damaged_bundle_in_the_cache_is_made_again_and_that_is_said(float_bundle, tmp_path, damage):
-    first = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context())
+    first = cached_transform(DynamicInt8(), float_bundle, tmp_path, Context()).bundle
     damage(first.path)
     listener = Listener()
-    assert cached_transform(DynamicInt8(), float_bundle, tmp_path, listener.context).hash == first.hash
+    assert cached_transform(DynamicInt8(), float_bundle, tmp_path, listener.context).bundle.hash == first.hash
     assert Bundle.open(first.path).hash == first.hash
     assert "the cached quantize.dynamic_int8 is damaged; making it again" in listener.told
 
@@ -131,3 +133,31 @@ def test_where_the_cache_is(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert cache_directory() == tmp_path / "home" / ".cache" / "vlatool"
+
+
+def test_a_stage_that_needs_a_bundle_says_how_to_begin_before_it_runs(tmp_path):
+    with pytest.raises(RecipeError, match=r"quantize.dynamic_int8 needs a bundle to start from"):
+        run_transform(DynamicInt8(), None, tmp_path / "out", Context())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_notes_and_the_folder_of_unfinished_work_come_from_who_writes_the_report(float_bundle, tmp_path, monkeypatch):
+    monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
+    seen: list[str] = []
+
+    def run(_stage: Recorded, _source: Bundle, context: Context) -> Report:
+        Path(context.work).mkdir(parents=True)
+        (Path(context.work) / "lock").touch()
+        context.note("one worker was slow")
+        return Report("evaluate", "title", "info")
+
+    monkeypatch.setattr(Recorded, "run", run)
+    cached_measure(Recorded(), float_bundle, tmp_path / "cache", Context(note=seen.append))
+    assert seen == ["one worker was slow"]
+    assert not work_folder(Recorded(), float_bundle).exists()
+
+
+def test_a_context_cannot_be_changed():
+    with pytest.raises(FrozenInstanceError):
+        Context().workers = 2
+    assert not [name for name, value in vars(Context()).items() if isinstance(value, list | dict | set)]

@@ -36,7 +36,7 @@ NOT_VERDICTS = {
     ("cli/_side_by_side.py", "item.where == HERE"): "the name of a machine",
     ("render/_view.py", "where == 'this host'"): "the name of a machine",
     ("optimize/timings.py", "what != OWN_SET"): "the name of an instruction set",
-    ("optimize/training_records.py", "name.endswith(TEACHER)"): "the name of a table",
+    ("optimize/evidence.py", "name.endswith(TEACHER)"): "the name of a table",
     ("render/sections/details.py", "title not in (UNDER, SHOWN)"): "the name of a table",
     ("render/sections/details.py", "title.startswith(AGAINST_BASELINE)"): "the name of a table",
     ("render/_format.py", "part.startswith(NO_INTERVAL)"): "shows the part of a note that the report's format marks",

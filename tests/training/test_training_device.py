@@ -136,7 +136,7 @@ def on_meta(*programs: Mapping[str, nn.Module]) -> Iterator[None]:
 ])  # fmt: skip
 def test_nothing_of_a_lesson_stays_on_another_device(tmp_path: Path, kind: str, stage: str, options: dict[str, Any]):
     folder = write_deep(tmp_path / "policy", MANY) if kind == "deep" else write_flow(tmp_path / "policy")
-    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context())
+    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context()).bundle
     training = build_stage(stage, options)
     assert isinstance(training, TrainingStage)
     modules = load_modules(source)

@@ -52,7 +52,7 @@ def deep(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """The tiny policy with six blocks; read only."""
     place = tmp_path_factory.mktemp("deep")
     folder = write_deep(place / "policy", layers=6)
-    return run_transform(TorchModule(policy=folder), None, place / "source", Context())
+    return run_transform(TorchModule(policy=folder), None, place / "source", Context()).bundle
 
 
 def numbers(student: Bundle, teacher: Path | None = None) -> dict[str, list[tuple[int, int]]]:
@@ -66,8 +66,8 @@ def numbers(student: Bundle, teacher: Path | None = None) -> dict[str, list[tupl
 
 
 def test_the_edits_say_which_blocks_are_there(deep: Bundle, tmp_path: Path):
-    once = run_transform(Depth(keep=(0, 1, 2, 5)), deep, tmp_path / "once", Context())
-    twice = run_transform(Depth(keep=(0, 2)), once, tmp_path / "twice", Context())
+    once = run_transform(Depth(keep=(0, 1, 2, 5)), deep, tmp_path / "once", Context()).bundle
+    twice = run_transform(Depth(keep=(0, 2)), once, tmp_path / "twice", Context()).bundle
     assert numbers(once) == {"blocks": [(0, 0), (1, 1), (2, 4), (3, 5)]}
     assert numbers(twice) == {"blocks": [(0, 1), (1, 5)]}, "blocks 0 and 2 of the six are left"
     assert numbers(twice, deep.path) == numbers(twice), "a teacher from the same factory, whole"
@@ -76,8 +76,8 @@ def test_the_edits_say_which_blocks_are_there(deep: Bundle, tmp_path: Path):
 
 def test_traced_modules_have_stacks_too(tmp_path: Path):
     folder = write_deep(tmp_path / "policy", layers=2)
-    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context())
-    narrow = run_transform(Structured(ratio=0.3, samples=2, multiple=1), source, tmp_path / "narrow", Context())
-    shallow = run_transform(Depth(keep=(0,)), source, tmp_path / "shallow", Context())
+    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context()).bundle
+    narrow = run_transform(Structured(ratio=0.3, samples=2, multiple=1), source, tmp_path / "narrow", Context()).bundle
+    shallow = run_transform(Depth(keep=(0,)), source, tmp_path / "shallow", Context()).bundle
     assert numbers(narrow) == {"blocks": [(0, 0), (1, 1)]}
     assert numbers(shallow, narrow.path) == {"blocks": [(0, 1)]}

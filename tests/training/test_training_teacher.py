@@ -12,6 +12,7 @@ from _deep import write_deep
 from vlatool.cli import main
 from vlatool.distill.policy import PolicyDistillation
 from vlatool.errors import BundleError, SourceError
+from vlatool.module.source import trust_policies
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.run import run_transform
@@ -28,9 +29,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.mark.parametrize("name", ["", "policy.yaml"])
 def test_a_policy_teaches_as_its_bundle_does(folder: Path, name: str, tmp_path: Path):
-    stage = PolicyDistillation(teacher=folder / name).trust_code()
+    stage = PolicyDistillation(teacher=folder / name)
+    trust_policies(stage)
     check_teacher(folder / name)
-    made = run_transform(TorchModule(policy=folder), None, tmp_path / "bundle", Context())
+    made = run_transform(TorchModule(policy=folder), None, tmp_path / "bundle", Context()).bundle
     assert teacher_bundle(folder / name).hash == made.hash == teacher_bundle(made.path).hash
     assert folder / "policy.py" in [path.resolve() for path in stage.inputs()]
     assert PolicyDistillation(teacher=made.path).inputs() == (made.path / "manifest.json",)
@@ -43,7 +45,8 @@ def test_its_code_runs_where_the_user_named_it(folder: Path):
             read(folder)
         assert f"--trust {folder.resolve()}" in caught.value.fix
     assert not trust.is_named(folder)
-    stage.trust_code().check(None, None)
+    trust_policies(stage)
+    stage.check(None, None)
 
 
 def test_what_it_is_made_of_is_part_of_the_key(folder: Path):

@@ -49,7 +49,7 @@ def bundle(mine: Path, tmp_path: Path) -> Bundle:
     """The source bundle of that policy, as somebody else may have sent it."""
     (tmp_path / "bundle").mkdir()
     with trust.forget_named():
-        return TorchModule(policy=mine).run(None, tmp_path / "bundle", Context())
+        return TorchModule(policy=mine).run(None, tmp_path / "bundle", Context()).bundle
 
 
 @pytest.fixture
@@ -187,7 +187,7 @@ def test_a_package_that_a_trusted_description_names_may_run(
     (policy_dir / "policy.yaml").write_text(described.replace("policy.py:make", "installed_policy:make"))
     (tmp_path / "bundle").mkdir()
     with trust.forget_named():
-        bundle = TorchModule(policy=policy_dir).run(None, tmp_path / "bundle", Context())
+        bundle = TorchModule(policy=policy_dir).run(None, tmp_path / "bundle", Context()).bundle
     with pytest.raises(SourceError, match="you did not"):
         load_modules(bundle)
     trust.trust(policy_dir)

@@ -97,14 +97,15 @@ def changed(bundle: Bundle, folder: Path, code: str) -> Path:
 def test_two_nodes_give_the_rows_of_one_process_and_say_how_they_differ(nodes: Nodes, bundle: Bundle):
     asked = jobs(bundle.path.parent / "policy")
     for _ in range(8):  # a node that is slow to start leaves all to the other
-        context = Context(launcher="ray", workers=0)
+        notes: list[str] = []
+        context = Context(launcher="ray", workers=0, note=notes.append)
         assert run_jobs(bundle, asked, "", context) == alone(bundle, asked)
         sent = [{path.name for path in (cache / "shipped").glob("*/*")} for cache in nodes.caches]
         if all(sent):
             break
     for found in sent:
         assert {"environment.py", "manifest.json"} <= found, "each node has a copy of its own"
-    (noted,) = context.notes
+    (noted,) = notes
     assert f"onnxruntime {OLD}" in noted
     assert disturbances_of(bundle, asked[0], context)[-1] == "push"
 

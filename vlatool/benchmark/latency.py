@@ -35,6 +35,8 @@ from vlatool.runtime.engine import engine_class
 from vlatool.stage.base import Context, Measure
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from vlatool.hardware.profile import Profile
 
 COLD_STARTS = 3
@@ -133,25 +135,25 @@ class Latency(Measure):
         for path in self.against:
             Bundle.open(path, verify=False)
 
-    def on(self, profile: Profile) -> Latency:
+    def on(self, board: Profile | None) -> Self:
         """Return the stage with the limits of a board, where it is to be emulated.
 
         Raises:
             UsageError: when more threads are asked for than the board has cores.
             ProfileError: when it has no such power mode.
         """
-        if not self.emulate:
+        if board is None or not self.emulate:
             return self
-        mode = profile.mode(self.mode or None)
-        cores = int(mode.cores.get("cpu", profile.units["cpu"].cores.value if "cpu" in profile.units else 0))
+        mode = board.mode(self.mode or None)
+        cores = int(mode.cores.get("cpu", board.units["cpu"].cores.value if "cpu" in board.units else 0))
         if cores and self.threads > cores:
             raise UsageError(
-                f"--threads is {self.threads}; {profile.name} has {cores} processors in this mode.",
+                f"--threads is {self.threads}; {board.name} has {cores} processors in this mode.",
                 f"give --threads {cores} or fewer, or another --mode of the board",
             )
-        memory = 1e3 * profile.usable_memory_gb.value
+        memory = 1e3 * board.usable_memory_gb.value
         limited = self.model_copy(update={"cores": self.cores or cores, "memory_mb": self.memory_mb or memory})
-        limited._board = profile.name
+        limited._board = board.name
         return limited
 
     def run(self, source: Bundle, context: Context) -> Report:

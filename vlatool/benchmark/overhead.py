@@ -59,7 +59,6 @@ class Overhead(Measure):
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Return the median of the paired differences in microseconds."""
-        self.check(source, None)
         policy = Policy.open(source, threads=self.threads, seed=0)
         observations = observations_for(source, 16)
         step = policy.program.steps[0]

@@ -99,7 +99,7 @@ def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wa
 
 def open_bundle(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or the source bundle of a policy."""
-    return source_bundle(open_source(source), cache_directory(), context)
+    return source_bundle(open_source(source), cache_directory(), context).bundle
 
 
 def count_workload(bundle: Bundle, context: Context) -> Workload:
@@ -136,7 +136,7 @@ def _counted_source(bundle: Bundle, context: Context) -> Workload:
 
 
 def _counted_export(bundle: Bundle, context: Context) -> Workload:
-    return workload(cached_transform(ExportOnnx(), bundle, cache_directory(), context))
+    return workload(cached_transform(ExportOnnx(), bundle, cache_directory(), context).bundle)
 
 
 def carry_count(source: str, context: Context) -> Path:

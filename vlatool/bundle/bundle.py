@@ -83,9 +83,9 @@ class Bundle:
             BundleError: when a file is missing, changed, a link, or not in the manifest.
         """
         self.check_tree()
-        names = [name for name in self.manifest.files if name.startswith(prefix) and not (but and name.startswith(but))]
-        for name in [name for name in names if name not in self._verified]:
-            verified_read.verify_file(self.path, name, *self._record(name))
+        for name, record in self.manifest.files.items():
+            if name.startswith(prefix) and not (but and name.startswith(but)) and name not in self._verified:
+                verified_read.verify_file(self.path, name, record.sha256, record.bytes)
 
     def check_tree(self) -> None:
         """Refuse what the manifest does not record, and a manifest that names files which it does not record.

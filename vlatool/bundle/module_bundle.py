@@ -15,6 +15,13 @@ MAX_LOCATION_BYTES = 1 << 16
 """Bytes of ``location.json`` that are looked at."""
 
 
+def factory_of(source: Bundle | None) -> str:
+    """Return where the factory of a source bundle is, for messages; empty for a bundle that runs no code."""
+    if source is None or source.manifest.graphs:
+        return ""
+    return str(source.manifest.source.get("factory", "")).rpartition(":")[0]
+
+
 def no_graph_error(bundle: Bundle, purpose: str) -> BundleError:
     """Return the error of a bundle that has no graph, with the command that makes a bundle with graphs of it.
 

@@ -77,7 +77,7 @@ def crew(workers: str | None) -> tuple[int, str]:
 @contextlib.contextmanager
 def progress(workers: int = 1, launched_by: str = PROCESSES) -> Iterator[Context]:
     """Yield a context whose progress is shown on stderr: a live bar on a terminal, plain lines elsewhere."""
-    common: dict[str, Any] = {"command": command_line(), "launcher": launched_by, "unfinished": []}
+    common: dict[str, Any] = {"command": command_line(), "launcher": launched_by}
     if not sys.stderr.isatty():
         yield Context(_plain_lines(), workers, **common)
         return

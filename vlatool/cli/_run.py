@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import inspect
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vlatool.bundle.bundle import REPORTS as REPORTS_FOLDER
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
-from vlatool.cli._board_summary import board_summary
+from vlatool.cli._board_summary import BoardSummary, board_summary
 from vlatool.cli._console import crew, file_or_none, progress, refuse_existing, refuse_video, show
 from vlatool.cli._document import document
 from vlatool.cli._options import AsJson, Force, Raw, Workers
@@ -24,12 +23,13 @@ from vlatool.files.outputs import BUNDLE
 from vlatool.files.printable import one_line, printable
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.instruction_sets import ENGINE, board_set
+from vlatool.module.stage import describe_modules
 from vlatool.report import Report
-from vlatool.stage.base import Context, Measure, Stage, Transform
-from vlatool.stage.build import build_stage
+from vlatool.stage.base import Context, Measure, Result, Stage, Transform
+from vlatool.stage.chain import run_chain
 from vlatool.stage.controls import PRUNED_KEY, controls
 from vlatool.stage.finish import read_difference
-from vlatool.stage.run import cache_directory, cached_transform, first_steps, measure_in_child, report_of, run_transform
+from vlatool.stage.run import cache_directory, cached_transform, measure_in_child, report_of, work_folder
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -65,7 +65,6 @@ TRANSFORM_FLAGS = (
     _board_flag("make it the way this board runs it, and show what to expect there (see: vlatool profiles list)"),
     *COMMON_FLAGS,
 )
-TRAINING_FLAGS = (_flag("events", Annotated[Path | None, EVENTS], None),)
 MEASURE_FLAGS = (
     _flag("out", Annotated[Path | None, REPORTS], None),
     _board_flag(
@@ -75,11 +74,15 @@ MEASURE_FLAGS = (
     *COMMON_FLAGS,
     _flag("raw", Raw, False),
 )
-VIDEO_FLAGS = (_flag("video", Annotated[Path | None, VIDEO], None),)
-REMOTE_FLAGS = (
-    _flag("target", Annotated[str | None, TARGET], None),
-    _flag("remote_python", Annotated[str | None, REMOTE_PYTHON], None),
-)
+FLAGS_OF = {
+    "remotely": (
+        _flag("target", Annotated[str | None, TARGET], None),
+        _flag("remote_python", Annotated[str | None, REMOTE_PYTHON], None),
+    ),
+    "films": (_flag("video", Annotated[Path | None, VIDEO], None),),
+    "trains": (_flag("events", Annotated[Path | None, EVENTS], None),),
+}
+"""What a class says of itself -> flags that its command has, too."""
 
 
 def transform(
@@ -92,67 +95,100 @@ def transform(
     events: Path | None = None,
 ) -> None:
     """Make a bundle from a bundle, or from a policy that is exported first."""
-    from vlatool.hardware.profile import load_profile
-    from vlatool.sources import open_source, source_bundle
+    from vlatool.sources import open_source
 
-    bundle: Bundle | None
     refuse_existing(out, force, source, file_or_none(profile), *named_files(stage), kind=BUNDLE)
+    _refuse_events(events, out)
+    board = _board(profile)
+    stage = stage.on(board)
+    with progress() as context:
+        context = replace(context, events=str(events.absolute()) if events else "")
+        opened = open_source(source)
+        stage, start, messages = _start(stage, opened, context)
+        result, before = run_chain(stage, start, board, out, cache_directory(), context, force=force)
+        on_board = board_summary(result.bundle, before, board, context) if board else None
+    if as_json:
+        document(_as_json(result.bundle, out, on_board))
+    else:
+        typer.echo("\n  ".join(_lines(result.bundle, out, before, (*messages, *result.messages), on_board)))
+    _refuse(result.bundle, source if isinstance(opened, Bundle) else "")
+
+
+def _board(profile: str | None) -> Profile | None:
+    if not profile:
+        return None
+    from vlatool.hardware.profile import load_profile
+
+    return load_profile(profile)
+
+
+def _refuse_events(events: Path | None, out: Path) -> None:
     if events is not None and out.absolute() in (events.absolute(), *events.absolute().parents):
         raise UsageError(
             f"--events {events} is in the output {out}, which appears whole or not at all.",
             "name a directory beside the output",
         )
-    board = load_profile(profile) if profile else None
-    stage = stage.on(board) if board else stage.on_this_host()
-    then = following(stage, board)
-    with progress() as context:
-        found = open_source(source)
-        if isinstance(found, Bundle):
-            bundle = found
-        elif stage.kind() == "export" and found.has_graphs:
-            stage, bundle = _graph_source(stage, found), None
-        elif stage.takes_modules:
-            bundle = source_bundle(found, cache_directory(), context)
-        else:
-            bundle = stream_source(stage, found, context) or export_source(found, cache_directory(), context)
-        context = replace(context, events=str(events.absolute()) if events else "")
-        stage, bundle = first_steps(stage, bundle, cache_directory(), context)
-        reports = None
-        for other in then:
-            bundle = cached_transform(stage, bundle, cache_directory(), context)
-            if told := stage.summary(bundle):
-                context.messages.extend((*told, f"loss curve: {out / REPORTS_FOLDER / 'report.html'}"))
-                reports = bundle.path / REPORTS_FOLDER
-            stage = other
-        result = run_transform(stage, bundle, out, context, force=force, reports=reports)
-        on_board = board_summary(result, bundle, board, context) if board else None
-    baseline = source if isinstance(found, Bundle) else ""
-    precision = {name: graph.precision for name, graph in result.manifest.graphs.items()}
-    if as_json:
-        document({
-            "bundle": str(out), "hash": result.hash, "bytes": result.size_bytes, "precision": precision,
-            "findings": result.manifest.findings, "pruned": result.manifest.made_by.get(PRUNED_KEY),
-            "board": on_board.values() if on_board else None,
-            "difference": asdict(difference) if (difference := read_difference(result)) else None,
-        })  # fmt: skip
-        _refuse(result, baseline)
-        return
-    graphs = f"graphs {result.graph_bytes / 1e6:.2f} MB, " if result.manifest.graphs else ""
-    sizes = f"{graphs}in all {result.size_bytes / 1e6:.1f} MB"
-    typer.echo(f"{out}: {one_line(result.manifest.name)} {one_line(result.manifest.version)}, {sizes}")
-    for line in (*map(printable, context.messages), *stage.lines(result), *(controls(bundle) if bundle else ())):
-        typer.echo(f"  {line}")
-    for name, shares in precision.items():
-        if not shares:
-            typer.echo(f"  {name}: no matrix product or convolution is counted")
-            continue
-        typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
-    for line in (*_moved(result), *(on_board.lines() if on_board else ())):
-        typer.echo(f"  {line}")
-    _refuse(result, baseline)
 
 
-def _moved(bundle: Bundle) -> Iterator[str]:
+def _start(
+    stage: Transform, opened: Bundle | Source, context: Context
+) -> tuple[Transform, Bundle | None, tuple[str, ...]]:
+    """Return a stage, what it starts from, and sentences on that: a bundle, or what is made of a policy."""
+    from vlatool.sources import source_bundle
+
+    if isinstance(opened, Bundle):
+        return stage, opened, ()
+    if stage.kind() == "export" and opened.has_graphs:
+        return _graph_source(stage, opened), None, ()
+    start = source_bundle(opened, cache_directory(), context)
+    if not _takes_source(stage, start.bundle):
+        start = with_graphs(start, cache_directory(), context)
+    return stage, start.bundle, start.messages
+
+
+def _takes_source(stage: Transform, bundle: Bundle) -> bool:
+    """Return whether a stage takes the source bundle of a policy: its modules, or the shards of its weights."""
+    if stage.takes_modules or not stage.streams:
+        return stage.takes_modules
+    try:
+        stage.check(bundle, None)
+    except BundleError:
+        return False
+    return True
+
+
+def _lines(
+    bundle: Bundle, out: Path, before: Bundle | None, messages: Iterable[str], on_board: BoardSummary | None
+) -> Iterator[str]:
+    """Yield what is printed of a new bundle, and of the one before it."""
+    graphs = f"graphs {bundle.graph_bytes / 1e6:.2f} MB, " if bundle.manifest.graphs else ""
+    sizes = f"{graphs}in all {bundle.size_bytes / 1e6:.1f} MB"
+    yield f"{out}: {one_line(bundle.manifest.name)} {one_line(bundle.manifest.version)}, {sizes}"
+    yield from map(printable, messages)
+    yield from () if bundle.manifest.graphs else describe_modules(bundle)
+    yield from controls(before) if before else ()
+    yield from (*_precisions(bundle), *_difference(bundle), *(on_board.lines() if on_board else ()))
+
+
+def _precisions(bundle: Bundle) -> Iterator[str]:
+    """Yield which shares of its multiply-accumulates each graph computes in which type."""
+    for name, graph in bundle.manifest.graphs.items():
+        shares = ", ".join(f"{share:.1%} {kind}" for kind, share in graph.precision.items())
+        yield f"{name}: {shares} of the MACs" if shares else f"{name}: no matrix product or convolution is counted"
+
+
+def _as_json(bundle: Bundle, out: Path, on_board: BoardSummary | None) -> dict[str, Any]:
+    difference = read_difference(bundle)
+    return {
+        "bundle": str(out), "hash": bundle.hash, "bytes": bundle.size_bytes,
+        "precision": {name: graph.precision for name, graph in bundle.manifest.graphs.items()},
+        "findings": bundle.manifest.findings, "pruned": bundle.manifest.made_by.get(PRUNED_KEY),
+        "board": on_board.values() if on_board else None,
+        "difference": asdict(difference) if difference else None,
+    }  # fmt: skip
+
+
+def _difference(bundle: Bundle) -> Iterator[str]:
     """Yield how far the action of a new bundle is from that of the float32 bundle that it was made from."""
     if (difference := read_difference(bundle)) is None:
         return
@@ -165,12 +201,6 @@ def _moved(bundle: Bundle) -> Iterator[str]:
         f"{action.name}: error against float32 {difference.mean:.2%} on average, {difference.worst:.2%} at worst "
         f"({observations})"
     )
-
-
-def following(stage: Transform, board: Profile | None) -> list[Transform]:
-    """Return the stages that the command line runs after one, with the options that the board needs."""
-    stages = [cast(Transform, build_stage(name, options)) for name, options in stage.following_stages()]
-    return [each.on(board) if board else each.on_this_host() for each in stages]
 
 
 def _graph_source(export: Transform, source: Source) -> Transform:
@@ -195,36 +225,23 @@ def named_files(stage: Stage) -> tuple[Path, ...]:
     return tuple(item for item in items if isinstance(item, Path))
 
 
-def stream_source(stage: Transform, source: Source, context: Context) -> Bundle | None:
-    """Return the bundle of a policy whose weights the stage reads from their shards itself, None for any other."""
-    from vlatool.sources import source_bundle
-
-    if not stage.streams:
-        return None
-    bundle = source_bundle(source, cache_directory(), context)
-    try:
-        stage.check(bundle, None)
-    except BundleError:
-        return None
-    return bundle
-
-
-def export_source(source: Bundle | Source, cache: Path, context: Context) -> Bundle:
-    """Return a bundle as it is, and a float32 bundle with graphs of a policy, exported with the default options."""
+def with_graphs(source: Result, cache: Path, context: Context) -> Result:
+    """Return a source bundle that has graphs, and any other one exported to float32 with the default options."""
     from vlatool.export.onnx import ExportOnnx
-    from vlatool.sources import source_bundle
 
-    bundle = source_bundle(source, cache, context)
-    return (
-        bundle if bundle is source or bundle.manifest.graphs else cached_transform(ExportOnnx(), bundle, cache, context)
-    )
+    if source.bundle.manifest.graphs:
+        return source
+    exported = cached_transform(ExportOnnx(), source.bundle, cache, context)
+    return replace(exported, messages=(*source.messages, *exported.messages))
 
 
 def open_with_graphs(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or that of a policy, exported with the default options."""
-    from vlatool.sources import open_source
+    from vlatool.sources import open_source, source_bundle
 
-    return export_source(open_source(source), cache_directory(), context)
+    if isinstance(opened := open_source(source), Bundle):
+        return opened
+    return with_graphs(source_bundle(opened, cache_directory(), context), cache_directory(), context).bundle
 
 
 def measure(
@@ -246,11 +263,7 @@ def measure(
     inputs = (source, file_or_none(profile), *named_files(stage))
     refuse_existing(out, force, *inputs)
     refuse_video(video, force, out, inputs)
-    board = None
-    if profile:
-        from vlatool.hardware.profile import load_profile
-
-        board = load_profile(profile)
+    board = _board(profile)
     with progress(*crew(workers)) as context:
         context = replace(context, video=str(video.absolute()) if video else "", force=force)
         bundle = open_with_graphs(source, context)
@@ -259,10 +272,13 @@ def measure(
             from vlatool.remote.ssh import measure_on
 
             context = replace(context, measure_remotely=partial(measure_on, target, python=remote_python or ""))
-        report = _measured(stage if board is None else stage.on(board), bundle, board, context)
+        stage = stage.on(board)
+        work = work_folder(stage, bundle)
+        context = replace(context, work=str(work.absolute()))
+        report = _measured(stage, bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
-    show(report, as_json=as_json, out=out, force=force, raw=raw, unfinished=context.unfinished or ())
+    show(report, as_json=as_json, out=out, force=force, raw=raw, unfinished=[work])
 
 
 def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Context) -> Report:

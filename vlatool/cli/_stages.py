@@ -7,6 +7,7 @@ import inspect
 import types
 import typing
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +20,8 @@ from vlatool.cli import _complete, _run, _torchrun
 from vlatool.cli._default import DefaultGroup
 from vlatool.cli._flag_conflicts import refuse_conflicting_flags
 from vlatool.errors import PluginError, UsageError, fix_for, suggest
-from vlatool.stage.base import Measure, Stage, Transform
+from vlatool.module.source import trust_policies
+from vlatool.stage.base import Measure, Stage
 from vlatool.stage.build import stage_from
 
 DEFAULTS = {
@@ -91,8 +93,9 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
         options = {name: arguments.pop(name) for name in own}
         chosen = {name: value for name, value in options.items() if _typed(context, name)}
         name = f"vlatool {stage.kind()} {registry_name(stage)}"
-        launch = _torchrun.launch_for(name, trains=issubclass(stage, Transform) and stage.trains)
-        built = stage_from(stage, _torchrun.with_processes(chosen, launch), name).trust_code()
+        launch = _torchrun.launch_for(name, trains=getattr(stage, "trains", False))
+        built = stage_from(stage, _torchrun.with_processes(chosen, launch), name)
+        trust_policies(built)
         if measures:
             _run.measure(typing.cast(Measure, built), **arguments)
         elif launch is not None:
@@ -100,14 +103,9 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
         else:
             _run.transform(typing.cast(Any, built), **arguments)
 
-    if issubclass(stage, Measure) and stage.remotely:
-        common = (*common, *_run.REMOTE_FLAGS)
-    if issubclass(stage, Measure) and stage.films:
-        common = (*common, *_run.VIDEO_FLAGS)
-    if issubclass(stage, Transform) and stage.trains:
-        common = (*common, *_run.TRAINING_FLAGS)
+    more = (flags for name, flags in _run.FLAGS_OF.items() if getattr(stage, name, False))
     typed = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-    parameters = [typed, _run.SOURCE_FLAG, *own.values(), *common]
+    parameters = [typed, _run.SOURCE_FLAG, *own.values(), *common, *chain(*more)]
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command

@@ -102,7 +102,7 @@ def _spec_of(policy: str) -> PolicySpec:
     if not isinstance(source, Bundle) and (described := source.describe()) is not None:
         return described.spec
     with progress() as context:
-        return source_bundle(source, cache_directory(), context).manifest.spec
+        return source_bundle(source, cache_directory(), context).bundle.manifest.spec
 
 
 def _refuse_inside(output: Path, path: Path) -> None:

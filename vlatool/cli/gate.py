@@ -23,6 +23,8 @@ from vlatool.cli._run import open_with_graphs
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files.outputs import output_errors, refuse_inputs
 from vlatool.files.user_files import refuse_file, write_own_file
+from vlatool.machine.host import cache_directory
+from vlatool.stage.cache import STREAMS
 
 if TYPE_CHECKING:
     from vlatool.gate.config import Gate
@@ -83,12 +85,13 @@ def run(
         _check_junit(junit, candidate, *_read_by(gate, base), config)
     with progress(*crew(workers)) as context:
         bundle = open_with_graphs(candidate, context)
-        report = run_gate(bundle, Bundle.open(base), gate, context, seed)
+        work = cache_directory() / STREAMS / f"gate-{bundle.hash[-16:]}"
+        report = run_gate(bundle, Bundle.open(base), gate, replace(context, work=str(work.absolute())), seed)
     report = replace(report, command=command_line(), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     if os.environ.get("GITHUB_ACTIONS") == "true" and not as_json:
         _tell_github(report)
     try:
-        show(report, as_json=as_json, out=output, force=force, raw=raw, unfinished=context.unfinished or ())
+        show(report, as_json=as_json, out=output, force=force, raw=raw, unfinished=[work])
     finally:  # after the directory of reports: the file may be in it
         if junit is not None:
             _write_junit(report, junit)

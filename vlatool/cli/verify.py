@@ -41,6 +41,6 @@ def verify(
     options = Options(against, data, samples, tolerance, seed, named.names if named else {})
     check(options)
     with progress() as context:
-        bundle = source_bundle(open_source(source), cache_directory(), context)
+        bundle = source_bundle(open_source(source), cache_directory(), context).bundle
         report = verify_policy(bundle, options, context)
     show(report, as_json=as_json, out=output, force=force)

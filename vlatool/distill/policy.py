@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
@@ -13,8 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import recordings_of
 from vlatool.distill._student import DEPTH, student_steps
 from vlatool.errors import DataError, RecipeError
-from vlatool.stage.base import Context, Transform
-from vlatool.stage.build import build_stage
+from vlatool.stage.base import Chain
 from vlatool.training.expert import RECORD, expert_loss
 from vlatool.training.imitation import ImitationStage
 from vlatool.training.supervision import Supervision
@@ -67,13 +65,11 @@ class PolicyDistillation(ImitationStage):
         "nothing from it; shows whether the teacher matters",
     )
 
-    def chain(self) -> tuple[Transform, ...]:
-        """The stages that make the student, then the training."""
+    def chain(self) -> Chain:
+        """Return the stages that make the student."""
         stacks = {name: globs for name, globs in (("include", self.include), ("exclude", self.exclude)) if globs}
-        made = [build_stage(name, options | (stacks if name == DEPTH else {}))
-                for name, options in student_steps(self.student)]  # fmt: skip
-        left = self.model_copy(update={"student": "", "include": (), "exclude": ()})
-        return *(stage for stage in made if isinstance(stage, Transform)), left
+        before = {name: options | (stacks if name == DEPTH else {}) for name, options in student_steps(self.student)}
+        return Chain(before, options=("student", "include", "exclude"))
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """What the teacher and the expert are asked for fits together, and is there."""
@@ -128,17 +124,3 @@ class PolicyDistillation(ImitationStage):
             return teacher, objective
         distance = self._distance(self.loss if self.loss in OF_LABELS else "l1")
         return teacher, replace(objective, expert=expert_loss(modules, source, distance))
-
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
-        """Train, unless that is only the last of several steps.
-
-        Raises:
-            RecipeError: when ``student`` asks for other stages first.
-        """
-        if self.student:
-            names = ", ".join(stage.name() for stage in self.chain())
-            raise RecipeError(
-                f"{self.name()} with the student {self.student} is several stages: {names}.",
-                "run one after the other what chain() returns, as the command line does",
-            )
-        return super().run(source, out, context)

@@ -21,6 +21,7 @@ from vlatool.episodes.play import OUTCOME_PREFIX, PRELOAD, RECORDINGS, EpisodesJ
 from vlatool.episodes.progress import Tally
 from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.messages import from_json, to_json
+from vlatool.files.resumable_work import Store
 from vlatool.module.factory import factory_file
 from vlatool.stage.base import Context
 from vlatool.workers import PROCESSES, Folder, Work, launcher
@@ -32,14 +33,16 @@ Outcomes = tuple[Outcome, ...]
 
 
 def run_jobs(
-    bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context, tally: Tally | None = None
-) -> list[Outcome]:
+    bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context, tally: Tally | None = None,
+    store: Store | None = None
+) -> list[Outcome]:  # fmt: skip
     """Play all episodes and return their outcomes in the order of the jobs, whoever plays them.
 
     Args:
         engine: engine of the runtime; the bundle's own when empty.
-        context: Progress, workers, and what is kept of an interrupted run.
+        context: Progress and workers.
         tally: Counts successes for the progress; one of these jobs alone when None.
+        store: Outcomes of an interrupted run, and of this one; none are stored when None.
 
     Raises:
         DataError: when the environment fails or does not fit the policy's spec.
@@ -49,7 +52,7 @@ def run_jobs(
     if not jobs:
         return []
     tally = tally or Tally(sum(len(job.seeds) for job in jobs))
-    kept = _Kept(bundle, engine, jobs, context)
+    kept = _Kept(bundle, engine, jobs, context, store)
     missing = [number for number in range(len(jobs)) if number not in kept.found]
     played = _played(bundle, [kept.rest(number) for number in missing], engine, context, kept, missing)
     outcomes: list[Outcome] = []
@@ -86,7 +89,7 @@ def _played(
             begun.add(what) if what in ours else context.progress(what, share)
 
     work = _work("play", bundle, jobs, engine, PRELOAD, "close", away=name != PROCESSES)
-    answers = launcher(name, count).answers(work, tell, keep_answer, context.notes.append)
+    answers = launcher(name, count).answers(work, tell, keep_answer, context.note)
     with contextlib.closing(answers):
         for job in jobs:
             with _located(job, begun, away=name != PROCESSES):
@@ -121,7 +124,7 @@ def check_opens(bundles: Sequence[Bundle], job: EpisodesJob, engine: str, contex
     for bundle in bundles:
         name = context.launcher if bundle.manifest.graphs else PROCESSES
         work = _work("open_bundle", bundle, [job], engine, PRELOAD, away=name != PROCESSES)
-        list(launcher(name, 1).answers(work, context.progress, lambda _number, _answer: None, context.notes.append))
+        list(launcher(name, 1).answers(work, context.progress, lambda _number, _answer: None, context.note))
 
 
 def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
@@ -133,7 +136,7 @@ def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple
     """
     work = _work("disturbances", bundle, [job], "", away=context.launcher != PROCESSES)
     who = launcher(context.launcher, context.workers)
-    (own,) = who.answers(work, context.progress, lambda _number, _answer: None, context.notes.append)
+    (own,) = who.answers(work, context.progress, lambda _number, _answer: None, context.note)
     if not isinstance(own, list) or not all(isinstance(kind, str) for kind in own):
         raise DataError(
             "The process that asked the environment for its disturbances did not answer with names.", OWN_FILES
@@ -221,12 +224,14 @@ def _impossible(outcome: Outcome, job: EpisodesJob) -> str:
 class _Kept:
     """The outcomes of an interrupted run of the same command, as far as nothing that decides them has changed."""
 
-    def __init__(self, bundle: Bundle, engine: str, jobs: Sequence[EpisodesJob], context: Context) -> None:
+    def __init__(
+        self, bundle: Bundle, engine: str, jobs: Sequence[EpisodesJob], context: Context, store: Store | None
+    ) -> None:
         self.found: dict[int, Outcomes] = {}
         self._jobs = jobs
         self._single: dict[tuple[str, int], Outcome] = {}
         self._context = context
-        self._store = None if context.store is None or jobs[0].record else context.store
+        self._store = None if jobs[0].record else store
         if self._store is None:
             return
         around = circumstances(bundle, engine, jobs[0])

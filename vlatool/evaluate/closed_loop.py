@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 from pydantic_core import PydanticCustomError
@@ -30,7 +31,7 @@ from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._training_overlap import FIX, seen_in_training
 from vlatool.files.resumable_work import Store
 from vlatool.hardware.profile import Profile
-from vlatool.machine.host import cache_directory, fingerprint
+from vlatool.machine.host import fingerprint
 from vlatool.measures import series, with_derived
 from vlatool.measures.success import SUCCESS
 from vlatool.module.factory import factory_file, split_factory
@@ -38,9 +39,11 @@ from vlatool.module.source import describe
 from vlatool.report import Report, Row
 from vlatool.runtime.control import layers
 from vlatool.stage.base import Context, Measure
-from vlatool.stage.cache import STREAMS
 from vlatool.stats.starts import distinct_starts
 from vlatool.user_code import trust
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 ALL = "all"
 """Every disturbance that there is."""
@@ -48,6 +51,9 @@ STRONGEST = 10
 """The largest strength of a disturbance."""
 CONTROL_EPISODES = 20
 """Episodes of each control, or a tenth of the policy's where that is more."""
+
+Run = Callable[[Bundle, list[EpisodesJob], str], list[Outcome]]
+"""Bundle, jobs and whose they are -> outcomes."""
 
 
 class ClosedLoop(Measure):
@@ -163,27 +169,29 @@ class ClosedLoop(Measure):
     def _bundles(self, source: Bundle) -> list[Bundle]:
         return [*([Bundle.open_lazily(self.baseline)] if self.baseline else []), source]
 
-    def on(self, profile: Profile) -> ClosedLoop:
+    def on(self, board: Profile | None) -> Self:
         """Return the evaluation with the latency that is predicted for a board, where latency counts."""
-        return self.model_copy(update={"board": profile.name}) if self.latency_in_the_loop and not self.board else self
+        named = board is not None and self.latency_in_the_loop and not self.board
+        return self.model_copy(update={"board": board.name}) if board and named else self
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Run all episodes of the bundle, and of the baseline when there is one.
 
-        What is finished is kept until the result is written, where somebody will see to that (``Context.unfinished``).
+        What is finished is stored until the report is written, where there is a folder for that (``Context.work``).
         """
-        if context.unfinished is None:
-            return self._measured(source, context)
-        directory = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
-        context.unfinished.append(directory)
-        with Store.open(directory) as kept:
-            report = self._measured(source, replace(context, store=kept))
-        taken = f"{kept.taken} of the {kept.asked} episodes are of an interrupted run of the same command."
-        notes = [*([taken] if kept.taken else []), *([kept.problem] if kept.problem else [])]
-        context.notes.extend(notes)
+        notes: list[str] = []
+        with Store.open(Path(context.work)) if context.work else contextlib.nullcontext() as store:
+            report = self._measured(source, replace(context, note=notes.append), store)
+        if store and store.taken:
+            notes.append(f"{store.taken} of the {store.asked} episodes are of an interrupted run of the same command.")
+        if store and store.problem:
+            notes.append(store.problem)
+        notes = list(dict.fromkeys(notes))
+        for note in notes:
+            context.note(note)
         return replace(report, warnings=(*report.warnings, *notes))
 
-    def _measured(self, source: Bundle, context: Context) -> Report:
+    def _measured(self, source: Bundle, context: Context, store: Store | None) -> Report:
         jobs = self._jobs(source)
         self._may_run(jobs[0])
         kinds = self._disturbances(source, jobs[0], context)
@@ -192,13 +200,17 @@ class ClosedLoop(Measure):
         check_video_of(bundles, jobs[0], context)
         if self.baseline:
             check_opens(bundles, jobs[0], self.engine, context)
-        latencies = [loop_latency(one, self.board, self.engine, context) if self.latency_in_the_loop else None
+        latencies = [loop_latency(one, self.board, self.engine, context, store) if self.latency_in_the_loop else None
                      for one in bundles]  # fmt: skip
+
+        def run(bundle: Bundle, jobs: list[EpisodesJob], whose: str) -> list[Outcome]:
+            return run_jobs(bundle, jobs, self.engine, context.about(whose), store=store)
+
         plays: list[Player] = []
         told_by = [context.about(whose) for whose in self._whose(names)]
         for one, latency, teller in zip(bundles, latencies, told_by, strict=True):
             most = sum(len(job.seeds) for job in jobs)
-            plays.append(Player(one, latency, self.engine, teller, most, plays[0] if plays else None))
+            plays.append(Player(one, latency, self.engine, teller, most, plays[0] if plays else None, store))
         rows: list[Row] = []
         believed, decision = Credibility(), None
         if self.baseline and self.limit is not None:
@@ -208,16 +220,17 @@ class ClosedLoop(Measure):
         else:
             *reference, outcomes = (play(jobs) for play in plays)
         if self.baseline:
-            rows.append(self._reference(bundles[0], names[0], reference[0], context))
+            rows.append(self._reference(bundles[0], names[0], reference[0], run))
             believed = credibility(rows[0]) if self.instruction == "right" else believed
         row = success_row(names[-1], "subject", outcomes)
         row = compare_success(rows[0], row) if rows else row
         row = with_decision(row, decision) if decision else row
         if kinds:
-            played = [self._disturbed(kinds, with_latency(jobs, latency), one, context, whose)
+            played = [self._disturbed(kinds, with_latency(jobs, latency), one, whose, run)
                       for one, latency, whose in zip(bundles, latencies, self._whose(names), strict=True)]  # fmt: skip
             row = with_disturbed(row, played[-1], played[0] if self.baseline else None)
-            context.notes.extend(without_effect(names[-1], played[-1], outcomes))
+            for note in without_effect(names[-1], played[-1], outcomes):
+                context.note(note)
         again = played_again(jobs[0], [*reference, outcomes], plays, bundles, context)
         if again.outcomes:
             rows, row = [with_episode(rows[0], again.outcomes[0])], with_episode(row, again.outcomes[1])
@@ -234,7 +247,7 @@ class ClosedLoop(Measure):
         decided = (sentence(decision, distinct_starts(row.raw[series.START])),) if decision else ()
         summary = (*believed.sentences, *decided, text, *sentences(rows, self.board), *again.sentences)
         doubts = (*repeated_starts(row), *seen_in_training(bundles, jobs), *found_wrong(source))
-        warnings = (*believed.warnings, *doubts, *again.warnings, *dict.fromkeys(context.notes))
+        warnings = (*believed.warnings, *doubts, *again.warnings)
         return Report("evaluate", title, verdict, summary, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _disturbances(self, source: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
@@ -260,18 +273,17 @@ class ClosedLoop(Measure):
         return [base, names[-1]]
 
     def _disturbed(
-        self, kinds: Sequence[str], jobs: list[EpisodesJob], bundle: Bundle, context: Context, whose: str
+        self, kinds: Sequence[str], jobs: list[EpisodesJob], bundle: Bundle, whose: str, run: Run
     ) -> dict[tuple[str, float], list[Outcome]]:
         """Return disturbance and strength -> the episodes of a bundle under it."""
         played = {}
         for kind, strength in product(kinds, self.strength):
             under = f"under {kind}, strength {strength:g}"
             disturbed = [replace(job, disturb=kind, strength=strength) for job in jobs]
-            teller = context.about(f"{whose}, {under}" if whose else under)
-            played[kind, strength] = run_jobs(bundle, disturbed, self.engine, teller)
+            played[kind, strength] = run(bundle, disturbed, f"{whose}, {under}" if whose else under)
         return played
 
-    def _reference(self, baseline: Bundle, name: str, outcomes: list[Outcome], context: Context) -> Row:
+    def _reference(self, baseline: Bundle, name: str, outcomes: list[Outcome], run: Run) -> Row:
         """Return the row of the baseline's episodes; play the controls that show what succeeds by chance."""
         row = success_row(name, "baseline", outcomes)
         if self.instruction != "right":
@@ -279,8 +291,8 @@ class ClosedLoop(Measure):
         controls = []
         for control in self.controls():
             (whose,) = control._whose([name])
-            outcomes = run_jobs(baseline, control._jobs(baseline), self.engine, context.about(whose))
-            controls.append(success_row(control.control, "subject", outcomes))
+            played = run(baseline, control._jobs(baseline), whose)
+            controls.append(success_row(control.control, "subject", played))
         return with_chance(row, controls)
 
     def controls(self) -> list[ClosedLoop]:

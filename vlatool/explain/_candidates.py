@@ -146,7 +146,7 @@ def measure(
         if baseline is None or not isinstance(candidate.stage, Transform):
             continue
         try:
-            candidate.bundle = run_transform(candidate.stage, baseline, scratch / str(number), Context())
+            candidate.bundle = run_transform(candidate.stage, baseline, scratch / str(number), Context()).bundle
         except VlatoolError as error:
             candidate.failed = error.message
     reference: list[Any] = []

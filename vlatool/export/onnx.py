@@ -20,7 +20,6 @@ from vlatool.machine.engine_calls import engine_call
 from vlatool.module.edits import is_changed
 from vlatool.module.folding import fold_weights
 from vlatool.module.memory import refuse_kept_values
-from vlatool.module.origin import factory_of
 from vlatool.module.sharded_weights import graph_weights, stored_modules, takes_shards, weights_on_demand
 from vlatool.module.to_onnx import (
     EXTERNAL_DATA_BYTES,
@@ -37,9 +36,10 @@ from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder, not_finite_text
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
-from vlatool.stage.base import Context, Transform, source_of
+from vlatool.stage.base import Context, Result, Transform
 from vlatool.stage.finish import carry_over, finish, graph_names
 from vlatool.stage.precision_shares import count_shares
+from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -65,10 +65,6 @@ class ExportOnnx(Transform):
     samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")
     tolerance: float = Field(1e-3, gt=0, description="largest relative L2 difference between torch and ONNX Runtime")
 
-    def runs(self, source: Bundle | None) -> str:
-        """The factory builds the modules, and their forward() runs."""
-        return factory_of(source)
-
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """What exports is installed: the child process that imports it takes seconds to say so."""
         for module in ("torch", "onnxscript", "onnx"):
@@ -83,26 +79,26 @@ class ExportOnnx(Transform):
                 "write the shapes into policy.yaml",
             )
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Export, run, compare, and write the bundle."""
-        bundle = source_of(source, self.name())
-        check_chunk(bundle.manifest.spec)
-        observations = observations_for(bundle, self.samples)
-        expected, graphs = self._run_and_export(bundle, observations, out, context)
+        check_chunk(source.manifest.spec)
+        observations = observations_for(source, self.samples)
+        expected, graphs = self._run_and_export(source, observations, out, context)
         gone = {name: rewrite_as_float32(out / graph.file) for name, graph in graphs.items()}
+        messages: tuple[str, ...] = ()
         for name, graph in graphs.items():
-            graphs[name] = replace(graph, precision=count_shares(out / graph.file, context))
-        carry_over(bundle, out)
+            shares, uncounted = count_shares(out / graph.file)
+            graphs[name], messages = replace(graph, precision=shares), messages + uncounted
+        carry_over(source, out)
         context.progress("checking in ONNX Runtime", None)
-        exported = finish(bundle, out, made_by=self.made_by(), graphs=graphs, observations=observations)
+        exported = finish(source, out, made_by=made_by(self), graphs=graphs, observations=observations)
         rounding = max((ROUNDING.get(kind, 0) for types in gone.values() for kind in types), default=0)
         error = self._compare(exported, observations, expected, max(self.tolerance, rounding))
-        for name, types in gone.items():
-            if types:
-                context.messages.append(
-                    f"{name}: {describe_conversion(types)}; its action differs from torch's by up to {error:.2g}"
-                )
-        return exported
+        converted = (
+            f"{name}: {describe_conversion(types)}; its action differs from torch's by up to {error:.2g}"
+            for name, types in gone.items() if types
+        )  # fmt: skip
+        return Result(exported, (*messages, *converted))
 
     def _run_and_export(
         self, bundle: Bundle, observations: list[dict[str, Any]], out: Path, context: Context

@@ -46,6 +46,8 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
         DataError: when accuracy is claimed and there is nothing to measure it on.
         GraphError: when a bundle cannot be run, hangs, or computes another golden action than its own.
     """
+    notes: list[str] = []
+    context = replace(context, note=notes.append)
     check(candidate, baseline, gate)
     for bundle in (candidate, baseline):
         refuse_findings(bundle, gate.accept)
@@ -65,7 +67,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     rows = (_row("baseline", baseline, timed, results), row)
     return Report(KIND, f"Gate of {name}", worst(result.verdict.outcome for result in results).value,
                   (*_summary(name, results), f"{inputs.description()}."), rows,
-                  command=context.command, environment=host, warnings=tuple(dict.fromkeys(context.notes)),
+                  command=context.command, environment=host, warnings=tuple(dict.fromkeys(notes)),
                   validity=validity(findings), findings=findings)  # fmt: skip
 
 

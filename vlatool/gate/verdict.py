@@ -9,18 +9,11 @@ from enum import Enum
 from typing import Any
 
 from vlatool.report import Measurement
+from vlatool.stats.outcome import Outcome as Outcome
 from vlatool.stats.sequential import ALPHA
 
 CONFIDENCE = 1 - 2 * ALPHA
 """Coverage of two-sided intervals: a verdict is wrong with chance ``ALPHA`` on either side."""
-
-
-class Outcome(str, Enum):
-    """Outcome of a claim, or of one of its numbers; the worst first."""
-
-    FAIL = "fail"
-    INCONCLUSIVE = "inconclusive"
-    PASS = "pass"
 
 
 class Reason(Enum):

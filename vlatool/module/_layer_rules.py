@@ -82,20 +82,20 @@ def _pixel_shuffle(walk: Values, node: Any) -> Shape:
 def _pixel_unshuffle(walk: Values, node: Any) -> Shape:
     """Turn places into the faster part of the channels."""
     given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
-    return _patches(walk, given, 3, sizes[-3], sizes[-2:])
+    return _patches(walk, given, sizes[-3], sizes[-2:])
 
 
 def _unfold(walk: Values, node: Any) -> Shape:
     """Let the channels of the places of a patch follow each other."""
     given, sizes = walk.shape_of(node.args[0]), sizes_of(node.meta["val"])
-    return _patches(walk, given, 3, sizes[-2], sizes[-1:])
+    return _patches(walk, given, sizes[-2], sizes[-1:])
 
 
-def _patches(walk: Values, given: Shape, back: int, size: int, space: list[int]) -> Shape:
-    walk.freeze(given[-back + 1 :])
-    channels = given[-back]
+def _patches(walk: Values, given: Shape, size: int, space: list[int]) -> Shape:
+    *lead, channels, rows, columns = given
+    walk.freeze((rows, columns))
     (patch,) = walk.frozen_axes([size // walk.factors.size(channels)])
-    return [*given[:-back], (*channels, *patch), *walk.frozen_axes(space)]
+    return [*lead, (*channels, *patch), *walk.frozen_axes(space)]
 
 
 def _fold(walk: Values, node: Any) -> Shape:

@@ -84,13 +84,6 @@ class Origin:
                 )
 
 
-def factory_of(source: Bundle | None) -> str:
-    """Return where the factory of a source bundle is, for messages; empty for a bundle that runs no code."""
-    if source is None or source.manifest.graphs:
-        return ""
-    return str(source.manifest.source.get("factory", "")).rpartition(":")[0]
-
-
 def origin_of(bundle: Bundle) -> Origin:
     """Return what a source bundle may run.
 

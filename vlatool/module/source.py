@@ -14,7 +14,7 @@ from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
 from vlatool.errors import SourceError
 from vlatool.module.description import Description
 from vlatool.registry import Claim
-from vlatool.stage.base import Transform
+from vlatool.stage.base import Stage, Transform
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -59,6 +59,10 @@ class Source(Transform):
         described = self.describe()
         return described is None or bool(described.graphs)
 
+    def trust_code(self) -> Self:
+        """Allow the policy's code to run in this process: the user typed its folder."""
+        return self
+
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Return the same source with the options that the build record of a bundle has for it.
 
@@ -86,6 +90,13 @@ def claimed_source(typed: str | Path) -> Source | None:
         return None
     source: type[Source] | None = registry.claimant("sources", str(typed), SourceError)
     return None if source is None else source.of(str(typed))
+
+
+def trust_policies(stage: Stage) -> None:
+    """Let the code of the policies that options of a stage name run in this process: the user typed them."""
+    for policy in (getattr(stage, name) for name in stage.policies):
+        if policy and (source := claimed_source(policy)):
+            source.trust_code()
 
 
 def source_of_policy(typed: str | Path) -> Source:

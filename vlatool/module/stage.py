@@ -21,12 +21,12 @@ from vlatool.module.edits import FOLDER, Edit, apply, concatenate_edits, holds_w
 from vlatool.module.failures import remedy_for
 from vlatool.module.fake_weights import as_float32, run_on_fake_tensors
 from vlatool.module.memory import refuse_hidden_state
-from vlatool.module.origin import factory_of
 from vlatool.module.sharded_weights import stored_modules, takes_shards, weights_on_demand
 from vlatool.module.torch_policy import load_modules, policy_of, torch_policy
 from vlatool.runtime.contract import OF_THE_POLICY, off_the_robot
-from vlatool.stage.base import Context, Transform, source_of
+from vlatool.stage.base import Context, Result, Transform
 from vlatool.stage.finish import SEED, carry_over, history, save_npz
+from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
     from torch import nn
@@ -52,6 +52,7 @@ class ModuleChanges:
         options: what the stage found out on this machine, under names of options of its own, so that it is made again
             in the same way wherever that is done.
         record: what it came to, for the record of the bundle, as JSON values.
+        messages: sentences on what was done.
     """
 
     edits: tuple[Edit, ...] = ()
@@ -60,6 +61,7 @@ class ModuleChanges:
     played: Mapping[str, Any] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     record: Mapping[str, Any] = field(default_factory=dict)
+    messages: tuple[str, ...] = ()
 
 
 class ModuleStage(Transform):
@@ -80,10 +82,6 @@ class ModuleStage(Transform):
                 "name the policy that it was made from",
             )
 
-    def runs(self, source: Bundle | None) -> str:
-        """The policy's factory is called."""
-        return factory_of(source)
-
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Change weights in place, and return what else is to be changed.
 
@@ -96,33 +94,21 @@ class ModuleStage(Transform):
         """Return whether ``change`` needs no more than one weight at a time, and no gradient."""
         return False
 
-    def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Return how large the modules are, and how to go on."""
-        size = sum(record.bytes for name, record in bundle.manifest.files.items() if name.endswith(".safetensors"))
-        folder, edits = read_location(bundle.path), _structure(bundle)
-        export = export_command(bundle.path)
-        if not holds_weights(bundle):
-            streams = f"vlatool quantize weight-only {bundle.path} -o BUNDLE --trust {folder}"
-            stay = f"weights stay in the shards in {folder}, {edits}; not exported yet:"
-            return (stay, export, f"{streams}    # one weight in memory at a time")
-        return (f"weights {size / 1e6:.2f} MB, {edits}; not exported yet:", export)
-
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Change the modules, write them, and run the policy once."""
         require("torch", "build")
-        bundle = source_of(source, self.name())
-        self.check(bundle, None)
-        if self.keeps_weights and takes_shards(bundle):
-            changed = self._write(bundle, out, self._chosen_on_shards(bundle, context), {}, context)
-            _run_once(changed)
-            return changed
-        changed = self._change_and_write(bundle, out, context)
+        if self.keeps_weights and takes_shards(source):
+            result = self._write(source, out, self._chosen_on_shards(source, context), {}, context)
+            _run_once(result.bundle)
+            return result
+        result = self._change_and_write(source, out, context)
+        changed = result.bundle
         answered = off_the_robot("the first observation", OF_THE_POLICY)
         with answered, _name_bad_weights(lambda: load_modules(changed)):
             torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
-        return changed
+        return result
 
-    def _change_and_write(self, bundle: Bundle, out: Path, context: Context) -> Bundle:
+    def _change_and_write(self, bundle: Bundle, out: Path, context: Context) -> Result:
         """Change the modules and write them; nothing keeps them while what was written runs."""
         modules = load_modules(bundle)
         refuse_hidden_state(bundle, modules)
@@ -139,14 +125,14 @@ class ModuleStage(Transform):
 
     def _write(
         self, bundle: Bundle, out: Path, done: ModuleChanges, modules: Mapping[str, nn.Module], context: Context
-    ) -> Bundle:
+    ) -> Result:
         """Write what was changed, with the modules; without them, where the weights stay in shards."""
-        made_by = self.made_by()
-        made_by |= {"options": {**made_by["options"], **done.options}, **done.record}
+        recorded = made_by(self)
+        recorded |= {"options": {**recorded["options"], **done.options}, **done.record}
         edits = concatenate_edits(read_edits(bundle), done.edits)
-        changed = write_modules(bundle, out, edits, modules, made_by, done.training, done.program, done.played)
+        changed = write_modules(bundle, out, edits, modules, recorded, done)
         context.progress("running the changed policy", None)
-        return changed
+        return Result(changed, done.messages)
 
 
 @contextlib.contextmanager
@@ -164,6 +150,18 @@ def _name_bad_weights(modules: Callable[[], Mapping[str, nn.Module]]) -> Iterato
                         "take weights from before the training that broke them",
                     ) from error
         raise
+
+
+def describe_modules(bundle: Bundle) -> tuple[str, ...]:
+    """Return how large the modules of a bundle without graphs are, and how to go on."""
+    size = sum(record.bytes for name, record in bundle.manifest.files.items() if name.endswith(".safetensors"))
+    folder, edits = read_location(bundle.path), _structure(bundle)
+    export = export_command(bundle.path)
+    if not holds_weights(bundle):
+        streams = f"vlatool quantize weight-only {bundle.path} -o BUNDLE --trust {folder}"
+        stay = f"weights stay in the shards in {folder}, {edits}; not exported yet:"
+        return (stay, export, f"{streams}    # one weight in memory at a time")
+    return (f"weights {size / 1e6:.2f} MB, {edits}; not exported yet:", export)
 
 
 def _structure(bundle: Bundle) -> str:
@@ -200,9 +198,7 @@ def write_modules(
     edits: Sequence[Edit],
     modules: Mapping[str, nn.Module],
     made_by: dict[str, Any],
-    training: Mapping[str, Any] | None = None,
-    program: tuple[ProgramStep, ...] | None = None,
-    played: Mapping[str, Any] | None = None,
+    done: ModuleChanges | None = None,
 ) -> Bundle:
     """Write a source bundle with other modules.
 
@@ -210,18 +206,18 @@ def write_modules(
         out: an empty directory.
         edits: all edits since the factory.
         modules: graph name -> module after the edits; none where the weights are those of the policy's shards.
-        program: how they run; as in the source when None.
-        played: observations that they were trained on, which the bundle keeps.
+        done: training, program and observations played; as in the source when None.
     """
+    done = done or ModuleChanges()
     write_module(out, edits, modules)
-    if training is not None:
-        (out / TRAINING).write_text(json.dumps(training) + "\n", encoding="utf-8")
+    if done.training is not None:
+        (out / TRAINING).write_text(json.dumps(done.training) + "\n", encoding="utf-8")
     carry_over(source, out)
-    if played is not None:
+    if done.played is not None:
         (out / OBSERVATIONS_FILE).parent.mkdir(exist_ok=True)
         (out / OBSERVATIONS_FILE).unlink(missing_ok=True)  # carried over, it may be the file of the bundle before
-        save_npz(out / OBSERVATIONS_FILE, played)
+        save_npz(out / OBSERVATIONS_FILE, done.played)
     shutil.copyfile(source.path / LOCATION, out / LOCATION)
     build = (*history(source), {**made_by, "input": source.hash})
-    program = source.manifest.program if program is None else program
+    program = source.manifest.program if done.program is None else done.program
     return seal(out, replace(source.manifest, program=program, parent=source.hash, made_by=made_by, build=build))

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from vlatool.measures.latency import LATENCY_P50, SPEEDUP
 from vlatool.measures.resources import SIZE
 from vlatool.measures.success import SUCCESS
-from vlatool.optimize.evidence import TIE
-from vlatool.optimize.judge import Judged, p50
+from vlatool.optimize.judge import Judged
+from vlatool.optimize.ranking import TIE, first_choice, is_faster, p50, ratio
 from vlatool.report import Row
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
-
-MIN_RATIO = 1.005
-"""Ratio of the medians from which on two decimals do not say 1.00."""
 
 
 def choose(
@@ -33,32 +31,46 @@ def choose(
         elsewhere: The board that the candidates are for, when it is not this host: its milliseconds are told, and not
             this host's.
     """
-    origin = "measured"
-    if engine not in engine_names() and all(p50(item.row, "predicted") < float("inf") for item in judged):
-        origin = "predicted"
-    inside = [item for item in judged if item.row.role != "baseline" and item.within]
-    if not inside:
-        best, reason, sentences = _nearest(judged, origin, elsewhere)
-    else:
-        best, reason = _best(inside, judged[0], origin, small)
+    origin, times = _times(judged, engine)
+    base, inside = judged[0], [item for item in judged[1:] if item.within]
+    if inside:
+        faster = [item for item in inside if is_faster(item.row, base.row, origin)]
+        best, reason = _best(inside, faster, base, times, origin, small)
         praised = origin == "measured"
-        sentences = _praise(best, judged, small, elsewhere) if praised else _foretell(best, judged)
+        sentences = _praise(best, judged, best in faster, small, elsewhere) if praised else _foretell(best, judged)
+    else:
+        best, reason, sentences = _nearest(judged, times, origin, elsewhere)
+    return mark(judged, best, reason, sentences)
+
+
+def mark(judged: list[Judged], best: Judged, reason: str, sentences: tuple[str, ...]) -> list[Judged]:
+    """Return the rows with that of ``best`` marked as chosen, and what is said of it."""
     chosen = replace(best, row=replace(best.row, role="chosen", reason=reason), sentences=sentences)
-    return [chosen if item is best else item for item in judged]
+    return [chosen if item.row.name == best.row.name else item for item in judged]
 
 
-def chosen_of(judged: list[Judged]) -> Judged:
+def _times(judged: list[Judged], engine: str) -> tuple[str, dict[str, float]]:
+    """Return what ranks the rows, ``measured`` or ``predicted``, and name -> median latency in ms of that origin."""
+    times = {item.row.name: p50(item.row, "predicted") for item in judged} if engine not in engine_names() else {}
+    if times and all(map(math.isfinite, times.values())):
+        return "predicted", times
+    return "measured", {item.row.name: p50(item.row) for item in judged}
+
+
+def chosen_of(judged: Sequence[Judged]) -> Judged:
     """Return the row that is marked as chosen."""
     return next(item for item in judged if item.row.role == "chosen")
 
 
-def _nearest(judged: list[Judged], origin: str, elsewhere: str) -> tuple[Judged, str, tuple[str, ...]]:
+def _nearest(
+    judged: list[Judged], times: Mapping[str, float], origin: str, elsewhere: str
+) -> tuple[Judged, str, tuple[str, ...]]:
     """Return the candidate that misses the limits by least, and what is said of all of them.
 
     Where none could be judged, and float32 keeps to the limits, float32 is returned.
     """
-    quantized = [item for item in judged if item.row.role != "baseline"]
-    best, base = min(quantized, key=lambda item: (item.miss, p50(item.row, origin))), judged[0]
+    base, *quantized = judged
+    best = min(quantized, key=lambda item: (item.miss, times[item.row.name]))
     missed = tuple(f"{item.row.name}: {item.row.reason}." for item in quantized)
     if base.within and math.isinf(best.miss):
         words = "no candidate could be judged"
@@ -66,58 +78,36 @@ def _nearest(judged: list[Judged], origin: str, elsewhere: str) -> tuple[Judged,
         return base, f"{words}; {base.row.reason}", (first, *missed)
     sentences = (
         f"No candidate keeps to the limits; the nearest, {best.row.name}, was kept."
-        + (f" It is {speed_words(best.row, judged[0].row, elsewhere)}." if elsewhere and origin == "measured" else "")
-        + foretold(best.row, judged[0].row, elsewhere),
+        + (f" It is {speed_words(best.row, base.row, elsewhere)}." if elsewhere and origin == "measured" else "")
+        + foretold(best.row, base.row, elsewhere),
         *missed,
     )
     return best, f"kept as the nearest, though outside the limits: {best.row.reason}", sentences
 
 
-def _best(inside: list[Judged], base: Judged, origin: str, small: bool) -> tuple[Judged, str]:
-    """Return the best of what keeps to the limits, and why it is."""
-    contest = inside
-    if base.within and not small:
-        faster = [item for item in inside if is_faster(item.row, base.row, origin)]
-        if not faster:
-            return base, f"no candidate inside the limits is faster ({origin}); {base.row.reason}"
-        contest = faster
-    best = _fastest(contest, origin)
-    first = min(p50(item.row, origin) for item in contest)
+def _best(
+    inside: list[Judged], faster: list[Judged], base: Judged, times: Mapping[str, float], origin: str, small: bool
+) -> tuple[Judged, str]:
+    """Return the best of what keeps to the limits, and why it is.
+
+    Args:
+        faster: those that are faster than float32.
+        times: name -> median latency in ms.
+    """
+    if base.within and not small and not faster:
+        return base, f"no candidate inside the limits is faster ({origin}); {base.row.reason}"
+    contest = faster if base.within and not small else inside
+    best = first_choice(contest, lambda item: times[item.row.name], lambda item: item.drop)
+    first = min(times[item.row.name] for item in contest)
     tied = f"within {TIE - 1:.0%} of the fastest inside the limits and the most accurate of those"
-    reason = "the fastest inside the limits" if p50(best.row, origin) == first else tied
-    if not is_faster(best.row, base.row, origin):
+    reason = "the fastest inside the limits" if times[best.row.name] == first else tied
+    if best not in faster:
         why = "memory was asked for" if small and base.within else f"{base.row.name} is outside: {base.row.reason}"
         reason = f"{reason}, though not faster than {base.row.name}: {why}"
     return best, f"{reason} ({origin}); {best.row.reason}"
 
 
-def is_faster(row: Row, base: Row, origin: str = "measured") -> bool:
-    """Say whether a row is faster than float32.
-
-    Measured: the interval of the speed-up lies above 1, and the speed-up that is printed does not round to 1.00.
-    Predicted: the prediction is; intervals of predictions for one board overlap, since they share their error.
-    """
-    if ratio(row, base, origin) < MIN_RATIO:
-        return False
-    speedup = row.get(SPEEDUP)
-    return origin == "predicted" or (speedup is not None and speedup.low is not None and speedup.low > 1.0)
-
-
-def ratio(row: Row, base: Row, origin: str = "measured") -> float:
-    """Return how many times as fast a row is as another: its speed-up, or the quotient of medians; 0 when unknown."""
-    if origin == "measured" and (speedup := row.get(SPEEDUP)) is not None and speedup.known:
-        return speedup.value
-    own, reference = p50(row, origin), p50(base, origin)
-    return reference / own if 0 < own < float("inf") and reference < float("inf") else 0.0
-
-
-def _fastest(items: list[Judged], origin: str) -> Judged:
-    least = min(p50(item.row, origin) for item in items)
-    tied = [item for item in items if p50(item.row, origin) <= TIE * least] or items
-    return min(tied, key=lambda item: item.drop)
-
-
-def _times(row: Row, base: Row) -> str:
+def _medians(row: Row, base: Row) -> str:
     return f"{p50(row):.4g} ms instead of {p50(base):.4g} ms, measured on this host"
 
 
@@ -148,19 +138,19 @@ def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
     known = speedup is not None and speedup.low is not None and speedup.high is not None
     span = f"; {speedup.low:.2f} to {speedup.high:.2f}" if speedup and known else ""
     times = ratio(row, base)
-    here = "measured on this host" if elsewhere else _times(row, base)
+    here = "measured on this host" if elsewhere else _medians(row, base)
     if is_faster(row, base):
         return f"{times:.2f}x as fast as {base.name} ({span[2:] + '; ' if elsewhere and span else ''}{here})"
     return f"not shown to be faster than {base.name} ({times:.3g}x{span}; {here})"
 
 
-def _praise(best: Judged, judged: list[Judged], small: bool, elsewhere: str) -> tuple[str, ...]:
+def _praise(best: Judged, judged: list[Judged], faster: bool, small: bool, elsewhere: str) -> tuple[str, ...]:
     row, base = best.row, judged[0].row
     if best is judged[0]:
         return _float32_kept(judged, elsewhere)
     success = f" {_episodes(row)}." if row.get(SUCCESS) else ""
     why = ""
-    if not is_faster(row, base):
+    if not faster:
         reason = "memory was asked for" if small and judged[0].within else f"{base.name} is outside: {base.reason}"
         why = f" It was chosen because {reason}."
     board = foretold(row, base, elsewhere)

@@ -12,8 +12,9 @@ from dataclasses import replace
 
 from vlatool.machine.instruction_sets import ENGINE, BoardSet
 from vlatool.measures.latency import LATENCY_P50, OPENVINO_FLOAT32_P50, SPEEDUP
-from vlatool.optimize.choice import choose, chosen_of, speed_words
-from vlatool.optimize.judge import Judged, p50
+from vlatool.optimize.choice import choose, chosen_of, mark, speed_words
+from vlatool.optimize.judge import Judged
+from vlatool.optimize.ranking import p50
 from vlatool.optimize.timings import IN_OPENVINO, OWN_SET
 from vlatool.report import Row
 
@@ -47,15 +48,14 @@ def choose_apart(
     if best is not base:
         first, *rest = best.sentences
         sentences = (first, _of_which(engines[best.row.name], where), *rest, how)
-        return _marked(judged, best, replace(best, sentences=sentences), best.row.reason)
+        return mark(judged, best, best.row.reason, sentences)
     return _kept(judged, "no candidate is predicted to be faster", how)
 
 
 def _kept(judged: list[Judged], why: str, *sentences: str) -> list[Judged]:
     """Mark float32 as the chosen one."""
     base = judged[0]
-    kept = replace(base, sentences=(f"{base.row.name} was kept: {why}.", *sentences))
-    return _marked(judged, base, kept, f"{why}; {base.row.reason}")
+    return mark(judged, base, f"{why}; {base.row.reason}", (f"{base.row.name} was kept: {why}.", *sentences))
 
 
 def _firsts(judged: list[Judged], engines: Mapping[str, str], small: bool) -> tuple[dict[str, Judged], tuple[str, ...]]:
@@ -109,9 +109,3 @@ def _by_prediction(times: Mapping[str, float], engines: Mapping[str, str]) -> st
     if any(engines.get(name) == ENGINE for name in times):
         figures += f"; {IN_OPENVINO} is predicted, its plans by their measured speed-ups"
     return f"Between the engines predictions for the board decided ({figures}): that was not measured."
-
-
-def _marked(judged: list[Judged], item: Judged, chosen: Judged, reason: str) -> list[Judged]:
-    """Return the list with one item replaced by what is said of it as the chosen one."""
-    best = replace(chosen, row=replace(chosen.row, role="chosen", reason=reason))
-    return [best if other.row.name == item.row.name else other for other in judged]

@@ -1,10 +1,9 @@
-"""The accuracy of every candidate: recorded observations, paired episodes, and what succeeds without looking."""
+"""What is known of every candidate: latency, recorded observations, paired episodes, predictions, trainings."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vlatool.accuracy.success_comparison import compare_success, with_chance
@@ -13,84 +12,76 @@ from vlatool.data import carries_evaluation, recordings_of
 from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
-from vlatool.measures import tables
-from vlatool.measures.latency import LATENCY_P50
+from vlatool.latency_model.predict import predictions
+from vlatool.machine.instruction_sets import ENGINE, about_onnx_runtime
+from vlatool.measures import series, tables, with_derived
 from vlatool.measures.success import SUCCESS, SUCCESS_WRONG_INSTRUCTION
-from vlatool.optimize.budget import distance_of
-from vlatool.report import Measurement, Row
+from vlatool.measures.training import TRAINING_TIME
+from vlatool.optimize.build_candidates import Candidates
+from vlatool.optimize.plan import BASELINE, Plan
+from vlatool.optimize.ranking import in_order
+from vlatool.optimize.timings import IN_OPENVINO, Timing, relabel_where, with_predictions
+from vlatool.report import Measurement, Report, Row
 from vlatool.stage.base import Context
+from vlatool.stage.controls import reservations, training_rows
 from vlatool.stage.run import cached_measure
 
-TIE = 1.01
-"""Candidates whose latencies differ by less are equally fast: two processes of one graph, in turns, differ by as much.
-More would give speed away: with 5 % the search delivered what was 3 % slower than one of its own plans."""
 Enough = Callable[[Row, Row], bool]
 """A candidate's row and float32's, both with their episodes -> whether no slower candidate can be chosen any more."""
 
 
-def with_accuracy(
-    rows: Mapping[str, Row],
-    bundles: Mapping[str, Bundle],
-    loop: ClosedLoop | None,
-    cache: Path,
-    context: Context,
-    enough: Enough | None = None,
-) -> dict[str, Row]:
-    """Return the rows with what recordings and episodes say of them.
+@dataclass(frozen=True)
+class Evidence:
+    """What was measured and predicted.
 
     Args:
-        bundles: Name -> bundle; the first is the float32 baseline, which the others are held against.
-        loop: The episodes; None for recordings alone.
-        enough: Ends the episodes: candidates play in the order in which they would be chosen. All play when None.
+        rows: name -> row, float32 first.
+        warnings: what a reader of the rows should know.
+        conditions: sentences on the instruction sets that the figures are of.
+    """
+
+    rows: Mapping[str, Row]
+    warnings: tuple[str, ...]
+    conditions: tuple[str, ...]
+
+
+def gather(
+    plan: Plan, source: Bundle, candidates: Candidates, context: Context, notes: Sequence[str], enough: Enough | None
+) -> Evidence:
+    """Measure float32 and all candidates, and predict for the board.
+
+    Args:
+        source: policy, for the time of eager torch.
+        notes: what the stages of the run noted so far; the list that those of this step are added to.
+        enough: see ``with_episodes``.
 
     Raises:
         DataError: when the recordings or the environment cannot be used.
     """
-    (base, baseline), *_ = bundles.items()
-    evaluated = {
-        name: replace(row, measurements=(*row.measurements, *_recorded(bundles[name], baseline, loop, cache, context)))
-        for name, row in rows.items()
+    bundles, where, loop, cache = candidates.bundles, plan.board_set, plan.closed_loop, plan.cache
+    timed, about_times = Timing(plan.recipe.effort, where, cache, context, plan.fresh).rows(source, bundles)
+    rows, about_actions = with_recordings(timed, bundles, loop, cache, context)
+    rows = with_episodes(rows, bundles, loop, cache, context, enough) if loop else rows
+    warnings = (*where.warnings(), *about_times, *about_actions, *dict.fromkeys(notes))
+    board, apart = plan.profile, {IN_OPENVINO: ENGINE} if where.is_confined else {}
+    asked = {**bundles, **dict.fromkeys(apart, bundles[BASELINE])}
+    misled = {
+        name: wrong_instruction(bundles[name], loop, cache, context)
+        for name in ((BASELINE, *candidates.trained) if candidates.trained and loop else ())
     }
-    if loop is None:
-        return evaluated
-    own = cached_measure(loop, baseline, cache, context.about(base)).rows[-1]
-    evaluated[base] = _joined(evaluated[base], _with_controls(loop, baseline, own, cache, context))
-    others = [row for name, row in evaluated.items() if name != base]
-    found = ""
-    for row in others if enough is None else in_order(others):
-        if found:
-            reason = f"its episodes were not played: {found} keeps to the limits and comes before it"
-            evaluated[row.name] = replace(row, reason=f"{reason} (--every-candidate plays all)")
-            continue
-        played = cached_measure(loop, bundles[row.name], cache, context.about(row.name)).rows[-1]
-        evaluated[row.name] = _joined(row, compare_success(own, played))
-        found = row.name if enough is not None and enough(evaluated[row.name], evaluated[base]) else ""
-    return evaluated
+    records = (f"{name}: {line}" for name in candidates.engines for line in reservations(bundles[name]))
+    trainings = {name: training_rows(candidates.stages[name]) for name in candidates.trained}
+    conditions = (*about_onnx_runtime(board), *where.sentences())
+    predicted = (
+        {name: predictions(board, bundle, apart.get(name, "")) for name, bundle in asked.items()} if board else {}
+    )
 
-
-def in_order(rows: Sequence[Row]) -> list[Row]:
-    """Return candidates in the order in which they would be chosen if all kept to the limits.
-
-    Of those that are as fast as the fastest that is left, the one nearest to float32 on recorded observations is first.
-    """
-    left, ordered = list(rows), []
-    while left:
-        least = min(_latency(row) for row in left)
-        tied = [row for row in left if _latency(row) <= TIE * least] or left
-        first = min(tied, key=_distance)
-        ordered.append(first)
-        left.remove(first)
-    return ordered
-
-
-def _latency(row: Row) -> float:
-    latency = row.get(LATENCY_P50)
-    return latency.value if latency is not None and latency.known else math.inf
-
-
-def _distance(row: Row) -> float:
-    distance = distance_of(row)
-    return distance.value if distance is not None and distance.known else math.inf
+    rows = relabel_where({name: with_derived(row) for name, row in rows.items()}, candidates.engines, where)
+    rows = with_predictions(rows, predicted)
+    for name, found in trainings.items():
+        rows[name] = _with_trainings(rows[name], found)
+        rows[name] = _with_wrong_instruction(rows[name], misled.get(name), misled.get(BASELINE))
+    return Evidence(rows, (*warnings, *records), conditions)
 
 
 def is_recorded(bundle: Bundle, loop: ClosedLoop | None) -> bool:
@@ -98,26 +89,71 @@ def is_recorded(bundle: Bundle, loop: ClosedLoop | None) -> bool:
     return recordings_of(bundle).evaluation is not None or (loop is None and carries_evaluation(bundle))
 
 
-def _recorded(
-    bundle: Bundle, baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Context
-) -> tuple[Measurement, ...]:
-    if not is_recorded(bundle, loop):
-        return ()
-    stage = Recorded(baseline=None if bundle is baseline else baseline.path)
-    return cached_measure(stage, bundle, cache, context).rows[-1].measurements
+def with_recordings(
+    rows: Mapping[str, Row], bundles: Mapping[str, Bundle], loop: ClosedLoop | None, cache: Path, context: Context
+) -> tuple[dict[str, Row], tuple[str, ...]]:
+    """Return the rows with their errors on recorded observations, and what these leave unjudged of float32's actions.
+
+    Args:
+        bundles: name -> bundle; the first is the float32 baseline, which the others are held against.
+    """
+    (base, baseline), *_ = bundles.items()
+    reports: dict[str, Report] = {
+        name: cached_measure(Recorded(baseline=None if name == base else baseline.path), bundle, cache, context)
+        for name, bundle in bundles.items()
+        if is_recorded(bundle, loop)
+    }
+    measured = {name: report.rows[-1].measurements for name, report in reports.items()}
+    added = {
+        name: replace(row, measurements=(*row.measurements, *measured.get(name, ()))) for name, row in rows.items()
+    }
+    return added, reports[base].warnings if base in reports else ()
 
 
-def unjudged_actions(baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Context) -> tuple[str, ...]:
-    """Return what the recordings leave unjudged of the baseline's actions, and so of any candidate's."""
-    if not is_recorded(baseline, loop):
-        return ()
-    return cached_measure(Recorded(), baseline, cache, context).warnings
+def with_episodes(
+    rows: Mapping[str, Row],
+    bundles: Mapping[str, Bundle],
+    loop: ClosedLoop,
+    cache: Path,
+    context: Context,
+    enough: Enough | None = None,
+) -> dict[str, Row]:
+    """Return the rows with what paired closed-loop episodes say of them.
+
+    Args:
+        rows: name -> row, float32 first.
+        enough: Ends the episodes: candidates play in the order in which they would be chosen. All play when None.
+
+    Raises:
+        DataError: when the environment cannot be used.
+    """
+    base, *candidates = rows.values()
+    baseline = bundles[base.name]
+    own = cached_measure(loop, baseline, cache, context.about(base.name)).rows[-1]
+    controls = [
+        replace(cached_measure(each, baseline, cache, context).rows[-1], name=each.control) for each in loop.controls()
+    ]
+    evaluated, found = dict(rows), ""
+    for row in (base, *(candidates if enough is None else in_order(candidates))):
+        if found:
+            reason = f"its episodes were not played: {found} keeps to the limits and comes before it"
+            evaluated[row.name] = replace(row, reason=f"{reason} (--every-candidate plays all)")
+            continue
+        if row is base:
+            compared = with_chance(own, controls)
+        else:
+            played = cached_measure(loop, bundles[row.name], cache, context.about(row.name)).rows[-1]
+            compared = compare_success(own, played)
+        evaluated[row.name] = _joined(row, compared)
+        if enough is not None and row is not base and enough(evaluated[row.name], evaluated[base.name]):
+            found = row.name
+    return evaluated
 
 
-def told_wrong(bundle: Bundle, loop: ClosedLoop | None, cache: Path, context: Context) -> Measurement | None:
-    """Return how often a policy succeeds that is told the wrong instruction: one that listens hardly does.
+def wrong_instruction(bundle: Bundle, loop: ClosedLoop | None, cache: Path, context: Context) -> Measurement | None:
+    """Return how often a policy succeeds that is given the wrong instruction: one that listens hardly does.
 
-    None without episodes, for a policy that takes no text, and in an environment that knows no wrong instruction.
+    None for a policy that takes no text, and in an environment that knows no wrong instruction.
     """
     if loop is None or not any(tensor.kind == "text" for tensor in bundle.manifest.spec.inputs):
         return None
@@ -137,11 +173,28 @@ def _joined(row: Row, played: Row) -> Row:
     return replace(row, measurements=measurements, raw=raw, details=details)
 
 
-def _with_controls(loop: ClosedLoop, baseline: Bundle, row: Row, cache: Path, context: Context) -> Row:
-    """Play what does not look, and add how often that succeeds to the row of float32."""
-    rows = []
-    for control in loop.controls():
-        context.progress(f"episodes of the control: {control.control} actions", None)
-        played = cached_measure(control, baseline, cache, context).rows[-1]
-        rows.append(replace(played, name=control.control))
-    return with_chance(row, rows)
+def _with_wrong_instruction(row: Row, told: Measurement | None, reference: Measurement | None) -> Row:
+    """Return the row of a trained candidate with how often it succeeds when it is told the wrong instruction.
+
+    Args:
+        told: The candidate's success; None where it is not known.
+    """
+    if told is None or reference is None:
+        return row
+    said = f"{told.value:.1%} of {told.samples} episodes succeed (float32: {reference.value:.1%})"
+    teachers = {
+        name: [{**record, "with the wrong instruction": said} for record in records]
+        for name, records in row.details.items() if tables.TEACHER.part(name) is not None
+    }  # fmt: skip
+    return replace(row, measurements=(*row.measurements, told), details={**row.details, **teachers})
+
+
+def _with_trainings(row: Row, trained: Iterable[Row]) -> Row:
+    """Return the row of a candidate with losses, rounds and times of its trainings."""
+    for other in trained:
+        raw = {name: values for name, values in other.raw.items() if series.LOSSES.part(name) is not None}
+        details = {name: records for name, records in other.details.items() if tables.ROUNDS.part(name) is not None}
+        took = TRAINING_TIME.members(other).values()
+        row = replace(row, raw={**row.raw, **raw}, details={**row.details, **details},
+                      measurements=(*row.measurements, *took))  # fmt: skip
+    return row

@@ -157,30 +157,25 @@ def _percent(share: float) -> str:
 
 def _recorded_drops(row: Row, baseline: Row) -> tuple[list[Measurement], bool]:
     """Return the drops on recorded observations, more is worse; and whether they are distances from float32 itself."""
-    drops = []
+    drops: list[tuple[Quantity, float, Measurement]] = []
     for quantity, drop, sign in (
         (actions.AGREEMENT_EXPERT, actions.AGREEMENT_DROP, -1.0),
         (actions.ERROR_EXPERT, actions.ERROR_INCREASE, 1.0),
     ):
         own, base = row.get(quantity), baseline.get(quantity)
         if own is not None and base is not None and own.known:
-            drops.append(_drop(drop, sign * (own.value - base.value), own, "recorded observations"))
-    if drops:
-        return drops, False
-    agreement, error = row.get(actions.AGREEMENT_BASELINE), row.get(actions.ERROR_BASELINE)
-    if agreement is not None:
-        drops = (
-            [_drop(actions.AGREEMENT_DROP, 1.0 - agreement.value, agreement, AGAINST_FLOAT32)]
-            if agreement.known
-            else []
-        )
-    elif error is not None and error.known:
-        drops = [_drop(actions.ERROR_INCREASE, error.value, error, AGAINST_FLOAT32)]
-    return drops, bool(drops)
-
-
-def _drop(quantity: Quantity, value: float, own: Measurement, note: str) -> Measurement:
-    return quantity.measurement(value, where=own.where, samples=own.samples, note=note)
+            drops.append((drop, sign * (own.value - base.value), own))
+    from_float32 = not drops
+    if from_float32:
+        agreement, error = row.get(actions.AGREEMENT_BASELINE), row.get(actions.ERROR_BASELINE)
+        if agreement is not None:
+            drops = [(actions.AGREEMENT_DROP, 1.0 - agreement.value, agreement)]
+        elif error is not None:
+            drops = [(actions.ERROR_INCREASE, error.value, error)]
+    note = AGAINST_FLOAT32 if from_float32 else "recorded observations"
+    known = [(drop, value, own) for drop, value, own in drops if own.known]
+    measured = [drop.measurement(value, where=own.where, samples=own.samples, note=note) for drop, value, own in known]
+    return measured, from_float32 and bool(measured)
 
 
 def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> Held:
@@ -250,9 +245,3 @@ def _drop_words(decisive: _Decisive) -> str:
 def _points(share: float) -> str:
     points = f"{100 * share:.3g}"
     return f"{points} point" + ("" if points == "1" else "s")
-
-
-def p50(row: Row, origin: str = "measured") -> float:
-    """Return the median latency of a row in ms, infinite when it is not known."""
-    latency = row.get(LATENCY_P50, origin)
-    return latency.value if latency is not None and latency.known else math.inf

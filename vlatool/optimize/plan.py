@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,8 +17,10 @@ from vlatool.optimize.study_storage import check_storage
 from vlatool.sources import Source, source_stage
 from vlatool.stage.base import Stage, Transform
 from vlatool.stage.build import build_stage
+from vlatool.stage.chain import steps_of
 
 BASELINE = "float32"
+Transforms = tuple[Transform, ...]
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,8 @@ class Plan:
     """
 
     source: Source
-    export: tuple[Transform, ...]
-    candidates: dict[str, tuple[Transform, ...]]
+    export: Transforms
+    candidates: Mapping[str, Transforms]
     recipe: Recipe
     profile: Profile | None
     cache: Path
@@ -95,10 +97,6 @@ class Plan:
 def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
     """Build and check every stage; nothing has run when this returns.
 
-    Args:
-        profile: The board; None for this host.
-        fresh: Measure again, even what was measured before.
-
     Raises:
         VlatoolError: for the first thing that cannot work.
     """
@@ -154,7 +152,7 @@ def _check_pruning(pruning: Pruning, source: Source) -> None:
     require_present("optuna", "search")
 
 
-def transforms(stages: StageList) -> tuple[Transform, ...]:
+def transforms(stages: StageList) -> Transforms:
     """Return the stages of a list of entries, each as the steps that it stands for.
 
     Raises:
@@ -173,7 +171,7 @@ def transforms(stages: StageList) -> tuple[Transform, ...]:
                 f"The stage {name} measures; a recipe lists stages that make a bundle.",
                 "leave the stage out of the recipe: optimize measures by itself",
             )
-        built += stage.chain()
+        built += steps_of(stage)
     return tuple(built)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -14,7 +15,7 @@ from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import carries_evaluation
 from vlatool.episodes.play import EVALUATION_SEEDS
-from vlatool.errors import NOT_POSSIBLE, VlatoolError
+from vlatool.errors import NOT_POSSIBLE
 from vlatool.evaluate.recorded import Recorded
 from vlatool.files.resumable_work import work_directory
 from vlatool.machine.version import VERSION
@@ -22,18 +23,17 @@ from vlatool.measures.latency import SPEEDUP
 from vlatool.measures.success import SUCCESS_DROP
 from vlatool.measures.training import TRAINING_TIME
 from vlatool.optimize.budget import budget_of
-from vlatool.optimize.build_candidates import candidate
+from vlatool.optimize.build_candidates import candidate, engine_of
 from vlatool.optimize.moves import Held, judge_moves
 from vlatool.optimize.plan import Plan, transforms
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.search import QUICK
 from vlatool.optimize.space import Shape, Space, quantizations, space_of
 from vlatool.optimize.study import Study, Tried
-from vlatool.optimize.training_records import trainings
 from vlatool.report import Row
-from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
 from vlatool.stage.cache import STREAMS
+from vlatool.stage.controls import training_rows
 from vlatool.stage.run import cached_measure
 
 SELECTION_SEEDS = 2 * EVALUATION_SEEDS
@@ -43,39 +43,38 @@ TIMED_RUNS = 60
 STUDY_COLUMN = "the study says"
 UNMEASURED_NOTE = "not measured in this run"
 CANDIDATE_NOTE = "measured as a candidate"
+Table = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class PrunedSearch:
-    """Trials of one run.
-
-    Args:
-        plan: With the recipe; its candidates are how a pruned policy may be quantized.
-        baseline: The whole policy in float32.
-    """
+    """Trials of one run, held against the whole policy in float32."""
 
     plan: Plan
     source: Bundle
     baseline: Bundle
     context: Context
 
-    def run(self) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
+    def run(self, candidates: Mapping[str, StageList]) -> tuple[dict[str, StageList], dict[str, Table]]:
         """Try as many as the recipe says; return the finalists, fastest first, and a table of all.
+
+        Args:
+            candidates: name -> stages; how a pruned policy may be quantized.
 
         Raises:
             RecipeError: when nothing of the policy can be pruned.
             UsageError: when the study cannot be opened.
         """
         if study := self.plan.recipe.pruning.study:
-            return self._run(study)
+            return self._run(study, candidates)
         directory = self.plan.cache / STREAMS / f"optimize.trials-{self._name().rpartition('-')[2]}"
         with work_directory(directory):  # of this machine, so that an interrupted run goes on
-            return self._run(f"sqlite:///{directory.absolute() / 'trials.db'}")
+            return self._run(f"sqlite:///{directory.absolute() / 'trials.db'}", candidates)
 
-    def _run(self, url: str) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
+    def _run(self, url: str, candidates: Mapping[str, StageList]) -> tuple[dict[str, StageList], dict[str, Table]]:
         pruning = self.plan.recipe.pruning
         study = Study(url, self._name(), self._allowed, pruning.seed)
-        quantized = study.agree_on(self._quantizations())
+        quantized = study.agree_on(self._quantizations(candidates))
         space = space_of(self.source, pruning, quantized, self.plan.cache, self.context)
         study.begin(space)
         while (asked := study.ask(pruning.trials)) is not None:
@@ -99,16 +98,13 @@ class PrunedSearch:
         digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
         return f"{self.baseline.manifest.name}-{digest}"
 
-    def _quantizations(self) -> dict[str, StageList]:
+    def _quantizations(self, candidates: Mapping[str, StageList]) -> dict[str, StageList]:
         """Return how the whole policy was quantized: name -> stages, the fastest first."""
         speeds: dict[str, float] = {}
-        found = quantizations(self.plan.recipe.candidates)
+        found = quantizations(candidates)
         for name, stages in found.items():
-            try:
+            with contextlib.suppress(*NOT_POSSIBLE):
                 speeds[name] = self._speedup(self._made(stages)[-1])
-            except VlatoolError as failure:
-                if failure.exit_code not in NOT_POSSIBLE:
-                    raise
         return {name: found[name] for name in sorted(speeds, key=lambda name: -speeds[name])}
 
     def _try(self, shape: Shape, space: Space) -> Tried:
@@ -118,16 +114,14 @@ class PrunedSearch:
             drop, moves = self._judged(made[-1])
             return Tried(shape, self._speedup(made[-1]), drop, _training_s(made), miss=moves.miss,
                          refused="; ".join(miss.words for miss in moves.missed))  # fmt: skip
-        except VlatoolError as failure:
-            if failure.exit_code not in NOT_POSSIBLE:
-                raise
+        except NOT_POSSIBLE as failure:
             return Tried(shape, note=failure.message)
 
-    def _made(self, stages: StageList) -> list[Bundle]:
+    def _made(self, stages: StageList) -> tuple[Bundle, ...]:
         return candidate(transforms(stages), self.source, self.baseline, self.plan, self.context)
 
     def _speedup(self, bundle: Bundle) -> float:
-        engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self.plan.board_set.is_confined else ""
+        engine = engine_of(bundle) if self.plan.board_set.is_confined else ""
         threads = self.plan.recipe.effort.threads
         timing = Latency(against=(bundle.path,), iterations=TIMED_RUNS, threads=threads, engine=engine, **QUICK)
         return cached_measure(timing, self.baseline, self.plan.cache, self.context).rows[-1].value(SPEEDUP)
@@ -162,7 +156,8 @@ class PrunedSearch:
 
     def _finalists(self, tried: list[Tried], space: Space) -> list[Tried]:
         """Return the fastest pruned ones within the budget, first those that move well; else the most accurate."""
-        pruned = [each for each in _best_of_each(tried) if each.speedup > 0 and not space.is_whole(each.shape)]
+        by_shape = {each.shape: each for each in tried}  # chance may choose one twice
+        pruned = [each for each in by_shape.values() if each.speedup > 0 and not space.is_whole(each.shape)]
         inside = [each for each in pruned if each.drop <= self._allowed]
         inside.sort(key=lambda each: (bool(each.refused), -each.speedup))
         return inside[:FINALISTS] or sorted(pruned, key=lambda each: each.drop)[:1]
@@ -173,7 +168,7 @@ class PrunedSearch:
         points = self.plan.closed_loop is not None and not self.plan.recipe.limits.metric
         return f"{100 * drop:.1f} points" if points else f"{drop:.4g}"
 
-    def _table(self, tried: list[Tried], space: Space) -> list[dict[str, Any]]:
+    def _table(self, tried: list[Tried], space: Space) -> Table:
         """Return all trials; what the study says of those that were not made in this run stands in a column of its own.
 
         A study may be written by anybody who reaches it, so that nothing of it is shown as measured.
@@ -204,7 +199,7 @@ class PrunedSearch:
         }
 
 
-def with_measured(table: list[dict[str, Any]], rows: Mapping[str, Row]) -> list[dict[str, Any]]:
+def with_measured(table: Table, rows: Mapping[str, Row]) -> Table:
     """Return the trials with the speed-up and the drop of those that were measured in this run after all.
 
     Args:
@@ -233,14 +228,9 @@ def front_of(tried: list[Tried]) -> list[Tried]:
     ]  # fmt: skip
 
 
-def _best_of_each(tried: list[Tried]) -> list[Tried]:
-    """Return one trial of each shape: chance may choose one twice."""
-    return list({each.shape: each for each in tried}.values())
-
-
-def _training_s(made: list[Bundle]) -> float:
+def _training_s(made: tuple[Bundle, ...]) -> float:
     """Return the seconds that the trainings of a policy took when it was trained."""
-    return sum(item.value for row in trainings(made) for item in TRAINING_TIME.members(row).values())
+    return sum(item.value for row in training_rows(made) for item in TRAINING_TIME.members(row).values())
 
 
 def _titled(elsewhere: int) -> str:

@@ -26,21 +26,21 @@ from vlatool import registry
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations, recordings_of
-from vlatool.errors import NOT_POSSIBLE, GraphError, PluginError, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, GraphError, PluginError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
 from vlatool.machine.instruction_sets import board_set
 from vlatool.machine.target import target_of
 from vlatool.measures.latency import SPEEDUP
 from vlatool.optimize.budget import budget_of
+from vlatool.optimize.build_candidates import chain, engine_of
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Limits, StageList
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, is_installed
-from vlatool.runtime.policy import refuse_findings
+from vlatool.runtime.engine import engine_class, engine_names, is_installed
 from vlatool.stage.base import Context
 from vlatool.stage.build import stage_class
-from vlatool.stage.run import cached_measure, cached_transform
+from vlatool.stage.run import cached_measure
 
 if TYPE_CHECKING:
     from vlatool.sensitivity.layers import LayerError
@@ -92,11 +92,7 @@ class Trial:
 
 @dataclass
 class Search:
-    """One run of the search.
-
-    Args:
-        profile: The board; None for this host.
-    """
+    """One run of the search, for a board or, without a profile, for this host."""
 
     baseline: Bundle
     limits: Limits
@@ -158,15 +154,12 @@ class Search:
         self.context.progress(f"search: plan {done + 1} of at most {self._planned}{rest}: {name}", done / self._planned)
         quiet = replace(self.context, progress=lambda _what, _share: None)
         try:
-            bundle = self.baseline
-            for stage in transforms(stages):
-                stage.check(bundle, self.profile)
-                bundle = cached_transform(stage, bundle, self.cache, quiet)
-            refuse_findings(bundle, self.limits.accept)
+            made = chain(transforms(stages), self.baseline, self.profile, self.limits.accept, self.cache, quiet)
+            bundle = made[-1]
             twin = self._seen.setdefault(graphs_of(bundle), name)
             if twin != name:  # no product has enough rows to become a convolution, say
                 raise GraphError(f"It has the graphs of {twin}.", f"look at {twin} in its place")
-            engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self._apart else ""
+            engine = engine_of(bundle) if self._apart else ""
             timing = Latency(
                 against=(bundle.path,), iterations=TIMED_RUNS, threads=self.threads, engine=engine, **QUICK
             )
@@ -176,9 +169,7 @@ class Search:
             trial = Trial(
                 name, stages, speedup, error, error <= SELECTION_SHARE * self.budget.value, "", engine, fastest
             )
-        except VlatoolError as failure:
-            if failure.exit_code not in NOT_POSSIBLE:
-                raise
+        except NOT_POSSIBLE as failure:
             trial = Trial(name, stages, note=failure.message)
         self.trials.append(trial)
         return trial
@@ -310,11 +301,7 @@ def _useful(base: Trial, trial: Trial, extra: Mapping[str, Any]) -> bool:
 
 
 def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageList]:
-    """Return the plans that every search begins with: name -> stages.
-
-    Args:
-        profile: The board; None for this host.
-    """
+    """Return the plans that every search for a board (None: this host) begins with: name -> stages."""
     known = engine_names()
     board = known if profile is None else [name for name in known if name in profile.engines]
     variants: dict[str, StageList] = {}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import NOT_POSSIBLE, RecipeError, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, RecipeError
 from vlatool.module.edits import BLOCKS, read_edits
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Pruning, StageList
@@ -128,10 +128,8 @@ def space_of(
         (stage,) = transforms(({name: options},))
         try:
             stage.check(source, None)
-            return cached_transform(stage, source, cache, context)
-        except VlatoolError as error:
-            if error.exit_code not in NOT_POSSIBLE:
-                raise
+            return cached_transform(stage, source, cache, context).bundle
+        except NOT_POSSIBLE as error:
             refused.append(f"{name}: {error.message}")
             return None
 

@@ -109,7 +109,7 @@ class Study:
         with storage_errors(self._url):
             for shape in space.first():
                 self._study.enqueue_trial(asdict(shape), skip_if_exists=True)
-            self._left = self._dead()
+            self._left = [trial.number for trial in self._trials() if self._is_left(trial)]
 
     def ask(self, trials: int) -> tuple[int, Shape] | None:
         """Return the number and shape of the next trial, None when so many are done or under way, or all was tried.
@@ -212,11 +212,8 @@ class Study:
         trial: Trial = self._optuna.trial.Trial(self._study, self._trials()[number]._trial_id)
         return trial
 
-    def _dead(self) -> list[int]:
-        """Return the trials that processes of this machine had under way when they were killed."""
-        return [trial.number for trial in self._trials() if self._is_left(trial)]
-
     def _is_left(self, trial: FrozenTrial) -> bool:
+        """Return whether a process of this machine had a trial under way when it was killed."""
         running = trial.state == self._optuna.trial.TrialState.RUNNING
         return running and _is_dead(str(trial.user_attrs.get(WORKER_KEY, "")))
 

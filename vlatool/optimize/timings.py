@@ -9,13 +9,11 @@ from pathlib import Path
 
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
-from vlatool.hardware.profile import Profile
-from vlatool.latency_model.predict import predictions
 from vlatool.machine.instruction_sets import ENGINE, BoardSet
 from vlatool.measures.latency import LATENCY_P50, OPENVINO_FLOAT32_P50, SPEEDUP, TORCH_EAGER_P50
+from vlatool.optimize.build_candidates import engine_of
 from vlatool.optimize.recipe import Effort
 from vlatool.report import Measurement, Row
-from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_measure
 
@@ -122,25 +120,12 @@ def relabel_where(rows: Mapping[str, Row], engines: Mapping[str, str], where: Bo
     }  # fmt: skip
 
 
-def foretold_by_engine(
-    profile: Profile, bundles: Mapping[str, Bundle], where: BoardSet
-) -> dict[str, list[Measurement]]:
-    """Return what is predicted for each bundle on a board; where OpenVINO is confined, float32 in it as well.
-
-    Args:
-        bundles: Name -> bundle, float32 first.
-        where: The set that OpenVINO is confined to, if it is.
-    """
-    predicted = {name: predictions(profile, bundle) for name, bundle in bundles.items()}
-    (base, baseline), *_ = bundles.items()
-    own = predictions(profile, baseline, ENGINE) if where.is_confined else []
-    predicted[base] += [OPENVINO_FLOAT32_P50.relabel(number) for number in own if number.name == LATENCY_P50.name]
-    return predicted
-
-
-def engine_of(bundle: Bundle) -> str:
-    """Return the engine that a bundle was made for."""
-    return bundle.manifest.engine or DEFAULT_ENGINE
+def with_predictions(rows: Mapping[str, Row], predicted: Mapping[str, Sequence[Measurement]]) -> dict[str, Row]:
+    """Return the rows, float32 first, with what is predicted for each; float32 also has its latency in OpenVINO."""
+    base = next(iter(rows))
+    apart = [number for number in predicted.get(IN_OPENVINO, ()) if number.name == LATENCY_P50.name]
+    added = {**predicted, base: (*predicted.get(base, ()), *map(OPENVINO_FLOAT32_P50.relabel, apart))}
+    return {name: replace(row, measurements=(*row.measurements, *added.get(name, ()))) for name, row in rows.items()}
 
 
 def utc_now() -> str:

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from vlatool.bundle.bundle import Bundle
 from vlatool.errors import FallsShort
 from vlatool.module.axes import Walk
 from vlatool.prune._unit_groups import Macs
-from vlatool.stage.controls import PRUNED_KEY
 
 MIN_REACHED = 0.9
 """Share of the requested reduction that a result must reach."""
@@ -51,9 +49,8 @@ def describe_reduction(record: Mapping[str, Any]) -> tuple[str, ...]:
     return (reached, *([f"{explanation}: {', '.join(unknown)}"] if unknown else []))
 
 
-def refuse_shortfall(bundle: Bundle) -> None:
-    """Refuse a bundle whose pruning missed the requested reduction by more than a tenth."""
-    record = bundle.manifest.made_by[PRUNED_KEY]
+def refuse_shortfall(record: Mapping[str, Any]) -> None:
+    """Refuse what missed the requested reduction by more than a tenth."""
     if record["reached"] >= MIN_REACHED * record["asked"]:
         return
     names = [f"{name} ({share:.1%})" for name, share in list(record["keeps"].items())[:MAX_NAMED]]

@@ -53,16 +53,15 @@ class SparsePruning(ModuleStage):
         """Set weights to zero."""
         check_pattern(self.pattern, self.ratio)
         selection = select_layers(modules, source, self.include, self.exclude)
-        context.messages.extend(selection.describe())
         layers = selection.prunable
-        context.messages.extend(unrecorded_note(source, self.samples) if self.uses_inputs else ())
         moments = self._input_moments(layers, modules, source, context) if self.uses_inputs else {}
         for number, (name, layer) in enumerate(layers.items()):
             context.progress(f"pruning {name}", number / len(layers))
             flat = layer.weight.detach().reshape(len(layer.weight), -1)
             pruned = self.prune_weight(flat, moments.get(name))
             layer.weight.data = pruned.reshape(layer.weight.shape).to(layer.weight.dtype)
-        return ModuleChanges()
+        unrecorded = unrecorded_note(source, self.samples) if self.uses_inputs else ()
+        return ModuleChanges(messages=(*selection.describe(), *unrecorded))
 
     def prune_weight(self, weight: Tensor, moments: Tensor | None) -> Tensor:
         """Return a weight with zeros.
@@ -82,9 +81,9 @@ class SparsePruning(ModuleStage):
         """
         return smallest_mask(score, self.pattern, self.ratio, rows=rows)
 
-    def lines(self, pruned: Bundle) -> tuple[str, ...]:
+    def summarize(self, pruned: Bundle) -> tuple[str, ...]:
         """Report the share of zeros, and the engines that benefit."""
-        return (*describe_zeros(pruned, self.pattern), *super().lines(pruned))
+        return describe_zeros(pruned, self.pattern)
 
     def _input_moments(
         self, layers: Mapping[str, Any], modules: Mapping[str, nn.Module], source: Bundle, context: Context

@@ -83,13 +83,16 @@ class Depth(ModuleStage):
         sizes = self._selected_stacks(self._sizes(modules), source)
         explicit = _explicit_blocks(sizes, self.keep) if self.keep else {}
         remaining = explicit or self._remaining_blocks(sizes, modules, source, context)
-        context.messages.extend(
+        ranked = not explicit and self.rank != "even"
+        kept_blocks = (
             f"kept {len(kept)} of {sizes[graph, name]} blocks of {name or 'the module itself'}: "
             f"{', '.join(map(str, kept))}"
             for (graph, name), kept in remaining.items()
         )
         edits = [Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in remaining.items()]
-        return ModuleChanges(tuple(sorted(edits, key=lambda edit: -len(edit.module))))  # stacks within blocks first
+        edits.sort(key=lambda edit: -len(edit.module))  # stacks within blocks first
+        unrecorded = unrecorded_note(source, self.samples) if ranked else ()
+        return ModuleChanges(tuple(edits), messages=(*unrecorded, *kept_blocks))
 
     def _sizes(self, modules: Mapping[str, nn.Module]) -> dict[StackId, int]:
         """Return the number of blocks of each stack; a shared stack belongs to its first graph."""
@@ -106,7 +109,6 @@ class Depth(ModuleStage):
             raise RecipeError(f"{requested} removes no block of {_list_stacks(sizes)}.", "ask for more")
         if self.rank == "even":
             return {stack: evenly_spaced(sizes[stack], sizes[stack] - count) for stack, count in removals.items()}
-        context.messages.extend(unrecorded_note(source, self.samples))
         ranking = BlockRanking(modules, source, self.samples)
         remaining = {stack: list(range(sizes[stack])) for stack in removals}
         for (graph, name), block in self._removal_order(ranking, remaining, removals, context):

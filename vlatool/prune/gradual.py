@@ -69,8 +69,8 @@ class Gradual(ImitationStage):
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Train, and report the layers that stay dense."""
-        context.messages.extend(select_layers(modules, source, self.include, self.exclude).describe())
-        return super().change(modules, source, context)
+        selection = select_layers(modules, source, self.include, self.exclude)
+        return replace(super().change(modules, source, context), messages=selection.describe())
 
     def objective(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Objective:
         """Return the objective: imitate the teacher with a growing share of zeros."""
@@ -78,9 +78,9 @@ class Gradual(ImitationStage):
         zeros = GrowingZeros([layer.weight for layer in layers], self._pruned_mask, self.shares())
         return replace(super().objective(modules, source, teacher), constraint=zeros)
 
-    def lines(self, pruned: Bundle) -> tuple[str, ...]:
+    def summarize(self, pruned: Bundle) -> tuple[str, ...]:
         """Report the share of zeros, and the training."""
-        return (*describe_zeros(pruned, self.pattern), *super().lines(pruned))
+        return (*describe_zeros(pruned, self.pattern), *super().summarize(pruned))
 
     def _pruned_mask(self, sizes: Tensor, share: float) -> Tensor:
         return smallest_mask(sizes, self.pattern, share, rows=False)

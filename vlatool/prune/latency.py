@@ -39,6 +39,7 @@ from vlatool.prune._trials import Trials
 from vlatool.prune._unit_groups import Macs, Rank, UnitGroup, find_groups, no_units, rank_units, trace_walks
 from vlatool.prune.depth import PROTECTED_WORDS
 from vlatool.stage.base import Context
+from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
     from torch import nn
@@ -77,26 +78,28 @@ class LatencyPruning(ModuleStage):
     exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
     chosen: str = Field("", description="choice of an earlier run, from its manifest; nothing is measured then")
 
-    def on(self, profile: Profile) -> Self:
+    def on(self, board: Profile | None) -> Self:
         """Return the stage that predicts for a board, or measures where the board is this machine.
 
         Raises:
             RecipeError: when no profile has its name, another board was named, or ``threads`` was set.
         """
+        if board is None:
+            return self
         if self.board:
-            if load_profile(self.board) != profile:
-                message = f"--board {self.board} and --profile {profile.name} are different boards."
+            if load_profile(self.board) != board:
+                message = f"--board {self.board} and --profile {board.name} are different boards."
                 raise RecipeError(message, "name one of them")
             return self
-        if matches(profile.model_strings, fingerprint()):
+        if matches(board.model_strings, fingerprint()):
             return self
-        if profile.name not in profile_names() or load_profile(profile.name) != profile:
+        if board.name not in profile_names() or load_profile(board.name) != board:
             raise RecipeError(
-                f"The bundle records for which board it was pruned, and {profile.name} is not a known profile.",
+                f"The bundle records for which board it was pruned, and {board.name} is not a known profile.",
                 "name its file: --board FILE, or add its folder to VLATOOL_PROFILES",
             )
-        self._refuse_threads(profile.name)
-        return self.model_copy(update={"board": profile.name})
+        self._refuse_threads(board.name)
+        return self.model_copy(update={"board": board.name})
 
     @model_validator(mode="after")
     def _check_board(self) -> Self:
@@ -121,10 +124,10 @@ class LatencyPruning(ModuleStage):
         files = (profile_file(self.board), *sorted(calibrations().glob("*.json")))
         return super().key(" ".join([source_hash, *map(hash_file, files)]))
 
-    def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Report the size of the modules, and a latency that was only predicted."""
+    def summarize(self, bundle: Bundle) -> tuple[str, ...]:
+        """Report a latency that was only predicted."""
         predicted = f"predicted, not measured: {self.target_ms:g} ms or up to {TOLERANCE:.0%} less on {self.board}"
-        return (*super().lines(bundle), *([predicted] if self.board and not self.chosen else []))
+        return (predicted,) if self.board and not self.chosen else ()
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the blocks and units to keep.
@@ -144,7 +147,6 @@ class LatencyPruning(ModuleStage):
         if not groups:
             raise no_units(source.manifest.name)
         context.progress(f"ranking the units of {len(groups)} groups", None)
-        context.messages.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
         work = Macs(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
@@ -152,7 +154,9 @@ class LatencyPruning(ModuleStage):
             meter = self._meter(source, scratch, context)
             edits = self._meet_target(groups, blocks, work, meter, context)
         board = {"board": load_profile(self.board).name} if self.board else {}
-        return ModuleChanges(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
+        options = {"chosen": json.dumps([asdict(edit) for edit in edits]), **board}
+        messages = unrecorded_note(source, self.samples) if self.rank == "gate" else ()
+        return ModuleChanges(edits, options=options, messages=messages)
 
     def _predict_whole(self, source: Bundle, context: Context) -> None:
         """Predict the unpruned policy before the ranking, in case the target is met already."""
@@ -162,7 +166,7 @@ class LatencyPruning(ModuleStage):
         self._refuse_if_met(whole)
 
     def _meter(self, source: Bundle, scratch: Path, context: Context) -> LatencyMeter:
-        arguments = (source, scratch, self.engine, self.threads, self.made_by(), context)
+        arguments = (source, scratch, self.engine, self.threads, made_by(self), context)
         return LatencyPredictor(load_profile(self.board), *arguments) if self.board else LatencyMeter(*arguments)
 
     def _refuse_if_met(self, whole: float) -> None:

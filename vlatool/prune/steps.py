@@ -49,11 +49,11 @@ class Steps(ModuleStage):
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Change the program alone."""
         before, program = source.manifest.program, self._program(source.manifest.program)
-        context.messages.extend(
+        changed = (
             f"steps of '{old.graph}': {old.repeat} -> {new.repeat}"
             for old, new in zip(before, program, strict=True) if old != new
         )  # fmt: skip
-        return ModuleChanges(program=program)
+        return ModuleChanges(program=program, messages=tuple(changed))
 
     def _program(self, steps: Sequence[ProgramStep]) -> tuple[ProgramStep, ...]:
         if all(step.repeat == 1 for step in steps):

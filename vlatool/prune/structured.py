@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pydantic import Field
@@ -45,15 +46,18 @@ class Structured(ModuleStage):
         Raises:
             RecipeError: when everything removable is excluded, or a pattern matches nothing.
             SourceError: when torch.export cannot trace a module.
+            FallsShort: when it misses the ratio by more than a tenth.
         """
         context.progress("tracing the policy", None)
         walks = trace_walks(modules, source)
         groups = find_groups(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         context.progress(f"ranking the units of {len(groups)} groups", None)
         if groups:
-            context.messages.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
             rank_units(groups, self.rank, modules, source, self.samples)
-        return self.choose(walks, groups, {step.graph: step.repeat for step in source.manifest.program}, context)
+        changes = self.choose(walks, groups, {step.graph: step.repeat for step in source.manifest.program}, context)
+        refuse_shortfall(changes.record[PRUNED_KEY])
+        unrecorded = unrecorded_note(source, self.samples) if groups and self.rank == "gate" else ()
+        return replace(changes, messages=(*unrecorded, *changes.messages))
 
     def choose(
         self, walks: Mapping[str, Walk], groups: Sequence[UnitGroup], runs: Mapping[str, int], context: Context
@@ -68,17 +72,8 @@ class Structured(ModuleStage):
         self._remove(groups, work, context)
         whole, remaining = [group.size for group in groups], [group.remaining for group in groups]
         record = reduction_record(self.ratio, work, whole, remaining, walks.values())
-        context.messages.extend(describe_reduction(record))
         edits = tuple(group.edit() for group in groups if group.remaining < group.size)
-        return ModuleChanges(edits, record={PRUNED_KEY: record})
-
-    def accept(self, bundle: Bundle) -> None:
-        """Refuse a bundle that falls short of the ratio.
-
-        Raises:
-            FallsShort: by more than a tenth.
-        """
-        refuse_shortfall(bundle)
+        return ModuleChanges(edits, record={PRUNED_KEY: record}, messages=tuple(describe_reduction(record)))
 
     def _remove(self, groups: Sequence[UnitGroup], work: Macs, context: Context) -> None:
         """Remove units, in the order of importance for the work that they save, while there are any."""

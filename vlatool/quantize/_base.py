@@ -7,10 +7,10 @@ import fnmatch
 import io
 import logging
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import Field
 
@@ -27,10 +27,11 @@ from vlatool.graph.precision import FLOATS
 from vlatool.quantize.calibration.non_finite import finite_layers
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
-from vlatool.stage.base import Context, Transform, source_of
+from vlatool.stage.base import Context, Result, Transform
 from vlatool.stage.finish import MAX_COMPARED, carry_over, finish, history
 from vlatool.stage.precision_shares import count_shares
 from vlatool.stage.products import int8_arithmetic
+from vlatool.stage.record import SampleSet, made_by
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -56,13 +57,17 @@ REDUCE_RANGE_NOTE = (
 class Quantization(Transform):
     """Options shared by every quantization method."""
 
-    runs_graphs: ClassVar[bool] = True
     include: tuple[str, ...] = Field((), description="globs of node names to quantize; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of node names to leave in float32")
     parts: tuple[str, ...] = Field(
         (), description="parts of the policy to quantize, as policy.yaml names them; all when empty"
     )
     graphs: tuple[str, ...] = Field((), description="globs of graph names to quantize; all when empty")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The recording that the method calibrates on, where one is given."""
+        calibration: Path | None = getattr(self, "calibration", None)
+        return (calibration,) if calibration else ()
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Check that every graph pattern matches a graph, and that no selected graph is quantized already."""
@@ -85,26 +90,30 @@ class Quantization(Transform):
 
     def transform(
         self,
-        source: Bundle | None,
+        source: Bundle,
         out: Path,
         context: Context,
         quantize: QuantizeGraph,
         engine: str = "",
-        made_by: dict[str, Any] | None = None,
-    ) -> Bundle:
+        samples: SampleSet | None = None,
+        report: Mapping[str, Any] | None = None,
+    ) -> Result:
         """Run ``quantize(graph name, original file, new file)`` on each selected graph and finish the bundle.
 
         The phases of a graph that computes in bfloat16 (``graph.phase``) move to a separate float32 graph.
+
+        Args:
+            samples: samples that the method calibrated on, for the record of the bundle.
+            report: further entries of that record.
         """
-        bundle = source_of(source, self.name())
-        self.check(bundle, None)
         (out / "graphs").mkdir()
         graphs: dict[str, Graph] = {}
-        program = bundle.manifest.program
-        for number, (name, graph) in enumerate(bundle.manifest.graphs.items()):
-            context.progress(f"quantizing {name}", number / len(bundle.manifest.graphs))
-            original, target = bundle.file(graph.file), out / graph.file
-            selected = name in self.chosen_graphs(bundle)
+        messages: tuple[str, ...] = ()
+        program = source.manifest.program
+        for number, (name, graph) in enumerate(source.manifest.graphs.items()):
+            context.progress(f"quantizing {name}", number / len(source.manifest.graphs))
+            original, target = source.file(graph.file), out / graph.file
+            selected = name in self.chosen_graphs(source)
             compute: str | None = None
             with foreign_errors(name):
                 if selected:
@@ -114,41 +123,31 @@ class Quantization(Transform):
                 if compute == "bfloat16":
                     program, phase_graphs = split_phases(program, name, target)
                     graphs.update({key: replace(part, opset=graph.opset) for key, part in phase_graphs.items()})
-                shares = count_shares(target, context)
+                shares, uncounted = count_shares(target)
+                messages += uncounted
             if compute:
                 shares = {compute if key == "float32" else key: share for key, share in shares.items()}
             graphs[name] = Graph(graph.file, shares, graph.opset, compute or "")
-        carry_over(bundle, out)
+        carry_over(source, out)
         context.progress("running the quantized graphs", None)
-        observations = self.golden_observations(bundle)
-        changes = {"program": program, "engine": engine or bundle.manifest.engine}
-        made_by = made_by or self.made_by()
-        return finish(
-            bundle, out, made_by=made_by, graphs=graphs, observations=observations, changes=changes,
-            recorded=self.is_recorded(bundle),
-        )  # fmt: skip
-
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file, when one is given."""
-        calibration: Path | None = getattr(self, "calibration", None)
-        return (calibration,) if calibration else ()
+        changes = {"program": program, "engine": engine or source.manifest.engine}
+        recorded = {**made_by(self, calibration=samples), **(report or {})}
+        made = finish(source, out, made_by=recorded, graphs=graphs, changes=changes, **self.golden_arguments(source))
+        return Result(made, messages)
 
     @property
     def recording(self) -> NamedRecording | None:
         """Recording of the golden observations; the bundle's own when None."""
         return named_recording(getattr(self, "calibration", None), getattr(self, "map", ()))
 
-    def golden_observations(self, bundle: Bundle) -> list[dict[str, Any]]:
-        """Return observations to compare the new bundle with the old one on; the first become golden.
+    def golden_arguments(self, source: Bundle) -> dict[str, Any]:
+        """Return the observations on which ``finish`` compares the new bundle with the old one, as its arguments.
 
         They are taken from the stage's own recording, where it has one: synthetic observations, whose ids are zero, do
         not reveal every fault of an engine.
         """
-        return observations_for(bundle, MAX_COMPARED, self.recording)
-
-    def is_recorded(self, bundle: Bundle) -> bool:
-        """Return whether golden observations are recorded instead of synthetic."""
-        return calibration_recording(bundle, self.recording) is not None
+        recorded = calibration_recording(source, self.recording) is not None
+        return {"observations": observations_for(source, MAX_COMPARED, self.recording), "recorded": recorded}
 
     def chosen_graphs(self, bundle: Bundle) -> list[str]:
         """Return the names of the graphs to quantize."""
@@ -230,19 +229,19 @@ def check_ops(ops: Iterable[str]) -> None:
             raise RecipeError.unknown(f"The operator '{name}' cannot be quantized", name, QUANTIZED_OPS)
 
 
-def describe_float_layers(name: str, model: Any) -> list[str]:
-    """Describe the recurrent layers of a graph, whose products stay in float32; an empty list without such layers.
-
-    Args:
-        model: An ``onnx.ModelProto``.
-    """
-    layers = [node.name for node in model.graph.node if node.op_type in RECURRENT]
-    if not layers:
-        return []
-    return [
-        f"{name}: {', '.join(layers)} computed in float32: a recurrent layer is one operator of ONNX, whose products "
+def name_float_layers(result: Result, graphs: Iterable[str]) -> Result:
+    """Return a result with a message on the recurrent layers of each of its graphs, whose products stay in float32."""
+    found = {}
+    for name in graphs:
+        file = result.bundle.file(result.bundle.manifest.graphs[name].file)
+        nodes = read(file, weights=False).graph.node
+        found[name] = ", ".join(node.name for node in nodes if node.op_type in RECURRENT)
+    messages = (
+        f"{name}: {layers} computed in float32: a recurrent layer is one operator of ONNX, whose products "
         "cannot be quantized; those of cells can (nn.GRUCell, nn.LSTMCell)"
-    ]
+        for name, layers in found.items() if layers
+    )  # fmt: skip
+    return replace(result, messages=(*messages, *result.messages))
 
 
 def fit_range_to_host(stage: StageT, engine: str) -> StageT:
@@ -253,7 +252,7 @@ def fit_range_to_host(stage: StageT, engine: str) -> StageT:
     """
     if "reduce_range" in stage.model_fields_set or int8_arithmetic(engine) in (EXACT, UNKNOWN):
         return stage
-    return stage.model_copy(update={"reduce_range": True})
+    return stage.unless_given({"reduce_range": True})
 
 
 @contextlib.contextmanager

@@ -26,7 +26,8 @@ from vlatool.quantize._base import Quantization
 from vlatool.quantize.calibration.activation_statistics import ValueNames, calibrate
 from vlatool.quantize.calibration.ranges import Statistics
 from vlatool.quantize.calibration.samples import played_moments, recorded_moments
-from vlatool.stage.base import Context, SampleSet
+from vlatool.stage.base import Context
+from vlatool.stage.record import SampleSet
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile

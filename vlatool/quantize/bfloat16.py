@@ -12,7 +12,7 @@ from vlatool.graph.files import load, save
 from vlatool.quantize._base import Quantization
 from vlatool.quantize.int8.convolutions import use_convolutions
 from vlatool.runtime.engine import computing, engine_class
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, Result
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -36,7 +36,7 @@ class Bfloat16(Quantization):
         super().check(source, profile)
         engine_class(computing("bfloat16")).library()
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Mark every selected graph."""
 
         def mark(_name: str, original: Path, target: Path) -> str:

@@ -18,12 +18,12 @@ from vlatool.quantize._base import (
     REDUCE_RANGE,
     REDUCE_RANGE_NOTE,
     Quantization,
-    describe_float_layers,
     fit_range_to_host,
+    name_float_layers,
     silenced_quantizer,
 )
 from vlatool.runtime.engines import build_tool
-from vlatool.stage.base import Context, source_of
+from vlatool.stage.base import Context, Result
 from vlatool.weights.pairs import largest_sums
 
 if TYPE_CHECKING:
@@ -48,18 +48,14 @@ class DynamicInt8(Quantization):
     per_channel: bool = Field(True, description="one weight scale for each output channel")
     reduce_range: bool = Field(False, description=REDUCE_RANGE)
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Quantize every selected graph."""
-        bundle = source_of(source, self.name())
-        self.check(bundle, None)
-        layers = self.selected_layers(bundle, OPS)
+        layers = self.selected_layers(source, OPS)
 
         def quantize(name: str, original: Path, target: Path) -> None:
-            model = load(original)
-            context.messages.extend(describe_float_layers(name, model))
-            self._quantize(model, target, layers[name])
+            self._quantize(load(original), target, layers[name])
 
-        return self.transform(bundle, out, context, quantize)
+        return name_float_layers(self.transform(source, out, context, quantize), layers)
 
     def _quantize(self, model: Any, target: Path, layers: list[Layer]) -> None:
         quantization, names = build_tool("quantization"), {layer.name for layer in layers}
@@ -102,17 +98,13 @@ class DynamicInt8(Quantization):
                 stored = graph.onnx.numpy_helper.from_array(array.reshape(tuple(tensor.dims)), tensor.name)
                 tensor.CopyFrom(stored)
 
-    def on_this_host(self) -> Self:
-        """Use weights without saturation where this host saturates."""
-        return fit_range_to_host(self, "")
+    def on(self, board: Profile | None) -> Self:
+        """Use weights without saturation where the board, or this host, saturates."""
+        if board is None:
+            return fit_range_to_host(self, "")
+        narrow = saturates(board.units[board.engines[board.engine].unit].isa)
+        return self.unless_given({"reduce_range": True} if narrow else {})
 
-    def on(self, profile: Profile) -> Self:
-        """Use weights without saturation where the board saturates."""
-        features = profile.units[profile.engines[profile.engine].unit].isa
-        if "reduce_range" in self.model_fields_set or not saturates(features):
-            return self
-        return self.model_copy(update={"reduce_range": True})
-
-    def lines(self, bundle: Bundle) -> tuple[str, ...]:
+    def summarize(self, bundle: Bundle) -> tuple[str, ...]:
         """Report that the weights are meant for processors without VNNI."""
         return (REDUCE_RANGE_NOTE,) if self.reduce_range else ()

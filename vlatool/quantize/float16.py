@@ -24,7 +24,8 @@ from vlatool.quantize.floats.overflow import find_overflows
 from vlatool.quantize.floats.underflow import measure_sizes, underflow_nodes
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.policy import relative_error
-from vlatool.stage.base import Context, SampleSet, source_of
+from vlatool.stage.base import Context, Result
+from vlatool.stage.record import SampleSet
 
 CRASH_FIX = "leave layers beside a Transpose in float32 with --exclude, or use another method"
 
@@ -52,26 +53,24 @@ class Float16(Quantization):
     map: tuple[str, ...] = Field((), description=MAP_HELP)
     samples: int = Field(16, ge=1, description="samples in which to look for values beyond float16")
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Find values beyond float16, then convert every selected graph."""
-        bundle = source_of(source, self.name())
-        self.check(bundle, None)
-        chosen = self.chosen_graphs(bundle)
+        chosen = self.chosen_graphs(source)
         candidates = []
         for name in chosen:
-            model = load(bundle.file(bundle.manifest.graphs[name].file))
+            model = load(source.file(source.manifest.graphs[name].file))
             check_opset(OnnxGraph(model).opset, "float16", MIN_OPSET)
             candidates += [node.name for node in model.graph.node]
-        selected = self.select_nodes(candidates, bundle)
+        selected = self.select_nodes(candidates, source)
         samples = SampleSet()
-        recording = calibration_recording(bundle, self.recording)
+        recording = calibration_recording(source, self.recording)
 
         def observations(samples: SampleSet) -> Iterable[Moment | Mapping[str, Any]]:
             if recording is None:
-                return samples.watch(synthetic_observations(bundle, self.samples))
-            return recorded_moments(bundle, recording, recording.spread(self.samples), samples)
+                return samples.watch(synthetic_observations(source, self.samples))
+            return recorded_moments(source, recording, recording.spread(self.samples), samples)
 
-        overflows = find_overflows(bundle, chosen, observations(samples), FLOAT16_MAX, context)
+        overflows = find_overflows(source, chosen, observations(samples), FLOAT16_MAX, context)
         report: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": [], "moved": {}}
         for graph, values in overflows.items():
             for value, overflow in values.items():
@@ -81,7 +80,7 @@ class Float16(Quantization):
                     f"{value} reaches {size:g} in sample {overflow.sample}, beyond float16: it stays float32", None
                 )
 
-        sizes = measure_sizes(bundle, chosen, observations(SampleSet()), context)
+        sizes = measure_sizes(source, chosen, observations(SampleSet()), context)
 
         def convert(name: str, original: Path, target: Path) -> None:
             model = load(original)
@@ -97,10 +96,9 @@ class Float16(Quantization):
             report["subnormal_weights"] += weight_losses(model, kept).subnormal
             report["moved"][name] = float(f"{change:.2g}")
 
-        made_by = {**self.made_by(calibration=samples), "float16": report}
-        return self.transform(bundle, out, context, convert, made_by=made_by)
+        return self.transform(source, out, context, convert, samples=samples, report={"float16": report})
 
-    def lines(self, quantized: Bundle) -> tuple[str, ...]:
+    def summarize(self, quantized: Bundle) -> tuple[str, ...]:
         """Return a summary of the new bundle for the user."""
         report = quantized.manifest.made_by["float16"]
         small = report["subnormal_weights"]

@@ -14,7 +14,8 @@ from vlatool.graph.layers import Style, calibrated_values
 from vlatool.quantize._base import QUANTIZED_OPS, check_ops
 from vlatool.quantize._calibrated_base import CalibratedQuantization
 from vlatool.quantize.floats.float8_qdq import Float8Writer
-from vlatool.stage.base import Context, SampleSet, source_of
+from vlatool.stage.base import Context, Result
+from vlatool.stage.record import SampleSet
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -41,14 +42,12 @@ class Float8(CalibratedQuantization):
         check_ops(self.ops)
         super().check(source, profile)
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Calibrate and quantize every selected graph."""
-        bundle = source_of(source, self.name())
-        self.check(bundle, None)
         require("ml_dtypes", "build")
-        layers, samples = self.selected_layers(bundle, self.ops, attention=self.attention), SampleSet()
+        layers, samples = self.selected_layers(source, self.ops, attention=self.attention), SampleSet()
         values = {name: calibrated_values(graph, Style(), {}) for name, graph in layers.items()}
-        statistics = self.statistics(bundle, values, samples, context)
+        statistics = self.statistics(source, values, samples, context)
 
         def quantize(name: str, original: Path, target: Path) -> None:
             model = load(original)
@@ -56,4 +55,4 @@ class Float8(CalibratedQuantization):
             Float8Writer(model, layers[name], peaks, self.per_channel).write()
             save(model, target)
 
-        return self.transform(bundle, out, context, quantize, made_by=self.made_by(calibration=samples))
+        return self.transform(source, out, context, quantize, samples=samples)

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from vlatool.data import MAX_PLAYED
 from vlatool.runtime.engine import layouts
+from vlatool.stage.base import Chain
 from vlatool.stage.build import build_stage
 from vlatool.training.fake_quantization import BLOCK, fake_quantization
 from vlatool.training.imitation import ImitationStage
@@ -51,14 +52,14 @@ class Qat(ImitationStage):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Check that the stages that follow take the layout."""
-        for name, options in self.following_stages():
+        for name, options in self.chain().after.items():
             build_stage(name, options)
         super().check(source, profile)
 
-    def following_stages(self) -> tuple[tuple[str, dict[str, Any]], ...]:
+    def chain(self) -> Chain:
         """Return the stages that export and quantize to the trained grid, in the requested layout."""
         layout = {"layout": self.layout} if "layout" in self.model_fields_set else {}
         if self.weights == "int4":
             blocks = {"bits": 4, "block": BLOCK, "search": False}
-            return ("export.onnx", {}), ("quantize.weight_only", {**blocks, **layout})
-        return ("export.onnx", {}), ("quantize.static_int8", layout)
+            return Chain(after={"export.onnx": {}, "quantize.weight_only": {**blocks, **layout}})
+        return Chain(after={"export.onnx": {}, "quantize.static_int8": layout})

@@ -23,7 +23,8 @@ from vlatool.quantize.int8.smoothing_scales import PeakExcess, best_alpha, int8_
 from vlatool.runtime.golden import load_golden
 from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import relative_error
-from vlatool.stage.base import Context, SampleSet, source_of
+from vlatool.stage.base import Context, Result
+from vlatool.stage.record import SampleSet
 
 OPS = ("MatMul", "Gemm")
 REPORT = "reports/smooth_quant.json"
@@ -64,21 +65,19 @@ class SmoothQuant(CalibratedQuantization):
     )
     insert: bool = Field(False, description="insert a Mul where the division cannot be folded into constants")
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Calibrate, smooth every selected graph, and compare the golden action with the source's."""
-        bundle = source_of(source, self.name())
-        self.check(bundle, None)
         groups, samples = {}, SampleSet()
-        for name, layers in self.selected_layers(bundle, OPS).items():
+        for name, layers in self.selected_layers(source, OPS).items():
             with foreign_errors(name):
-                groups[name] = find_groups(load(bundle.file(bundle.manifest.graphs[name].file)), layers)
+                groups[name] = find_groups(load(source.file(source.manifest.graphs[name].file)), layers)
         values = {name: [value for group in members for value in group.activations] for name, members in groups.items()}
-        recording, chosen = self.calibration_samples(bundle)
+        recording, chosen = self.calibration_samples(source)
         halves = self._halves(chosen)
         peaks = []
         for numbers in halves:
-            observations = recorded_moments(bundle, recording, numbers, samples)
-            statistics = calibrate(bundle, values, observations, context, channels=True, numbers=numbers)
+            observations = recorded_moments(source, recording, numbers, samples)
+            statistics = calibrate(source, values, observations, context, channels=True, numbers=numbers)
             peaks.append({graph: {name: np.asarray(seen.peaks) for name, seen in collected.items()}
                           for graph, collected in statistics.items()})  # fmt: skip
         notes: list[dict[str, Any]] = []
@@ -90,17 +89,17 @@ class SmoothQuant(CalibratedQuantization):
                 notes.append({"graph": name, **self._smooth(model, group, largest, sum(map(len, halves)))})
             save(model, target)
 
-        smoothed = self.transform(bundle, out, context, smooth, made_by=self.made_by(calibration=samples))
+        result = self.transform(source, out, context, smooth, samples=samples)
         (out / REPORT).parent.mkdir(exist_ok=True)
         (out / REPORT).write_text(json.dumps({"groups": notes}, indent=1) + "\n", encoding="utf-8")
-        _check_same(bundle, smoothed)
-        return smoothed
+        _check_same(source, result.bundle)
+        return result
 
     @property
     def recording(self) -> None:
         """None, for that of the smoothed bundle: its golden action must not change."""
 
-    def lines(self, smoothed: Bundle) -> tuple[str, ...]:
+    def summarize(self, smoothed: Bundle) -> tuple[str, ...]:
         """Return a summary of the new bundle for the user."""
         groups = json.loads((smoothed.path / REPORT).read_text(encoding="utf-8"))["groups"]
         count = {how: sum(group["how"] == how for group in groups) for how in ("folded", "inserted", "left")}

@@ -28,8 +28,8 @@ from vlatool.quantize._base import (
     REDUCE_RANGE,
     REDUCE_RANGE_NOTE,
     check_ops,
-    describe_float_layers,
     fit_range_to_host,
+    name_float_layers,
 )
 from vlatool.quantize._calibrated_base import CalibratedQuantization
 from vlatool.quantize._trial_compile import open_in_child
@@ -40,7 +40,8 @@ from vlatool.quantize.int8.integer_matmul import use_integer_matmul
 from vlatool.quantize.int8.quantizer_hoisting import hoist_quantizers
 from vlatool.quantize.int8.reductions import keep_reduced_axes
 from vlatool.runtime.engine import DEFAULT_ENGINE, STANDARD_LAYOUT, Engine, Int8Layout, class_for, engine_class, layouts
-from vlatool.stage.base import Context, SampleSet, source_of
+from vlatool.stage.base import Context, Result
+from vlatool.stage.record import SampleSet
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -118,20 +119,19 @@ class StaticInt8(CalibratedQuantization):
             signed_second=second, unsigned_convolutions=layout.symmetric
         )  # fmt: skip
 
-    def on(self, profile: Profile) -> Self:
-        """Use the layout and activation type of the board's preferred engine."""
-        options = dict(class_for(profile.engine).int8)
-        if saturates(profile.units[profile.engines[profile.engine].unit].isa):
+    def on(self, board: Profile | None) -> Self:
+        """Use layout and activations of the board's preferred engine, and weights that do not saturate where it does.
+
+        Without a board, weights are for this host, unless the layout is the standard one, which may be for any board.
+        """
+        if board is None:
+            return self if self.layout == STANDARD_LAYOUT else fit_range_to_host(self, self.engine)
+        options = dict(class_for(board.engine).int8)
+        if saturates(board.units[board.engines[board.engine].unit].isa):
             options["reduce_range"] = True
-        return self.model_copy(update={name: how for name, how in options.items() if name not in self.model_fields_set})
+        return self.unless_given(options)
 
-    def on_this_host(self) -> Self:
-        """Use weights that cannot saturate if this host's products do; the standard layout may be for any board."""
-        if self.layout == STANDARD_LAYOUT:
-            return self
-        return fit_range_to_host(self, self.engine)
-
-    def lines(self, bundle: Bundle) -> tuple[str, ...]:
+    def summarize(self, bundle: Bundle) -> tuple[str, ...]:
         """Return the note that the weights are meant for processors without VNNI."""
         return (REDUCE_RANGE_NOTE,) if self.reduce_range else ()
 
@@ -157,18 +157,15 @@ class StaticInt8(CalibratedQuantization):
             library.library()
         super().check(source, profile)
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Calibrate and quantize every selected graph."""
-        bundle = source_of(source, self.name())
-        self.check(bundle, None)
-        layers, values = self.plan(bundle)
+        layers, values = self.plan(source)
         samples = SampleSet()
-        statistics = self.statistics(bundle, values, samples, context, _values_read_by_sums_only(layers))
+        statistics = self.statistics(source, values, samples, context, _values_read_by_sums_only(layers))
         layers = {name: _finite_layers(chosen, statistics[name]) for name, chosen in layers.items()}
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
-            context.messages.extend(describe_float_layers(name, model))
             pixels: dict[str, Range] = {}
             if self.int8_layout.integer:
                 split_gemms(model)
@@ -189,8 +186,8 @@ class StaticInt8(CalibratedQuantization):
                 open_in_child(target, self.engine, "int8", CRASH_FIX)
             return "" if self.compute == "float32" else self.compute
 
-        made_by = self.made_by(calibration=samples)
-        return self.transform(bundle, out, context, quantize, self.engine, made_by)
+        result = self.transform(source, out, context, quantize, self.engine, samples)
+        return name_float_layers(result, layers)
 
     def ranges(self, statistics: Mapping[str, Statistics], unsigned: Collection[str] = ()) -> dict[str, Range]:
         """Return value -> quantization range (low, high).

@@ -19,19 +19,21 @@ from vlatool.errors import BundleError, DataError, require
 from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.graph.files import link
 from vlatool.graph.precision import precision_shares
-from vlatool.module.origin import factory_of
+from vlatool.machine.host import cache_directory
 from vlatool.module.sharded_weights import takes_shards
 from vlatool.module.to_onnx import IMPORTS
 from vlatool.quantize.streamed.graph_templates import BLOCKED_OPSET, load_templates, weights_fingerprint
 from vlatool.quantize.streamed.options import WeightOptions
-from vlatool.quantize.streamed.record_file import RecordFile, work_root, write_records
+from vlatool.quantize.streamed.record_file import RecordFile, write_records
 from vlatool.quantize.streamed.records import Record
 from vlatool.quantize.streamed.tensor_jobs import records_for
 from vlatool.quantize.streamed.weights_plan import WeightsPlan, make_plan
 from vlatool.runtime.engine import STANDARD_LAYOUT, class_for
-from vlatool.stage.base import Context, SampleSet, source_of
+from vlatool.stage.base import Context, Result
+from vlatool.stage.cache import STREAMS
 from vlatool.stage.finish import SEED, carry_over, finish, history
 from vlatool.stage.precision_shares import count_shares
+from vlatool.stage.record import SampleSet, made_by
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -58,13 +60,11 @@ class WeightOnly(WeightOptions):
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnx-ir", "onnxscript", "numpy")
     imports: ClassVar[tuple[str, ...]] = IMPORTS
     streams: ClassVar[bool] = True
-    """Whether the stage takes a source bundle whose policy describes its shards, without an export."""
 
-    def on(self, profile: Profile) -> Self:
+    def on(self, board: Profile | None) -> Self:
         """Use standard operators where the board's preferred engine takes only those."""
-        standard = class_for(profile.engine).int8.get("layout") == STANDARD_LAYOUT
-        change = {"layout": STANDARD_LAYOUT} if standard and "layout" not in self.model_fields_set else {}
-        return self.model_copy(update=change)
+        standard = board is not None and class_for(board.engine).int8.get("layout") == STANDARD_LAYOUT
+        return self.unless_given({"layout": STANDARD_LAYOUT} if standard else {})
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Check that there is something to quantize, and calibration data for the methods that need it."""
@@ -88,27 +88,21 @@ class WeightOnly(WeightOptions):
                 f"export it first: {export_command(source.path)}; or add 'weights: \"*.safetensors\"' to policy.yaml",
             )
 
-    def runs(self, source: Bundle | None) -> str:
-        """Return the factory of a policy without graphs, which this stage exports."""
-        return factory_of(source)
-
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Plan, stream the weights into one file, write the graphs, and verify."""
-        bundle = source_of(source, self.name())
-        self.check(bundle, None)
         for package in ("onnx", "onnx_ir"):
             require(package, "build")
         context.progress("reading the graphs", None)
         (out / "graphs").mkdir()
-        plan = make_plan(load_templates(bundle, BLOCKED_OPSET), self, bundle, WEIGHTS_FILE)
+        plan = make_plan(load_templates(source, BLOCKED_OPSET), self, source, WEIGHTS_FILE)
         samples = SampleSet() if self.method in CALIBRATED_METHODS else None
-        with work_directory(self.work(bundle)) as directory:
-            records = self._records(plan, bundle, directory, samples)
+        with work_directory(self.work(source)) as directory:
+            records = self._records(plan, source, directory, samples)
             written = write_records(
-                records, self._identity(plan, bundle), directory, _processes(records), context.progress
+                records, self._identity(plan, source), directory, _processes(records), context.progress
             )
             link(written.path, out / WEIGHTS_FILE)
-            quantized = self._finish(plan, bundle, out, written, samples, context)
+            quantized = self._finish(plan, source, out, written, samples, context)
             remove_work(directory)
         return quantized
 
@@ -120,32 +114,31 @@ class WeightOnly(WeightOptions):
         written: RecordFile,
         samples: SampleSet | None,
         context: Context,
-    ) -> Bundle:
+    ) -> Result:
         """Write the graphs and all other files, and verify."""
         opsets = plan.save(out)
         carry_over(bundle, out)
-        made_by = {**self.made_by(calibration=samples), **_summarize(written, out / LOSS_REPORT)}
+        recorded = {**made_by(self, calibration=samples), **_summarize(written, out / LOSS_REPORT)}
         context.progress("counting", None)
         runs = self.verify == "run" or (self.verify == "auto" and written.bytes < MAX_RUN_BYTES)
-        graphs = {}
+        graphs, messages = {}, tuple[str, ...]()
         for name, opset in opsets.items():
             file = out / f"graphs/{name}.onnx"
-            shares = count_shares(file, context) if runs else precision_shares(file)
+            shares, uncounted = count_shares(file) if runs else (precision_shares(file), ())
+            messages += uncounted
             graphs[name] = Graph(f"graphs/{name}.onnx", shares, opset)
-        if runs:
-            context.progress("running the quantized graphs", None)
-            return finish(
-                bundle, out, made_by=made_by, graphs=graphs, observations=self.golden_observations(bundle),
-                recorded=self.is_recorded(bundle),
-            )  # fmt: skip
-        return _seal(bundle, out, written, made_by, graphs)
+        if not runs:
+            return Result(_seal(bundle, out, written, recorded, graphs))
+        context.progress("running the quantized graphs", None)
+        made = finish(bundle, out, made_by=recorded, graphs=graphs, **self.golden_arguments(bundle))
+        return Result(made, messages)
 
     def work(self, source: Bundle) -> Path:
         """Return the directory of unfinished work on a source."""
         weights = hashlib.sha256(f"{self.key(source.hash)} {weights_fingerprint(source)}".encode()).hexdigest()
-        return work_root() / f"{self.name()}-{weights[:16]}"
+        return cache_directory() / STREAMS / f"{self.name()}-{weights[:16]}"
 
-    def lines(self, quantized: Bundle) -> tuple[str, ...]:
+    def summarize(self, quantized: Bundle) -> tuple[str, ...]:
         """Return a summary of the new bundle for the user."""
         report = json.loads((quantized.path / LOSS_REPORT).read_text(encoding="utf-8"))
         again = f", {report['resumed']} of them from the run before" if report["resumed"] else ""

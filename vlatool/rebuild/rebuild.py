@@ -17,13 +17,14 @@ from vlatool.files.ownership import LEDGER
 from vlatool.files.scratch import scratch_directory
 from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
-from vlatool.optimize.pipeline import ROBOT_FOLDERS
+from vlatool.optimize.result import ROBOT_FOLDERS
 from vlatool.rebuild.differences import FileMatch, compare_bundles
 from vlatool.runtime.engine import identities
 from vlatool.sources import is_bundle, source_stage
 from vlatool.stage.base import Context, Transform, content_hash, installed_version, source_of
 from vlatool.stage.build import build_stage, stage_class
 from vlatool.stage.finish import FINALIZED_FIELDS, OPTIMIZE, history, reseal
+from vlatool.stage.record import input_hashes
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust
 
@@ -196,7 +197,7 @@ def rebuild(
         for number, (entry, stage) in enumerate(start.stages):
             before, folder = product, scratch / f"{number}-{entry['stage']}"
             product = (
-                _finalize(entry, before, folder) if stage is None else run_transform(stage, before, folder, context)
+                run_transform(stage, before, folder, context).bundle if stage else _finalize(entry, before, folder)
             )
             same.append((entry["stage"], _graphs_as_recorded(entry, product)))
             if before is not None and before is not start.bundle:
@@ -294,7 +295,7 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
         )
     stage = stage.as_recorded(entry, bundle)
     stage.check(None, None)
-    got, recorded = stage.input_hashes(), entry.get("files", {})
+    got, recorded = input_hashes(stage), entry.get("files", {})
     wrong = [
         f"{name}: got {_short_hash(got.get(name))}, recorded {_short_hash(recorded.get(name))}"
         for name in dict.fromkeys([*recorded, *got])

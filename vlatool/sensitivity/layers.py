@@ -28,7 +28,8 @@ from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.sensitivity._switches import add_switches
-from vlatool.stage.base import Context, SampleSet
+from vlatool.stage.base import Context
+from vlatool.stage.record import SampleSet
 
 LayerId = tuple[str, str]
 """Graph name and layer name."""

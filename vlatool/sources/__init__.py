@@ -6,7 +6,7 @@ from pathlib import Path
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.module.source import Source, is_bundle, source_of_policy
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, Result
 from vlatool.stage.run import cached_transform
 
 __all__ = ["Source", "brings_calibration", "is_bundle", "open_source", "source_bundle", "source_stage"]
@@ -31,10 +31,10 @@ def source_stage(typed: str) -> Source:
     return source_of_policy(typed).trust_code()
 
 
-def source_bundle(source: Bundle | Source, cache: Path, context: Context) -> Bundle:
+def source_bundle(source: Bundle | Source, cache: Path, context: Context) -> Result:
     """Return a bundle unchanged, or the source bundle of a policy."""
     if isinstance(source, Bundle):
-        return source
+        return Result(source)
     source.check(None, None)
     return cached_transform(source, None, cache, context)
 

@@ -34,9 +34,10 @@ from vlatool.sources._onnx_batch import add_batch_axes
 from vlatool.sources._onnx_ends import complete_outputs, refuse_types
 from vlatool.sources._onnx_files import refuse_bare
 from vlatool.sources._onnx_plain import plain
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, Result
 from vlatool.stage.finish import SEED, finish
 from vlatool.stage.precision_shares import count_shares
+from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -55,7 +56,6 @@ class OnnxFile(Source):
     """A policy that is one ONNX file; the spec comes from a description, or from the file's inputs and outputs."""
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
-    runs_graphs: ClassVar[bool] = True
     needs: ClassVar[str] = "a .onnx file"
 
     model: Path = Field(description="the ONNX file; external data is found beside it")
@@ -106,9 +106,8 @@ class OnnxFile(Source):
             return tuple(beside)
         return (*beside, *described.recordings().values(), *described.read_from, *described.assets())
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Result:
         """Load the file, store it, and run it once."""
-        self.check(None, None)
         model = plain(_load(self.model))
         if (description := self.describe()) is not None:
             _check_program(description)
@@ -125,12 +124,14 @@ class OnnxFile(Source):
         manifest = described.manifest()
         options = {"opset": self.opset, "shape": list(self.shape)}
         given = {name: value for name, value in options.items() if value}
-        made_by = {**self.made_by(), "options": {"model": self.model.name, **given}}
+        recorded = {**made_by(self), "options": {"model": self.model.name, **given}}
         with _named_after(self.model, file):
-            opset = self._store(model, out, manifest, changes, context)
+            opset, stored = self._store(model, out, manifest, changes)
             observations = observations_for(Bundle(out, manifest), 2)
-            graphs = {"main": Graph("graphs/main.onnx", count_shares(file, context), opset)}
-            return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
+            shares, uncounted = count_shares(file)
+            graphs = {"main": Graph("graphs/main.onnx", shares, opset)}
+            made = finish(Bundle(out, manifest), out, made_by=recorded, graphs=graphs, observations=observations)
+            return Result(made, (*changes.messages, *stored, *uncounted))
 
     def _prepare(self, model: Any, description: Description | None, context: Context) -> _Changes:
         """Bring types and axes into the form that stages take, in place."""
@@ -140,8 +141,7 @@ class OnnxFile(Source):
                 f"--shape is given, and {self.policy} says the shapes of all inputs.",
                 "leave --shape out, or change them there",
             )
-        if gone := as_float32(model):
-            context.messages.append(describe_conversion(gone))
+        gone = as_float32(model)
         declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
         fixed = axes_text(fix_axes(model, declared or shapes_from(self.shape), declared is not None, str(self.model)))
         further = [] if description else add_batch_axes(model, opset_of(model))
@@ -150,10 +150,11 @@ class OnnxFile(Source):
             fixed = f"{fixed}; {axes}" if fixed else axes
         if fixed:
             context.progress(fixed, None)
-        return _Changes(further, max(TOLERANCE, *(ROUNDING.get(kind, 0) for kind in gone), 0))
+        tolerance = max(TOLERANCE, *(ROUNDING.get(kind, 0) for kind in gone), 0)
+        return _Changes(further, tolerance, (describe_conversion(gone),) if gone else ())
 
-    def _store(self, model: Any, out: Path, manifest: Manifest, changes: _Changes, context: Context) -> int:
-        """Write the graph, in the opset that is asked for or that stages need; return its opset.
+    def _store(self, model: Any, out: Path, manifest: Manifest, changes: _Changes) -> tuple[int, tuple[str, ...]]:
+        """Write the graph, in the opset that is asked for or that stages need; return its opset, and what was done.
 
         Raises:
             GraphError: when ONNX Runtime refuses it.
@@ -163,20 +164,20 @@ class OnnxFile(Source):
         wanted = self.opset or max(opset, MIN_OPSET if opset else 0)
         save(model, file)
         before, unbatched = self._before(file, changes.further)
+        stays: tuple[str, ...] = ()
         if wanted != opset:
             try:
                 save(with_opset(model, wanted), file)
                 self._compare(before, unbatched, out, manifest, changes.tolerance)
-                context.messages.append(f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations")
-                return wanted
+                return wanted, (f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations",)
             except InputError as error:
                 if self.opset:
                     raise
                 words = f"opset {opset} stays, in which nothing can be quantized to int8 ({MIN_OPSET} or later): "
-                context.messages.append(f"{words}{error.message}")
+                stays = (f"{words}{error.message}",)
                 save(model, file)
         self._compare(before, unbatched, out, manifest, changes.tolerance)
-        return opset
+        return opset, stays
 
     def _before(self, file: Path, further: list[str]) -> tuple[Any, list[str]]:
         """Open the file itself, or where ONNX Runtime refuses it what is written of it; and what has no batch axis."""
@@ -228,10 +229,12 @@ class _Changes:
     Args:
         further: Inputs and outputs that were given a batch axis.
         tolerance: Relative L2 difference that this may make.
+        messages: Sentences on it.
     """
 
     further: list[str]
     tolerance: float = TOLERANCE
+    messages: tuple[str, ...] = ()
 
 
 def _check_program(described: Description) -> None:

@@ -16,7 +16,8 @@ from vlatool.module.imports import imported_files
 from vlatool.module.source import Source
 from vlatool.registry import Claim
 from vlatool.sources._onnx_files import refuse_bare
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, Result
+from vlatool.stage.record import made_by
 from vlatool.user_code import trust
 from vlatool.weights.shards import fingerprint, sampled_hash, shard_files
 
@@ -38,6 +39,7 @@ class TorchModule(Source):
 
     needs: ClassVar[str] = f"a directory with a {FILE}, or path/to/policy.py:make beside one"
 
+    runs_graphs: ClassVar[bool] = False
     policy: Path = Field(description="policy.yaml, or the directory that holds it")
     factory: str = Field("", description="path.py:make or package.module:make; the one in policy.yaml when empty")
 
@@ -96,7 +98,7 @@ class TorchModule(Source):
         described = self.describe()
         return super().key(f"{described.folder.resolve()} {_shards(described)}")
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Result:
         """Write the spec, the assets and the recorded data."""
         described = self.describe()
         self.trust_code()
@@ -106,8 +108,8 @@ class TorchModule(Source):
         code = {path.relative_to(root).as_posix(): hash_file(path) for path in self._code(described)}
         write_location(out, described.folder)
         source_record = {"factory": factory, "arguments": described.arguments, "code": code, **_weights(described)}
-        made_by = {**self.made_by(), "options": {}}
-        return seal(out, described.manifest(made_by=made_by, source=source_record))
+        recorded = {**made_by(self), "options": {}}
+        return Result(seal(out, described.manifest(made_by=recorded, source=source_record)))
 
     def trust_code(self) -> Self:
         """Allow the policy's code to run in this process: the user named its folder."""

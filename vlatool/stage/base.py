@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -19,7 +19,6 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import PluginError, RecipeError
 from vlatool.files.numbers import Numeric
-from vlatool.files.resumable_work import Store
 from vlatool.files.tree import hash_directory
 from vlatool.machine.instruction_sets import openvino_set
 from vlatool.machine.version import VERSION
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
 OnProgress = Callable[[str, float | None], None]
+OnNote = Callable[[str], None]
 BEFORE_ENGINES = ("sources", "export")
 """Kinds of stages whose output is the same whatever an engine computes in."""
 DEFINE_RUN = "define it; docs/guides/add-a-method.md shows a complete stage"
@@ -39,8 +39,12 @@ RECORD_VERSION = 2
 """Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
 
 
-def _silent(_what: str, _share: float | None) -> None:
+def _no_progress(_what: str, _share: float | None) -> None:
     """Ignore progress."""
+
+
+def _no_note(_sentence: str) -> None:
+    """Ignore a note."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +61,12 @@ class Context:
         video: file for the video of an episode of an evaluation; none when empty.
         force: whether a video that vlatool wrote there may be replaced.
         launcher: what starts the workers that play episodes: an entry of the kind ``workers``.
-        unfinished: list that receives the folders of unfinished work (``files.resumable_work.Store``), to be removed
-            once the result is written; None to store none.
-        store: results stored during this run, once a stage has opened it.
-        notes: list that receives sentences for the report on how it was computed.
-        messages: list that receives sentences on what a stage did, which the command line prints.
+        work: folder for finished parts of a measurement (``files.resumable_work.Store``), which whoever writes the
+            report removes afterwards; none are stored when empty.
+        note: callback: sentence on how something was measured, for reports on it.
     """
 
-    progress: OnProgress = field(default=_silent)
+    progress: OnProgress = _no_progress
     workers: int = 1
     command: str = ""
     measure_remotely: Callable[[Mapping[str, Any], Sequence[Path], OnProgress], dict[str, Any]] | None = None
@@ -72,52 +74,40 @@ class Context:
     video: str = ""
     force: bool = False
     launcher: str = "processes"
-    unfinished: list[Path] | None = None
-    store: Store | None = None
-    notes: list[str] = field(default_factory=list)
-    messages: list[str] = field(default_factory=list)
+    work: str = ""
+    note: OnNote = _no_note
 
     def about(self, whose: str) -> Context:
         """Return the context with a prefix for its progress, unless that is empty."""
         return replace(self, progress=lambda what, share: self.progress(f"{whose}: {what}", share)) if whose else self
 
 
-class SampleSet:
-    """A fingerprint of the samples that a stage calibrates on, taken while they stream by.
+@dataclass(frozen=True)
+class Result:
+    """What a stage that makes a bundle gives.
 
-    Example:
-        >>> samples = SampleSet()
-        >>> for observation in samples.watch([{"proprio": [0.5, 1.0]}]): pass
-        >>> samples.record()["samples"]
-        1
+    Args:
+        bundle: new bundle.
+        messages: sentences on what the stage did, which the command line prints.
     """
 
-    def __init__(self) -> None:
-        self._hashes: list[str] = []
-
-    def watch(self, observations: Iterable[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-        """Yield the observations, each hashed before it is handed on; go through one ``SampleSet`` once."""
-        for observation in observations:
-            self._hashes.append(_sample_hash(observation))
-            yield observation
-
-    def record(self) -> dict[str, Any]:
-        """Return ``samples``, how many there were, and ``sha256``, the hash of their hashes in order."""
-        return {"samples": len(self._hashes), "sha256": hashlib.sha256("\n".join(self._hashes).encode()).hexdigest()}
+    bundle: Bundle
+    messages: tuple[str, ...] = ()
 
 
-def _sample_hash(observation: Mapping[str, Any]) -> str:
-    """Hash names, types, shapes and values of one observation."""
-    import numpy as np
+@dataclass(frozen=True)
+class Chain:
+    """The other stages that a stage stands for; the command line runs them as if each had been named.
 
-    digest = hashlib.sha256()
-    for name in sorted(observation):
-        value = np.ascontiguousarray(observation[name])
-        text = value.dtype.kind in "US"
-        content = json.dumps(value.tolist()).encode() if text else value.tobytes()
-        kind = "text" if text else value.dtype.str
-        digest.update(json.dumps([name, kind, list(np.shape(observation[name])), len(content)]).encode() + content)
-    return digest.hexdigest()
+    Args:
+        before: stages that its options ask for first, in order: name -> options.
+        after: stages that are to follow it, which a recipe names itself.
+        options: options that ask for the stages before it; what is left of the stage has their defaults.
+    """
+
+    before: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    after: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    options: tuple[str, ...] = ()
 
 
 class Stage(Numeric):
@@ -128,6 +118,8 @@ class Stage(Numeric):
     """Options with which a search of ``optimize`` tries the stage: ending of the plan's name -> options."""
     packages: ClassVar[tuple[str, ...]] = ()
     """Distributions whose versions change the result whatever the options; part of the cache key and the record."""
+    policies: ClassVar[tuple[str, ...]] = ()
+    """Options that name policies, whose code may run once a user typed them (not for options in a file)."""
     imports: ClassVar[tuple[str, ...]] = ()
     """Modules that it imports when it runs; the server that forks children for it imports them once."""
 
@@ -152,9 +144,13 @@ class Stage(Numeric):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Raise a user error when this stage cannot run on that source; a cheap check."""
 
-    def trust_code(self) -> Self:
-        """Allow the code of policies that the options name to run: the user typed them (not for options in a file)."""
+    def on(self, board: Profile | None) -> Self:
+        """Return the stage with the options that a board needs, or this host where that is None; given ones stay."""
         return self
+
+    def unless_given(self, options: Mapping[str, Any]) -> Self:
+        """Return the stage with options, but for those that were given."""
+        return self.model_copy(update={name: options[name] for name in options.keys() - self.model_fields_set})
 
     def inputs(self) -> tuple[Path, ...]:
         """Files and directories outside the source whose content changes the result; part of the cache key."""
@@ -184,97 +180,30 @@ class Transform(Stage):
     """Whether it starts from a source bundle without graphs, since it works on the policy's torch modules."""
     trains: ClassVar[bool] = False
     """Whether it changes weights step by step, and tells of each (``Context.events``)."""
-    runs_graphs: ClassVar[bool] = False
-    """Whether it opens or runs new graphs: it does so in a child process, since an engine may crash."""
+    runs_graphs: ClassVar[bool] = True
+    """Whether it opens or runs graphs or modules: it does so in a child process, since these may end the process."""
     streams: ClassVar[bool] = False
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 
-    def on(self, profile: Profile) -> Self:
-        """Return the stage with the options that a board needs; options that were given stay."""
-        return self
-
-    def on_this_host(self) -> Self:
-        """Return the stage with the options that this host needs, where no board is named; given ones stay."""
-        return self
-
-    def runs(self, source: Bundle | None) -> str:
-        """Return whose code this stage runs on that source (``policy.py``); empty when only vlatool's own.
-
-        Such a stage is run in a child process, as those that run graphs are; see ``vlatool.user_code.children``.
-        """
-        return ""
-
-    def chain(self) -> tuple[Transform, ...]:
-        """Return the stages that this one stands for: those that its options ask for first, then what is left of it.
-
-        The command line and recipes run them one after the other, so that each is cached, recorded and rebuilt as if it
-        had been named. A stage that stands for several refuses ``run``.
+    def chain(self) -> Chain:
+        """Return the stages that run before and after this one; none where it stands for itself alone.
 
         Raises:
             RecipeError: when an option cannot be read.
         """
-        return (self,)
+        return Chain()
 
-    def following_stages(self) -> tuple[tuple[str, dict[str, Any]], ...]:
-        """Return the stages that the command line runs after this one, each with its options; a recipe names them."""
+    def summarize(self, bundle: Bundle) -> tuple[str, ...]:
+        """Return sentences on a bundle that this stage made, now or earlier."""
         return ()
 
-    def summary(self, bundle: Bundle) -> tuple[str, ...]:
-        """Return a summary of the new bundle, which is printed even where other stages follow."""
-        return ()
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
+        """Write a new bundle of a source that ``check`` accepts into the empty directory ``out``.
 
-    def lines(self, bundle: Bundle) -> tuple[str, ...]:
-        """Return further sentences on the new bundle, one for each line."""
-        return ()
-
-    def accept(self, bundle: Bundle) -> None:
-        """Raise when the result does not meet the request; its output is then discarded."""
-
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
-        """Write the new bundle into the empty directory ``out`` and return it."""
-        raise PluginError(f"The stage {self.name()} has no method run().", DEFINE_RUN)
-
-    def _recorded_options(self) -> dict[str, Any]:
-        """Return the options with files named by name and content: paths are not recorded."""
-        options = self.options()
-        for name in options:
-            value = getattr(self, name)
-            if isinstance(value, Path):
-                whole = value in self.inputs() or not value.is_dir()  # of a policy only some files count
-                digest = content_hash(value) if whole else f"absent:{value.name}"
-                options[name] = f"{value.name} sha256:{digest[:16]}"
-        return options
-
-    def made_by(self, seed: int | None = None, calibration: SampleSet | None = None) -> dict[str, Any]:
-        """Return the ``made_by`` entry of the manifest.
-
-        Args:
-            seed: seed of what the stage draws itself; ``finish`` notes the seed of noise and golden inputs otherwise.
-            calibration: the samples that the stage calibrated on, after the last one was used.
-
-        Returns:
-            ``vlatool``, ``stage``, ``options`` that differ from their defaults, ``versions``, and where there are any
-            ``files`` (name -> SHA-256 of each file outside the source), ``seed`` and ``calibration``. No paths, no
-            times: the same command gives the same entry in another directory and on another day.
+        Raises:
+            VlatoolError: when the result does not meet the request, too; ``out`` is then discarded.
         """
-        installed = {package: installed_version(package) for package in self.used_packages()}
-        versions = {package: version for package, version in installed.items() if version}
-        entry: dict[str, Any] = {"vlatool": VERSION, "stage": self.name(), "options": self._recorded_options()}
-        files = self.input_hashes()
-        entry |= {"versions": versions, **({"files": files} if files else {})}
-        entry |= {} if seed is None else {"seed": seed}
-        return entry | ({} if calibration is None else {"calibration": calibration.record()})
-
-    def input_hashes(self) -> dict[str, str]:
-        """Return name -> SHA-256 of the inputs outside the source; a second one of the same name is ``NAME (2)``."""
-        hashes: dict[str, str] = {}
-        for path in (path for path in self.inputs() if path.is_file() or path.is_dir()):
-            digest, name, number = content_hash(path), path.name, 1
-            while hashes.get(name, digest) != digest:
-                number += 1
-                name = f"{path.name} ({number})"
-            hashes[name] = digest
-        return hashes
+        raise PluginError(f"The stage {self.name()} has no method run().", DEFINE_RUN)
 
 
 class Measure(Stage):
@@ -286,10 +215,6 @@ class Measure(Stage):
     """Whether it opens graphs itself, not in processes that it starts: then it runs in a child, as above."""
     films: ClassVar[bool] = False
     """Whether it can write a video of what it measured (``Context.video``)."""
-
-    def on(self, profile: Profile) -> Measure:
-        """Return the stage as it is for a board."""
-        return self
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Measure and return the report; the caller writes it."""

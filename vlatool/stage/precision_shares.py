@@ -18,21 +18,19 @@ from vlatool.graph.run_shapes import RunShapes, read_run_shapes, write_run_shape
 from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.engines import open_traced
-from vlatool.stage.base import Context
 
 MAX_NAMES = 4
 """Layers that a sentence names."""
 
 
-def count_shares(path: Path, context: Context) -> dict[str, float]:
-    """Return precision -> share of a graph's multiply-accumulates.
+def count_shares(path: Path) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return precision -> share of a graph's multiply-accumulates, and a sentence on layers that are not counted.
 
     Where layers have no static shape, or a loop ends nobody knows when, the graph is run once on drawn inputs, and what
-    that shows is noted in its file, for all who count it later. What nobody knows after that is said.
+    that shows is noted in its file, for all who count it later.
 
     Args:
         path: written by a stage that runs where its engine may crash; no other name of the file is in use.
-        context: context that receives the sentence.
     """
     shares, unknown = shares_and_unknown(path)
     seen = _run(path) if unknown else {}
@@ -42,11 +40,11 @@ def count_shares(path: Path, context: Context) -> dict[str, float]:
         write_run_shapes(model, {name: node for name, node in seen.items() if name in wanted})
         path.write_bytes(model.SerializeToString())
         shares, unknown = shares_and_unknown(path)
-    if unknown:
-        more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
-        named = ", ".join(unknown[:MAX_NAMES]) + more
-        context.messages.append(f"{path.stem}: not counted, for want of fixed shapes: {named}")
-    return shares
+    if not unknown:
+        return shares, ()
+    more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
+    named = ", ".join(unknown[:MAX_NAMES]) + more
+    return shares, (f"{path.stem}: not counted, for want of fixed shapes: {named}",)
 
 
 def _run(path: Path) -> dict[str, RunShapes]:

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vlatool.stats.outcome import Outcome
 from vlatool.stats.signed_rank import hodges_lehmann, lower_bound, min_differences, upper_bound
 
 INTERIM_ANALYSES = (10, 20, 40)
@@ -33,7 +34,7 @@ class Decision:
     """Decision from the processes.
 
     Args:
-        verdict: ``pass``, ``fail`` or ``inconclusive``.
+        verdict: pass, fail or inconclusive.
         ratio: Candidate over baseline, Hodges-Lehmann centre; 1.1 is a tenth slower.
         low, high: Bounds of the ratio, each at the error of one analysis.
         margin: The largest slowdown that passes, a share.
@@ -42,7 +43,7 @@ class Decision:
         alpha: Chance of a false verdict of the analysis, on either side.
     """
 
-    verdict: str
+    verdict: Outcome
     ratio: float
     low: float
     high: float
@@ -62,7 +63,7 @@ class Decision:
 
         None would do where the centre lies on the margin: then it is a million.
         """
-        if self.verdict != "inconclusive":
+        if self.verdict != Outcome.INCONCLUSIVE:
             return 0
         gap = abs(math.log(self.ratio) - math.log1p(self.margin))
         needed = reach(self.processes, self.alpha) * self.spread
@@ -104,7 +105,8 @@ def judge(
         raise ValueError(f"the margin is {margin}; allowed: above -1")
     low, high = lower_bound(log_ratios, alpha / sharing), upper_bound(log_ratios, alpha)
     limit = math.log1p(margin)
-    verdict = "fail" if low > limit else "pass" if high < limit else "inconclusive"
+    passes = Outcome.PASS if high < limit else Outcome.INCONCLUSIVE
+    verdict = Outcome.FAIL if low > limit else passes
     count = len(log_ratios)
     spread = float(np.std(log_ratios, ddof=1)) if count > 1 else math.nan
     centre = hodges_lehmann(log_ratios)
@@ -142,6 +144,6 @@ def judge_jointly(
             processes.append(measure(len(processes)))
         decisions = [judge(ratios, margin, alpha / len(after), statistics) for ratios in zip(*processes, strict=True)]
         verdicts = {decision.verdict for decision in decisions}
-        if "fail" in verdicts or "inconclusive" not in verdicts:
+        if Outcome.FAIL in verdicts or Outcome.INCONCLUSIVE not in verdicts:
             break
     return decisions, processes

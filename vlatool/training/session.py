@@ -20,7 +20,7 @@ from vlatool.episodes.play import jobs_for
 from vlatool.errors import require
 from vlatool.files.user_files import atomic_file
 from vlatool.module.edits import read_edits
-from vlatool.module.stage import write_modules
+from vlatool.module.stage import ModuleChanges, write_modules
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 from vlatool.training.batches import Batches, draw_of, mean_loss
@@ -339,7 +339,9 @@ class Session:
                 return write_modules(source, target, edits, modules, source.manifest.made_by)
         modules = teacher.program.modules
         program = teacher.program.steps
-        return write_modules(teacher.bundle, target, teacher.edits, modules, source.manifest.made_by, program=program)
+        return write_modules(
+            teacher.bundle, target, teacher.edits, modules, source.manifest.made_by, ModuleChanges(program=program)
+        )
 
     def _report(self, step: int, loss: float) -> None:
         steps, left = self._settings.steps, self._forecast.time_left(step)

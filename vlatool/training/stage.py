@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from vlatool.bundle.bundle import MANIFEST, REPORTS, Bundle
+from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.bundle.module_bundle import factory_of
 from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import OutputError, RecipeError, require
 from vlatool.files.printable import file_of
 from vlatool.files.resumable_work import remove_work, work_directory
-from vlatool.machine import host
 from vlatool.module.edits import is_changed
 from vlatool.module.source import claimed_source
 from vlatool.module.stage import TRAINING, ModuleChanges, ModuleStage
 from vlatool.module.zeros import has_zeros, sparse_weights, zero_share
-from vlatool.stage.base import Context, source_of
-from vlatool.stage.cache import STREAMS
+from vlatool.stage.base import Context, Result
+from vlatool.stage.run import work_folder
 from vlatool.training.constraint import KeptZeros
 from vlatool.training.device import Device, DeviceChoice, device_of
 from vlatool.training.events import check_events
@@ -39,7 +39,6 @@ from vlatool.training.user_batches import requested_rows
 
 if TYPE_CHECKING:
     from torch import nn
-    from typing_extensions import Self
 
     from vlatool.hardware.profile import Profile
 
@@ -59,6 +58,7 @@ class TrainingStage(ModuleStage):
     changed_first: ClassVar[bool] = True
     """Whether an unchanged policy has nothing to learn."""
     trains: ClassVar[bool] = True
+    policies: ClassVar[tuple[str, ...]] = ("teacher",)
     keeps: ClassVar[int] = 0
     """Number of observations that are stored in the bundle, for the ranges of activations."""
     teacher: Path | None = Field(
@@ -115,12 +115,6 @@ class TrainingStage(ModuleStage):
         teacher = claimed_source(self.teacher) if self.teacher else None
         return super().key(f"{source_hash} {teacher.key('')}" if teacher else source_hash)
 
-    def trust_code(self) -> Self:
-        """Allow the code of a teacher that is a policy to run in this process, because the user named its folder."""
-        if self.teacher and (source := claimed_source(self.teacher)):
-            source.trust_code()
-        return self
-
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Check that training and evaluation share no episodes, and that the teacher is another policy."""
         super().check(source, profile)
@@ -150,7 +144,7 @@ class TrainingStage(ModuleStage):
                 f"{EVALUATION_SEEDS}, and would see episodes of the training.",
                 "take a smaller --first-seed, or fewer episodes",
             )
-        changes = len(self.chain()) > 1
+        changes = bool(self.chain().before)
         if self.changed_first and not (source is None or self.teacher or changes or is_changed(source)):
             raise RecipeError(
                 f"{source.manifest.name} is as its factory makes it: without --teacher it would be its own teacher.",
@@ -219,7 +213,7 @@ class TrainingStage(ModuleStage):
         """Return the objective: the student's loss on a batch with the teacher's labels."""
         raise NotImplementedError(self.name())
 
-    def summary(self, made: Bundle) -> tuple[str, ...]:
+    def summarize(self, made: Bundle) -> tuple[str, ...]:
         """Return sentences on the training data and the losses."""
         training = json.loads(made.file(TRAINING).read_bytes())
         seen = sum(round_["observations"] for round_ in training["rounds"])
@@ -242,10 +236,6 @@ class TrainingStage(ModuleStage):
             ),
         )
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
-        """Return sentences on the training, the loss curve and the next step."""
-        return (*self.summary(made), *curve_lines(made), *super().lines(made))
-
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Train the modules in place."""
         torch = require("torch", "build")
@@ -253,10 +243,10 @@ class TrainingStage(ModuleStage):
         here = launch.local_size if launch and not self.threads else self.processes
         torch.set_num_threads(max(1, (self.threads or before) // here))
         try:
-            with work_directory(self._work_folder(source)) as folder:
+            with work_directory(work_folder(self, source)) as folder:
                 return self._train(modules, source, folder, context)
         except OSError as error:  # about the work folder, not about the bundle
-            where = file_of(error) or self._work_folder(source)
+            where = file_of(error) or work_folder(self, source)
             raise OutputError(
                 f"The training cannot be kept: {where}: {error.strerror or error}.",
                 "make room there, or name another cache (VLATOOL_CACHE); the same command goes on from its last "
@@ -272,7 +262,7 @@ class TrainingStage(ModuleStage):
         teacher, objective = self.prepare_objective(modules, source)
         settings, programs = self.settings(), (objective.trainable, teacher.program.modules)
         settings.device.choose(0)
-        launch_arguments = self._job(source), self.processes, folder, self.runs(source), settings.device.name
+        launch_arguments = self._job(source), self.processes, folder, factory_of(source), settings.device.name
         with settings.device.holding(*programs), launch_processes(*launch_arguments) as processes:
             session = Session(plan, settings, objective, source, teacher, folder, context, processes)
             training = session.run()
@@ -313,24 +303,15 @@ class TrainingStage(ModuleStage):
         path = str(source.path.absolute())
         return {"stage": self.name(), "options": self.explicit_options(), "source": path, "threads": threads}
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Train; the checkpoint of a killed run stays until the result is written."""
         if context.events:
             check_events(context.events)
-        made = super().run(source, out, context)
-        folder = self._work_folder(source_of(source, self.name()))
-        write_training_report(made, seconds_of(folder), context.command)
+        result = super().run(source, out, context)
+        folder = work_folder(self, source)
+        write_training_report(result.bundle, seconds_of(folder), context.command)
         remove_work(folder)
-        return made
-
-    def _work_folder(self, source: Bundle) -> Path:
-        return host.cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
-
-
-def curve_lines(made: Bundle) -> tuple[str, ...]:
-    """Return a sentence that names the report of a training, if there is one."""
-    page = made.path / REPORTS / "report.html"
-    return (f"loss curve: {page}",) if page.is_file() else ()
+        return result
 
 
 def _hint_lines(hints: Mapping[str, Any]) -> tuple[str, ...]:

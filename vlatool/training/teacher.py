@@ -35,7 +35,9 @@ def teacher_bundle(path: Path) -> Bundle:
         SourceError: when it is a policy whose folder was neither named nor trusted.
     """
     source = _checked_source(path)
-    return Bundle.open(path) if source is None else cached_transform(source, None, host.cache_directory(), Context())
+    if source is None:
+        return Bundle.open(path)
+    return cached_transform(source, None, host.cache_directory(), Context()).bundle
 
 
 def check_teacher(path: Path) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlatool import errors
-from vlatool.errors import GraphError, InputError, MissingExtra, SourceError, VlatoolError
+from vlatool.errors import FallsShort, GraphError, InputError, MissingExtra, SourceError, VlatoolError
 from vlatool.files.json import parse_json
 from vlatool.files.limits import LIMITS_VARIABLE, limit
 from vlatool.files.printable import MAX_CHARACTERS, file_of, truncate
@@ -105,7 +105,7 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
         own: the child runs vlatool's code alone: what fails in it is a bug of vlatool.
 
     Raises:
-        InputError, MissingExtra: of the class that is named; any VlatoolError where ``own``.
+        InputError, MissingExtra, FallsShort: of the class that is named; any VlatoolError where ``own``.
         SourceError: for everything else that was raised, also by vlatool, which is named then; RuntimeError where
             ``own``.
         OSError, MemoryError: what the child met.
@@ -117,7 +117,7 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     message = plain(answer["message"])
     if "error" in answer:
         kind = ChildKilled if answer["error"] == ChildKilled.__name__ else getattr(errors, answer["error"], None)
-        if isinstance(kind, type) and issubclass(kind, VlatoolError if own else InputError | MissingExtra):
+        if isinstance(kind, type) and issubclass(kind, VlatoolError if own else InputError | MissingExtra | FallsShort):
             raise kind(truncate(answer["message"], MAX_MESSAGE), truncate(answer["fix"], MAX_MESSAGE))
         name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
         raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}", truncate(answer["fix"], MAX_MESSAGE))

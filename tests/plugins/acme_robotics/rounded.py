@@ -10,7 +10,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import find_layers
 from vlatool.quantize import Quantization
-from vlatool.stage.base import Context, source_of
+from vlatool.stage.base import Context, Result
 
 
 class Rounded(Quantization):
@@ -21,14 +21,13 @@ class Rounded(Quantization):
 
     bits: int = Field(6, ge=2, le=16, description="bits of a weight")
 
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+    def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Round the weights of every selected layer."""
-        bundle = source_of(source, self.name())
         layers = {}
-        for graph in self.chosen_graphs(bundle):
-            model = load(bundle.file(bundle.manifest.graphs[graph].file))
+        for graph in self.chosen_graphs(source):
+            model = load(source.file(source.manifest.graphs[graph].file))
             layers[graph] = find_layers(model, ("MatMul", "Gemm", "Conv"))
-        selected = self.select_nodes([layer.name for found in layers.values() for layer in found], bundle)
+        selected = self.select_nodes([layer.name for found in layers.values() for layer in found], source)
 
         def quantize(graph: str, original: Path, target: Path) -> None:
             model = load(original)
@@ -39,7 +38,7 @@ class Rounded(Quantization):
                     tensor.CopyFrom(numpy_helper.from_array(rounded, tensor.name))
             save(model, target)
 
-        return self.transform(bundle, out, context, quantize)
+        return self.transform(source, out, context, quantize)
 
     def rounded(self, weights: np.ndarray) -> np.ndarray:
         """Return the nearest of ``2 ** bits - 1`` evenly spaced values for each weight."""

@@ -149,7 +149,7 @@ def test_a_sum_that_is_infinite_stays_float(tmp_path: Path, layout: str) -> None
     np.savez(tmp_path / "mine.npz", x=x, seen=np.arange(12, dtype=np.float32).reshape(12, 1) % 2)
     exact = full_range_or_less() if layout == "openvino" else {}
     stage = StaticInt8(elementwise=True, calibration=tmp_path / "mine.npz", layout=layout, **exact)
-    made = run_transform(stage, bundle, tmp_path / "int8", Context())
+    made = run_transform(stage, bundle, tmp_path / "int8", Context()).bundle
     shares = made.manifest.graphs["head"].precision
     assert shares["int8"] > 0
     observation = {"x": x[0], "seen": np.zeros(1, np.float32)}

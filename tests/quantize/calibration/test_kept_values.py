@@ -16,7 +16,8 @@ from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.streamed import sequential_calibration
 from vlatool.quantize.weight_only import WeightOnly
-from vlatool.stage.base import Context, SampleSet, Transform
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.record import SampleSet
 from vlatool.stage.run import run_transform
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*calibration samples:UserWarning")
@@ -95,9 +96,9 @@ def test_a_recurrent_layer_that_stays_float32_is_named(tmp_path: Path, stage: Tr
     """ONNX has one operator for nn.GRU, and none that multiplies its weights in int8."""
     said = {}
     for kind in ("gru", "elman"):
-        bundle, context = exported(tmp_path / kind, kind, count=2), Context()
-        made = run_transform(stage, bundle, tmp_path / f"{kind}-int8", context)
-        said[kind] = [line for line in context.messages if "recurrent layer" in line]
-        assert (made.manifest.graphs["main"].precision.get("float32", 0) > 0.5) is (kind == "gru")
+        bundle = exported(tmp_path / kind, kind, count=2)
+        result = run_transform(stage, bundle, tmp_path / f"{kind}-int8", Context())
+        said[kind] = [line for line in result.messages if "recurrent layer" in line]
+        assert (result.bundle.manifest.graphs["main"].precision.get("float32", 0) > 0.5) is (kind == "gru")
     assert "gru/GRU, gru/GRU_1 computed in float32" in said["gru"][0]
     assert not said["elman"]

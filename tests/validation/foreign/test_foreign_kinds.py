@@ -171,7 +171,7 @@ def exported(folder: Path, code: str, description: str, **recorded: np.ndarray) 
     source, out = folder / "source", folder / "float32"
     source.mkdir()
     out.mkdir()
-    bundle = ExportOnnx().run(TorchModule(policy=folder).run(None, source, Context()), out, Context())
+    bundle = ExportOnnx().run(TorchModule(policy=folder).run(None, source, Context()).bundle, out, Context()).bundle
     space: dict[str, Any] = {}
     exec(code, space)
     made = space["make"]()
@@ -218,7 +218,7 @@ def test_a_diffusion_policy_is_no_other_one_in_8_bits(tmp_path, method):
     state, noise = random.normal(size=(8, 2, 4)).astype(np.float32), random.normal(size=(1, 8, 2)).astype(np.float32)
     bundle, _ = exported(tmp_path / "policy", DDIM, DDIM_YAML, state=state)
     (tmp_path / "eighth").mkdir()
-    made = method().run(bundle, tmp_path / "eighth", Context())
+    made = method().run(bundle, tmp_path / "eighth", Context()).bundle
     assert made.manifest.findings == ()
     got, wanted = (
         np.array([load(each.path).infer({"state": row}, noise={"sample": noise}).chunk for row in state])

@@ -95,10 +95,12 @@ def trials(
     made: list[Bundle] = []
 
     def export() -> Bundle:
-        source = run_transform(source_stage(str(policy.write(scratch / "policy"))), None, scratch / "source", Context())
+        source = run_transform(
+            source_stage(str(policy.write(scratch / "policy"))), None, scratch / "source", Context()
+        ).bundle
         (scratch / "float").mkdir()
         made.append(source)
-        return ExportOnnx().run(source, scratch / "float", Context())
+        return ExportOnnx().run(source, scratch / "float", Context()).bundle
 
     exported, failed = trial.tried((EXPORT, ""), export)
     if exported is None:
@@ -115,7 +117,7 @@ def trials(
             exact = full_range_or_less() if options.get("layout") == "openvino" else {}
             built = build_stage(stage, {**options, **exact, **more})
             assert isinstance(built, Transform)
-            return run_transform(built, exported, scratch / f"{method}{word}", Context())
+            return run_transform(built, exported, scratch / f"{method}{word}", Context()).bundle
 
         bundle, failed = trial.tried((method, ""), quantize)
         if bundle is None:

@@ -240,7 +240,7 @@ def tried(name: str, place: Path) -> Iterator[tuple[str, str, str]]:
 
     def done(stage: str, source: Any, options: Mapping[str, Any], out: str) -> Any:
         made = TorchModule(policy=folder) if not stage else build_stage(stage, dict(options))
-        return run_transform(made, source, place / f"{name}-{out}", Context())
+        return run_transform(made, source, place / f"{name}-{out}", Context()).bundle
 
     def far(bundle: Any, module: Any) -> float:
         wanted = by_hand(module, kind, rows)

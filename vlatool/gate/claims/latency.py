@@ -109,7 +109,7 @@ class Latency(Claim):
         measured = quantity.measurement(
             decision.ratio, samples=count, low=low, high=high, confidence=CONFIDENCE, note=note
         )
-        return Judgement(Outcome(decision.verdict), what, measured, 1 + self.margin, facts={"decision": decision})
+        return Judgement(decision.verdict, what, measured, 1 + self.margin, facts={"decision": decision})
 
     def sentence(self, verdict: Verdict) -> str:
         """Return the observations that are slow, or else the statistic that decides; both statistics either way."""
@@ -134,7 +134,7 @@ def decision_words(decision: Decision) -> str:
     words = f"{slower(decision.ratio)} ({change(decision.low)} to {change(decision.high)}, {decision.processes} "
     words += f"processes; allowed: {change(1 + decision.margin)}); "
     words += f"a slowdown of {decision.detectable:.1%} is found 95 times in 100"
-    return f"{words}, {_advice(decision)}" if Outcome(decision.verdict) is Outcome.INCONCLUSIVE else words
+    return f"{words}, {_advice(decision)}" if decision.verdict == Outcome.INCONCLUSIVE else words
 
 
 def _advice(decision: Decision) -> str:

@@ -10,7 +10,7 @@ from vlatool.bundle.program import keeps_values
 from vlatool.data import Moment, Recording, played_observations
 from vlatool.module.torch_policy import torch_policy
 from vlatool.runtime.policy import Policy
-from vlatool.stage.base import SampleSet
+from vlatool.stage.record import SampleSet
 
 
 def recorded_moments(

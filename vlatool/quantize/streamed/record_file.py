@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import OutputError
-from vlatool.machine.host import cache_directory
 from vlatool.quantize.streamed._journal import DATA, Journal, hash_part
 from vlatool.quantize.streamed._prefetch import Prefetcher
 from vlatool.quantize.streamed.records import Record
@@ -43,11 +42,6 @@ class RecordFile:
     bytes: int
     notes: list[dict[str, Any]]
     resumed: int
-
-
-def work_root() -> Path:
-    """Return the directory of unfinished work: ``streams`` in vlatool's cache directory."""
-    return cache_directory() / "streams"
 
 
 def write_records(records: list[Record], plan: str, directory: Path, processes: int, tell: OnProgress) -> RecordFile:

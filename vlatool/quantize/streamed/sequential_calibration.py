@@ -35,7 +35,7 @@ from vlatool.quantize.streamed.weights_plan import WeightsPlan
 from vlatool.runtime.interface import Array
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import draw
-from vlatool.stage.base import SampleSet
+from vlatool.stage.record import SampleSet
 
 MAX_STATE_SIZE, STATE_SAMPLES = 4096, 1024
 """Largest number of elements of a state observation, and number of samples for such observations."""

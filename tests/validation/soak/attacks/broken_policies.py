@@ -30,20 +30,19 @@ from toy_robot import write_robot
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import main as vlatool
-from vlatool.cli._run import export_source
+from vlatool.cli._run import with_graphs
 from vlatool.errors import VlatoolError
 from vlatool.gate.claims.accuracy import Accuracy
 from vlatool.gate.config import Gate
 from vlatool.gate.run import run_gate
-from vlatool.optimize.evidence import with_accuracy
-from vlatool.optimize.pipeline import judged_rows
+from vlatool.optimize.decision import decide
+from vlatool.optimize.evidence import with_episodes, with_recordings
 from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, Recipe
-from vlatool.optimize.summary import verdict_of
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.report import Measurement, Row
 from vlatool.runtime.golden import load_goldens
-from vlatool.sources import source_stage
+from vlatool.sources import source_bundle, source_stage
 from vlatool.stage.base import Context
 from vlatool.stage.finish import write_golden
 
@@ -94,7 +93,8 @@ def bundles(case: Case, folder: Path, kept: Path) -> dict[str, Bundle]:
     )
     place = kept / hashlib.sha256(code.encode()).hexdigest()[:16]
     if not place.exists():
-        baseline = export_source(source_stage(str(folder)), place / "cache", Context())
+        source = source_bundle(source_stage(str(folder)), place / "cache", Context())
+        baseline = with_graphs(source, place / "cache", Context()).bundle
         (place / "int8").mkdir()
         DynamicInt8().run(baseline, place / "int8", Context())
         shutil.copytree(baseline.path, place / "float32")
@@ -138,9 +138,10 @@ def by_optimize(case: Case, folder: Path, made: dict[str, Bundle], cache: Path) 
     )  # fmt: skip
     plan = make_plan(str(folder), None, recipe, cache)
     rows = {"float32": timed("float32", 10.0), "int8": timed("int8", 5.0)}
-    judged, trust = judged_rows(plan, with_accuracy(rows, made, plan.closed_loop, cache, Context()))
-    chosen = next(item for item in judged if item.row.role == "chosen")
-    verdict = verdict_of(judged, trust)
+    loop, context = plan.closed_loop, Context()
+    rows, _ = with_recordings(rows, made, loop, cache, context)
+    decision = decide(plan, with_episodes(rows, made, loop, cache, context) if loop else rows)
+    chosen, verdict, trust = decision.choice, decision.verdict, decision.trust
     if case.candidate and verdict == "pass" and chosen.row.name == "float32":
         return "fail", chosen.row.reason
     return verdict, " ".join((*trust.sentences[:1], *(chosen.sentences if not trust.fails else ())))

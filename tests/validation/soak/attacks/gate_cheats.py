@@ -206,7 +206,7 @@ def honest(base: Bundle, folder: Path) -> dict[str, Bundle]:
     for stage in (StaticInt8(), DynamicInt8()):
         out = folder / type(stage).__name__
         out.mkdir()
-        found[type(stage).__name__] = stage.run(base, out, Context())
+        found[type(stage).__name__] = stage.run(base, out, Context()).bundle
     return found
 
 
@@ -277,8 +277,8 @@ def exported(folder: Path) -> Bundle:
     trust.allow(policy)
     for name in ("source", "exported"):
         (folder / name).mkdir()
-    source = TorchModule(policy=policy).run(None, folder / "source", Context())
-    return ExportOnnx().run(source, folder / "exported", Context())
+    source = TorchModule(policy=policy).run(None, folder / "source", Context()).bundle
+    return ExportOnnx().run(source, folder / "exported", Context()).bundle
 
 
 if __name__ == "__main__":

@@ -1,66 +1,56 @@
-"""The report of a run: what was chosen and why, with everything that was measured."""
+"""What a run leaves behind: the report on what was chosen and why, the bundle, and the recipe that makes it again."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
-from vlatool.accuracy.credibility import Credibility
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import pip_install
 from vlatool.machine.host import fingerprint
-from vlatool.machine.instruction_sets import ENGINE, BoardSet, about_onnx_runtime
+from vlatool.machine.instruction_sets import ENGINE, BoardSet
+from vlatool.measures.actions import AGREEMENT_EXPERT, ERROR_EXPERT
 from vlatool.measures.latency import SPEEDUP
-from vlatool.optimize.choice import chosen_of
-from vlatool.optimize.judge import Judged
+from vlatool.measures.success import SUCCESS, SUCCESS_DROP
+from vlatool.optimize.build_candidates import Candidates, engine_of
+from vlatool.optimize.decision import Decision
+from vlatool.optimize.evidence import Evidence
 from vlatool.optimize.moves import slower_task
-from vlatool.optimize.plan import Plan
-from vlatool.optimize.timings import IN_OPENVINO, engine_of, utc_now
+from vlatool.optimize.plan import BASELINE, Plan
+from vlatool.optimize.recipe import Pruning, Recipe, StageList
+from vlatool.optimize.timings import IN_OPENVINO, utc_now
 from vlatool.report import ON_BOARD, Report, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
+from vlatool.stage.finish import reseal
+
+ROBOT_FOLDERS = ("assets", "graphs", "golden")
+"""What of a bundle a robot needs; recorded data stays behind."""
 
 
-def report_of(
-    plan: Plan,
-    baseline: Bundle,
-    bundles: Mapping[str, Bundle],
-    judged: list[Judged],
-    failures: Sequence[Row],
-    notes: Sequence[str],
-    trust: Credibility,
-    command: str,
-) -> Report:
-    """Return the report.
-
-    Args:
-        bundles: Name -> bundle of each candidate.
-        judged: The rows, float32 first, one of them chosen.
-    """
-    chosen, where = chosen_of(judged), plan.board_set
-    engine = engine_of(bundles.get(chosen.row.name, baseline))
-    rows = {item.row.name: item.row for item in judged}
-    warnings = [*where.warnings(), *notes, *trust.warnings, *(text for item in judged for text in item.warnings)]
+def summarize(plan: Plan, candidates: Candidates, evidence: Evidence, decision: Decision, command: str) -> Report:
+    """Return the report."""
+    chosen, trust, where = decision.choice, decision.trust, plan.board_set
+    rows = {item.row.name: item.row for item in decision.judged}
+    judged = (text for item in decision.judged for text in item.warnings)
+    warnings = (*evidence.warnings, *trust.warnings, *judged)
     return Report(
         "optimize",
-        f"{baseline.manifest.name} for {plan.board}",
-        verdict_of(judged, trust),
+        f"{candidates.bundles[BASELINE].manifest.name} for {plan.board}",
+        decision.verdict,
         summary=(
             *trust.sentences, *chosen.sentences, *filter(None, [slower_task(chosen.row)]), *filter(None, [trust.floor]),
-            *about_int8(rows, in_int8(bundles), where), *about_onnx_runtime(plan.profile), *where.sentences(),
-            *_needs(engine),
+            *about_int8(rows, in_int8(candidates.bundles), where), *evidence.conditions,
+            *_needs(engine_of(candidates.bundles[chosen.row.name])),
         ),
-        rows=(*rows.values(), *failures),
+        rows=(*rows.values(), *candidates.failures),
         limits=_limits(plan),
         command=command,
         created=utc_now(),
         environment={**fingerprint(), **({ON_BOARD: plan.board} if plan.profile and plan.on_board else {})},
         warnings=tuple(dict.fromkeys(warnings)),
     )  # fmt: skip
-
-
-def verdict_of(judged: list[Judged], trust: Credibility) -> str:
-    """Return ``pass``, ``fail``, or ``inconclusive`` where nothing can be held against the reference."""
-    kept = chosen_of(judged).within and any(item.within for item in judged[1:])
-    return "inconclusive" if trust.fails else "pass" if kept else "fail"
 
 
 def _limits(plan: Plan) -> dict[str, float | str]:
@@ -114,3 +104,39 @@ def _needs(engine: str) -> tuple[str, ...]:
     if engine == DEFAULT_ENGINE:
         return ()
     return (f"It runs on the engine {engine}: {pip_install(engine, 'vlatool-runtime')} on the robot.",)
+
+
+def write_bundle(bundle: Bundle, chosen: Row, board: str, draft: Path) -> None:
+    """Write the chosen bundle, without what a robot does not need, into an empty directory.
+
+    Args:
+        board: name of the profile, or of what stands in for it.
+    """
+    manifest = replace(
+        bundle.manifest,
+        parent=bundle.hash,
+        made_by={**bundle.manifest.made_by, "candidate": chosen.name, "profile": board},
+        accuracy=_accuracy(chosen),
+        source={},
+        files={graph.file: bundle.manifest.files[graph.file] for graph in bundle.manifest.graphs.values()},
+    )
+    reseal(bundle, draft, manifest, ROBOT_FOLDERS)
+
+
+def write_recipe(recipe: Recipe, candidates: Mapping[str, StageList], chosen: str, draft: Path) -> None:
+    """Write the recipe that makes the chosen candidate again, or all of them where float32 was kept."""
+    only = {"candidates": {chosen: candidates.get(chosen)}, "search": False, "pruning": Pruning()}
+    nowhere = {"pruning": recipe.pruning.model_copy(update={"study": ""})}  # of this machine, and may hold a password
+    repeat = recipe.model_copy(update=only if chosen in candidates else {"candidates": dict(candidates), **nowhere})
+    (draft / "recipe.yaml").write_text(repeat.to_yaml(), encoding="utf-8")
+
+
+def _accuracy(row: Row) -> dict[str, Any]:
+    """Return what the manifest says of the accuracy."""
+    accuracy = {}
+    for quantity in (SUCCESS, SUCCESS_DROP, AGREEMENT_EXPERT, ERROR_EXPERT):
+        measured = row.get(quantity)
+        if measured is not None and measured.known:
+            interval = {"low": measured.low, "high": measured.high} if measured.low is not None else {}
+            accuracy[quantity.name] = {"value": measured.value, **interval, "samples": measured.samples}
+    return accuracy
