@@ -42,7 +42,7 @@ from vlatool.data._selections import carry_recording as carry_recording
 from vlatool.data._selections import evaluation_recording as evaluation_recording
 from vlatool.data._selections import is_of_recording as is_of_recording
 from vlatool.data._selections import recordings_of as recordings_of
-from vlatool.data._steps import StepReader as StepReader
+from vlatool.data._step_reader import StepReader as StepReader
 from vlatool.data._steps import Steps as Steps
 from vlatool.data._training_observations import BEGINS as BEGINS
 from vlatool.data._training_observations import MAX_PLAYED as MAX_PLAYED

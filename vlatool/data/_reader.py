@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from vlatool import registry
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data._recording import Recording
+from vlatool.data._steps import Steps
 from vlatool.errors import DataError, UsageError, suggest
 from vlatool.registry import Claim
-
-if TYPE_CHECKING:
-    from vlatool.data._steps import Steps
 
 MAP_HELP = (
     "NAME=RECORDED where a recording has another name for an input or the action; RECORDED may be a part or several "

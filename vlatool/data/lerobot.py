@@ -15,7 +15,8 @@ from vlatool.data._lazy_rows import LazyRows, text_rows
 from vlatool.data._parquet import COPY_AGAIN, ParquetPictures, Table, open_parquet, read_table
 from vlatool.data._pictures import stack_pictures
 from vlatool.data._recording import Values
-from vlatool.data._steps import StepReader, Steps
+from vlatool.data._step_reader import StepReader
+from vlatool.data._steps import Steps
 from vlatool.data._video import VideoFrames
 from vlatool.errors import DataError
 from vlatool.files.json import read_json

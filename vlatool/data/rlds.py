@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from vlatool.data._lazy_rows import LazyRows
 from vlatool.data._pictures import decode_picture, stack_pictures
 from vlatool.data._recording import Values
-from vlatool.data._steps import StepReader, Steps
+from vlatool.data._step_reader import StepReader
+from vlatool.data._steps import Steps
 from vlatool.errors import DataError, require
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit, limit

@@ -11,7 +11,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import StepReader, Steps, read_recording, sampled_rows
 from vlatool.data._lazy_rows import LazyRows, text_rows
 from vlatool.data._sampling import rows_to_carry, sampled_episodes, save_recording
-from vlatool.data._steps import recording_of
+from vlatool.data._step_reader import recording_of
 from vlatool.errors import DataError
 
 LENGTHS = (5, 2, 7)
