@@ -11,6 +11,7 @@ from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import (
+    NamedRecording,
     calibration_recording,
     carries_evaluation,
     carry_recording,
@@ -103,3 +104,29 @@ def test_names_of_the_recording_may_differ_from_those_of_the_spec(tmp_path: Path
     assert read_recording(path, SPEC, {"x": "observation.x"}).inputs["x"].shape == (9, 2)
     with pytest.raises(DataError, match="has no 'x'"):
         read_recording(path, SPEC)
+
+
+def test_of_a_dataset_a_bundle_carries_a_sample_under_the_names_of_the_spec(tmp_path: Path):
+    h5py = pytest.importorskip("h5py", reason="HDF5 is read with h5py (extra data)")
+    with h5py.File(tmp_path / "demos.hdf5", "w") as file:
+        for number in range(20):
+            file[f"data/demo_{number}/obs/joints"] = np.full((100, 2), number, np.float32)
+            file[f"data/demo_{number}/actions"] = np.zeros((100, 1), np.float32)
+    out = tmp_path / "out"
+    out.mkdir()
+    named = NamedRecording(tmp_path / "demos.hdf5", {"x": "obs/joints"})
+    carry_recording(named, "calibration", SPEC, out)
+    assert [file.name for file in (out / "data").iterdir()] == ["calibration.npz"]
+    recording = read_recording(out / "data/calibration.npz", SPEC)
+    assert len(recording) == 512
+    assert np.unique(recording.inputs["x"][:, 0], return_counts=True)[1].min() >= 25, "of each episode as many"
+    carry_recording(named, "evaluation", SPEC, out, keeps=True)
+    recording = read_recording(out / "data/evaluation.npz", SPEC)
+    assert np.unique(recording.episodes, return_counts=True)[1].tolist() == [100] * 5
+
+
+def test_a_recording_with_other_names_is_carried_under_those_of_the_spec(tmp_path: Path):
+    path = recorded(tmp_path / "a.npz", 9, "observation.x")
+    (tmp_path / "out").mkdir()
+    carry_recording(NamedRecording(path, {"x": "observation.x"}), "calibration", SPEC, tmp_path / "out")
+    assert len(read_recording(tmp_path / "out/data/calibration.npz", SPEC)) == 9

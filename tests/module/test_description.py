@@ -202,3 +202,31 @@ def test_a_bundle_that_does_not_say_where_its_code_is(tmp_path: Path, text):
         (tmp_path / LOCATION).write_text(text)
     with pytest.raises(SourceError, match="does not say where the policy's code is"):
         read_location(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["calibration", "evaluation"])
+def test_a_recording_may_have_other_names(tmp_path: Path, key: str):
+    np.savez(tmp_path / "walk.npz", **{"observation.x": np.zeros((20, 2), np.float32)})
+    entry = {"path": "walk.npz", "map": {"x": "observation.x"}}
+    described = read_description(write(tmp_path, **{key: entry}))
+    assert described.recordings() == {key: tmp_path / "walk.npz"}
+    assert described.maps[key] == {"x": "observation.x"}
+    (tmp_path / "out").mkdir()
+    copy_assets(described, tmp_path / "out")
+    with np.load(tmp_path / f"out/data/{key}.npz") as arrays:
+        assert arrays["x"].shape == (20, 2)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"path": "walk.npz", "maps": {}}, "'calibration' has the unknown key 'maps'; known: map, path"),
+        ({"path": "walk.npz", "map": ["x"]}, "'map' of 'calibration' must name"),
+        ({"path": "walk.npz", "map": {"x": 3}}, "'map' of 'calibration' must name"),
+        ({"path": "absent.npz"}, "names the calibration data absent.npz, which does not exist"),
+    ],
+)
+def test_a_wrong_entry_of_a_recording_is_refused(tmp_path: Path, entry: Any, message: str):
+    (tmp_path / "walk.npz").touch()
+    with pytest.raises(SourceError, match=message):
+        read_description(write(tmp_path, calibration=entry))

@@ -27,3 +27,10 @@ Workers = Annotated[
 ProfileName = Annotated[
     str, typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles)
 ]
+MapNames = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map", metavar="NAME=RECORDED", help="name in the recording of an input or the action, where it differs; "
+        "also a part or several parts: state=qpos[0:7]+gripper",
+    ),
+]  # fmt: skip

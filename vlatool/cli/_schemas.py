@@ -35,6 +35,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "cache size": ("cache_size",),
     "cache list": ("cache_list",),
     "cache prune": ("cache_pruned",),
+    "data inspect": ("inspection",),
+    "data sample": ("written",),
     "verify": ("report",),
     "inspect": ("manifest",),
     "rebuild": ("rebuilt",),
@@ -153,6 +155,14 @@ def _documents() -> dict[str, Schema]:
         "cache_pruned": document(
             "What was removed from the cache, or would be; stays: name -> why.",
             cache=TEXT, dry_run=FLAG, removed=many(TEXT), freed_bytes=INTEGER, bytes=INTEGER, stays=by_name(TEXT),
+        ),
+        "inspection": document(
+            "What a recording holds; low and high are of finite numbers; gaps are the largest of gap_count.",
+            path=TEXT, format=TEXT, episodes=INTEGER, steps=INTEGER, hz=NUMBER, measured_hz=NUMBER,
+            lengths=many(INTEGER), tasks=INTEGER, action=TEXT, columns=many(record(
+                name=TEXT, dtype=TEXT, shape=many(INTEGER), low=NUMBER, high=NUMBER, not_finite=INTEGER,
+                constant=many(INTEGER), drift_ms=NUMBER)),
+            gaps=many(record(episode=INTEGER, step=INTEGER, seconds=NUMBER)), gap_count=INTEGER, findings=many(TEXT),
         ),
         "checks": many(record(name=TEXT, status=status, finding=TEXT, fix=TEXT)),
         "simulation": document(

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from vlatool.cli._console import progress, refuse_existing, show
-from vlatool.cli._options import AsJson, Force, ReportFolder
+from vlatool.cli._options import AsJson, Force, MapNames, ReportFolder
 
 
 def verify(
@@ -17,6 +17,7 @@ def verify(
         str, typer.Option(help="path.py:FUNCTION or package.module:FUNCTION of the original", show_default=False)
     ],
     data: Annotated[Path | None, typer.Option(help="recorded observations; the policy's own when not given")] = None,
+    map: MapNames = None,
     samples: Annotated[int, typer.Option(min=1, max=100_000, help="observations at most, spread over the data")] = 32,
     tolerance: Annotated[float, typer.Option(help="largest relative error of an action, and of each stage")] = 1e-3,
     seed: Annotated[int, typer.Option(min=0, help="seed of the noise that both are given")] = 0,
@@ -29,13 +30,15 @@ def verify(
     FUNCTION takes an observation (a dict of physical values, without a batch axis) and returns the action in physical
     units. Exits 1 when the actions differ.
     """
+    from vlatool.data import named_recording
     from vlatool.machine.host import cache_directory
     from vlatool.sources import open_source, source_bundle
     from vlatool.verify import Options, check
     from vlatool.verify import verify as verify_policy
 
     refuse_existing(output, force, source, data)
-    options = Options(against, data, samples, tolerance, seed)
+    named = named_recording(data, map or ())
+    options = Options(against, data, samples, tolerance, seed, named.names if named else {})
     check(options)
     with progress() as context:
         bundle = source_bundle(open_source(source), cache_directory(), context).bundle

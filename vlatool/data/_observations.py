@@ -12,6 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._not_finite import with_not_finite
 from vlatool.data._random_observations import sentence, words_of
+from vlatool.data._reader import NamedRecording
 from vlatool.data._recording import Moment, Recording
 from vlatool.data._selections import calibration_recording
 from vlatool.errors import DataError
@@ -47,7 +48,9 @@ class Observations(Sequence[dict[str, Any]]):
         return self._recording.with_history(self._numbers)
 
 
-def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> Sequence[dict[str, Any]]:
+def recorded_observations(
+    source: Bundle, count: int, path: Path | NamedRecording | None = None
+) -> Sequence[dict[str, Any]]:
     """Return up to ``count`` recorded observations, spread over the recording; none when the bundle carries none.
 
     They stay on the disk until they are asked for.
@@ -59,7 +62,7 @@ def recorded_observations(source: Bundle, count: int, path: Path | None = None) 
     return [] if recording is None else Observations(recording, recording.spread(count))
 
 
-def observations_for(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
+def observations_for(source: Bundle, count: int, path: Path | NamedRecording | None = None) -> list[dict[str, Any]]:
     """Return recorded observations, in memory, or synthetic ones when the bundle carries none.
 
     Three in four hold NaN and infinity in inputs that take them, whatever was recorded.

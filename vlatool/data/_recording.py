@@ -13,15 +13,18 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.image import Image
 from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.data._lazy_rows import LazyRows
 from vlatool.errors import DataError, suggest
-from vlatool.files.rows import Rows, blocks
+from vlatool.files.rows import Rows, blocks, in_memory
 
 Array = NDArray[Any]
 Values = Array | Rows
 """An input of all samples: in memory, or on the disk, where it is large."""
 RECORD_ALL = "record every input of the spec under its name, a row for each sample"
 REPAIR = "remove those samples, or repair the recording"
-EXPERT = ("action", "episode")
+PADDING = "action_is_pad"
+"""Array (N, T): whether an action is there only to fill the chunk, since the episode had ended; as LeRobot names it."""
+EXPERT = ("action", "episode", PADDING)
 """Arrays that a recording may hold beside the inputs."""
 
 
@@ -50,23 +53,27 @@ class Recording:
             are rows that stay on the disk.
         actions: (N, T, A) in physical units, or (N, T) indices for discrete actions; T is the policy's chunk, or fewer
             of its leading steps; None when not recorded.
+        padded: (N,) whether the episode ends before the chunk does; None where no chunk is longer than its episode.
         episodes: (N,) int64 episode of each sample; None when not recorded.
         times: (N,) float64 time stamp of each sample in seconds; None where the format has none.
         ignored: Names of arrays that the spec does not know.
         chunk: Actions in one inference of the policy.
         whole: Recording that it is a selection of; None when it is all that was recorded.
         indices: (N,) index of each observation in ``whole``.
+        left_out: Number of observations that ``with_whole_chunks`` left out.
     """
 
     path: Path
     inputs: Mapping[str, Values]
-    actions: Array | None
+    actions: Values | None
     episodes: Array | None
     times: Array | None = None
     ignored: tuple[str, ...] = ()
     chunk: int = 1
     whole: Recording | None = None
     indices: Array | None = None
+    padded: Array | None = None
+    left_out: int = 0
 
     def __len__(self) -> int:
         return len(next(iter(self.inputs.values())))
@@ -84,16 +91,29 @@ class Recording:
 
     def subset(self, chosen: NDArray[np.bool_]) -> Recording:
         """Return some observations, in their order."""
-        inputs = {
-            name: values.select(chosen) if isinstance(values, Rows) else values[chosen]
-            for name, values in self.inputs.items()
-        }
-        actions = None if self.actions is None else self.actions[chosen]
+        inputs = {name: _selected(values, chosen) for name, values in self.inputs.items()}
+        actions = None if self.actions is None else _selected(self.actions, chosen)
         episodes = None if self.episodes is None else self.episodes[chosen]
         times = None if self.times is None else self.times[chosen]
+        padded = None if self.padded is None else self.padded[chosen]
         indices = np.flatnonzero(chosen) if self.indices is None else self.indices[chosen]
-        series = replace(self, inputs=inputs, actions=actions, episodes=episodes, times=times)
+        series = replace(self, inputs=inputs, actions=actions, episodes=episodes, times=times, padded=padded)
         return replace(series, whole=self.whole or self, indices=indices)
+
+    def with_whole_chunks(self) -> Recording:
+        """Return the observations that can be judged: those whose expert acts until the end of the chunk.
+
+        Raises:
+            DataError: when there are none.
+        """
+        if self.actions is None or self.padded is None or not self.padded.any():
+            return self
+        if self.padded.all():
+            raise DataError(
+                f"No observation of {self.path} is followed by {self.actions.shape[1]} actions of its episode.",
+                "record longer episodes",
+            )
+        return replace(self.subset(~self.padded), left_out=int(self.padded.sum()))
 
     def begins(self) -> NDArray[np.bool_]:
         """Say of each observation whether an episode begins with it, or none follows the one before: (N,)."""
@@ -118,20 +138,30 @@ class Recording:
 
     @property
     def unjudged_steps(self) -> tuple[str, ...]:
-        """A sentence when fewer steps than the policy's chunk are recorded, so that the others are not judged."""
-        if self.actions is None or (steps := self.actions.shape[1]) == self.chunk:
-            return ()
-        some = "the first one alone is" if steps == 1 else f"the first {steps} alone are"
-        return (
-            f"{self.path.name} records {steps} of the {self.chunk} actions of each chunk: {some} held against the "
-            f"expert; record all {self.chunk} that follow each observation to judge the whole chunk",
-        )
+        """Sentences on what is not judged: steps that are not recorded, observations without a whole chunk."""
+        sentences = []
+        if self.actions is not None and (steps := self.actions.shape[1]) != self.chunk:
+            some = "the first one alone is" if steps == 1 else f"the first {steps} alone are"
+            sentences.append(
+                f"{self.path.name} records {steps} of the {self.chunk} actions of each chunk: {some} held against the "
+                f"expert; record all {self.chunk} that follow each observation to judge the whole chunk"
+            )
+        if self.left_out:
+            sentences.append(
+                f"{self.left_out} of {self.left_out + len(self)} observations of {self.path.name} are not judged: "
+                "their episode ends before the chunk does"
+            )
+        return tuple(sentences)
 
     def spread(self, count: int) -> list[int]:
         """Return ``count`` indices (or all) spread evenly over the recording, so that every phase is present."""
         if count >= len(self):
             return list(range(len(self)))
         return sorted({int(index) for index in np.linspace(0, len(self) - 1, count)})
+
+
+def _selected(values: Values, chosen: NDArray[np.bool_]) -> Values:
+    return values.select(chosen) if isinstance(values, Rows) else values[chosen]
 
 
 def build_recording(
@@ -158,8 +188,9 @@ def build_recording(
         if tensor.image is not None:
             _check_frames(f"'{tensor.name}' in {path}", tensor, tensor.image, inputs[tensor.name])
     actions, episodes = _in_memory(arrays, spec.action.name, "action"), _in_memory(arrays, "episode")
+    padded = _in_memory(arrays, PADDING)
     lengths = {name: len(values) for name, values in inputs.items()}
-    for name, recorded in (("action", actions), ("episode", episodes), ("times", times)):
+    for name, recorded in (("action", actions), ("episode", episodes), (PADDING, padded), ("times", times)):
         if recorded is not None:
             lengths[name] = _length(path, name, recorded)
     if len(set(lengths.values())) != 1:
@@ -174,13 +205,23 @@ def build_recording(
     known = {*inputs, *EXPERT, *(tensor.name for tensor in spec.outputs)}
     ignored = tuple(name for name in arrays if name not in known)
     action = None if actions is None else _checked_action(path, spec, actions)
-    return Recording(path, inputs, action, episodes, times, ignored, spec.chunk)
+    return Recording(path, inputs, action, episodes, times, ignored, spec.chunk, padded=_checked_padding(path, padded))
+
+
+def _checked_padding(path: Path, values: Array | None) -> Array | None:
+    """Return for each sample whether a part of its chunk is padding."""
+    if values is not None and values.dtype != np.bool_:
+        raise DataError(
+            f"'{PADDING}' in {path} is {values.dtype}; wanted truth values.",
+            "store for each action of a chunk whether it only fills the chunk, as bool",
+        )
+    return None if values is None else np.asarray(values.reshape(len(values), -1).any(axis=1))
 
 
 def _in_memory(arrays: Mapping[str, Values], *names: str) -> Array | None:
     """Return the first array that there is, in memory: actions and episodes are compared as a whole."""
     array = next((arrays[name] for name in names if name in arrays), None)
-    return array.read(0, len(array)) if isinstance(array, Rows) else array
+    return None if array is None else in_memory(array)
 
 
 def _length(path: Path, name: str, values: Values) -> int:
@@ -194,7 +235,7 @@ def _length(path: Path, name: str, values: Values) -> int:
 def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicySpec) -> Values:
     where = f"'{tensor.name}' in {path}"
     if tensor.kind == "text":
-        if isinstance(values, Rows) or values.dtype.kind != "U":
+        if values.dtype.kind != "U":
             raise DataError(
                 f"{where} is {values.dtype}; a text input needs unicode strings.",
                 "store it with np.array(TEXTS), a str for each sample",
@@ -204,7 +245,7 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
                 f"{where} has the shape {list(values.shape)}; a text input has one string a sample.",
                 "store a one-dimensional array, a str for each sample",
             )
-        return values.reshape(-1)
+        return values if isinstance(values, Rows) else values.reshape(-1)
     if values.ndim == max(1, len(tensor.shape)) + 1 and values.shape[1] == 1:
         values = values.without_second_axis() if isinstance(values, Rows) else values[:, 0]
     if not _fits(tensor, values):
@@ -214,6 +255,8 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
             f"it would fit '{others[0]}'; are the names swapped?" if others else RECORD_ALL,
         )
     _check_type(where, tensor, values)
+    if isinstance(values, LazyRows):  # each row is checked when it is read
+        return values.within(np.dtype(tensor.dtype)) if tensor.finite and values.dtype.kind == "f" else values
     if tensor.finite:
         _check_finite(where, values, f"{REPAIR}; where the policy handles them: finite: false in its spec")
     return values
@@ -253,7 +296,8 @@ def _check_type(where: str, tensor: TensorSpec, values: Values) -> None:
     if not numbers:
         hint = "store raw pixel values from 0 to 255" if tensor.dtype == "uint8" else f"store it as {tensor.dtype}"
         raise DataError(f"{where} is {values.dtype}; the policy takes {tensor.dtype}.", hint)
-    if expected.kind == "f" and values.dtype.kind == "f" and values.dtype.itemsize > expected.itemsize:
+    wider = values.dtype.kind == "f" and values.dtype.itemsize > expected.itemsize
+    if expected.kind == "f" and wider and not isinstance(values, LazyRows):
         _check_size(where, tensor, values)
 
 

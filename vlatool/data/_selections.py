@@ -10,11 +10,14 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data._halves import MIN_HALF, halves
-from vlatool.data._reader import read_recording, reader_of
+from vlatool.data._reader import NamedRecording, read_recording, reader_of
 from vlatool.data._recording import Recording
+from vlatool.data._sampling import rows_to_carry, save_recording
 from vlatool.errors import DataError
 from vlatool.files.blob_store import link_or_copy
 
@@ -31,7 +34,7 @@ class Selection:
         half: Index of a half, as ``halves`` gives them; None for the whole recording.
     """
 
-    path: Path
+    recording: Path | NamedRecording
     half: int | None = None
 
     def read(self, spec: PolicySpec) -> Recording:
@@ -40,7 +43,7 @@ class Selection:
         Raises:
             DataError: when the recording is missing, corrupt, or does not fit the spec.
         """
-        recording = read_recording(self.path, spec)
+        recording = read_recording(self.recording, spec)
         return recording if self.half is None else halves(recording)[self.half]
 
 
@@ -51,7 +54,7 @@ class Recordings:
     calibration: Path | None = None
     evaluation: Path | None = None
 
-    def select(self, purpose: str, named: Path | None = None) -> Selection | None:
+    def select(self, purpose: str, named: Path | NamedRecording | None = None) -> Selection | None:
         """Return the observations for one of ``PURPOSES``, None where there are none.
 
         Args:
@@ -87,22 +90,35 @@ def is_of_recording(name: str) -> bool:
     return _RECORDING_FILE.fullmatch(name) is not None
 
 
-def carry_recording(path: Path, purpose: str, spec: PolicySpec, out: Path) -> None:
+def carry_recording(
+    recording: Path | NamedRecording, purpose: str, spec: PolicySpec, out: Path, *, keeps: bool = False
+) -> None:
     """Put a recording into a new bundle, once it was found to fit, while it has the name that the user knows.
+
+    Of a dataset, and of a recording with other names, it is a sample or a copy under the names of the spec.
 
     Args:
         purpose: One of ``PURPOSES``.
+        keeps: Whether the policy keeps values: a sample is then whole episodes.
 
     Raises:
         DataError: when it cannot be read, or does not fit the spec.
     """
-    reader = reader_of(path)
-    reader.open(path, spec, {})
+    named = recording if isinstance(recording, NamedRecording) else NamedRecording(recording)
+    reader = reader_of(named.path)
+    opened = reader.open(named.path, spec, named.names)
     (out / "data").mkdir(exist_ok=True)
-    link_or_copy(path, out / "data" / f"{purpose}{reader.suffix}")
+    if not reader.carries_sample and not named.names:
+        link_or_copy(named.path, out / "data" / f"{purpose}{reader.suffix}")
+        return
+    if reader.carries_sample:
+        chosen = np.zeros(len(opened), np.bool_)
+        chosen[rows_to_carry(opened, keeps)] = True
+        opened = opened.subset(chosen)
+    save_recording(opened, out / "data" / f"{purpose}.npz")
 
 
-def calibration_recording(source: Bundle, path: Path | None = None) -> Recording | None:
+def calibration_recording(source: Bundle, path: Path | NamedRecording | None = None) -> Recording | None:
     """Return what calibrates a bundle, or all of the recording at ``path``; None when there is neither.
 
     Raises:
@@ -112,7 +128,7 @@ def calibration_recording(source: Bundle, path: Path | None = None) -> Recording
     return None if selection is None else selection.read(source.manifest.spec)
 
 
-def evaluation_recording(source: Bundle, path: Path | None = None) -> tuple[Recording, str]:
+def evaluation_recording(source: Bundle, path: Path | NamedRecording | None = None) -> tuple[Recording, str]:
     """Return what evaluates a bundle, and a reservation about it, empty when there is none.
 
     Args:

@@ -7,10 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data._reader import Reader
-from vlatool.data._recording import Recording, build_recording
+from vlatool.data._recording import Recording, Values, build_recording
+from vlatool.data._steps import Steps
 from vlatool.files.npz import open_rows
+from vlatool.files.rows import in_memory
 from vlatool.machine.host import memory
 from vlatool.registry import Claim
 
@@ -38,9 +42,23 @@ class NpzReader(Reader):
                 limit, or what is not an array of rows into the memory, before anything is unpacked; when it does not
                 fit the spec.
         """
-        free = _free_mb()
-        arrays = open_rows(path, LIMIT, free=None if free is None else free * 1e6)
-        return build_recording(path, arrays, spec, names)
+        return build_recording(path, _arrays(path), spec, names)
+
+    def steps(self, path: Path) -> Steps:
+        """Return the arrays of a recording as columns.
+
+        Raises:
+            DataError: when the file is corrupt, or its arrays have different numbers of rows.
+        """
+        arrays = {name: values for name, values in _arrays(path).items() if values.ndim}
+        count = max((len(values) for values in arrays.values()), default=0)
+        episodes = in_memory(arrays.pop("episode")) if "episode" in arrays else np.zeros(count, np.int64)
+        return Steps(path, arrays, episodes, action="action" if "action" in arrays else "")
+
+
+def _arrays(path: Path) -> dict[str, Values]:
+    free = _free_mb()
+    return dict(open_rows(path, LIMIT, free=None if free is None else free * 1e6))
 
 
 def _free_mb() -> float | None:

@@ -30,6 +30,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "cuda": ("onnxruntime-gpu",),
     "build": ("torch", "onnx", "onnxscript", "onnx-ir", "safetensors"),
     "openvino": ("openvino",),
+    "data": ("pillow", "pyarrow", "av", "h5py", "zarr", "rosbags", "google-crc32c"),
     "sim": ("gymnasium", "minigrid"),
     "metaworld": ("metaworld", "mujoco"),
     "text": ("tokenizers",),

@@ -17,7 +17,7 @@ from vlatool.accuracy.skill import skill, variation
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.bundle.program import keeps_values
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data import Moment, Recording, carries_evaluation, evaluation_recording
+from vlatool.data import MAP_HELP, Moment, Recording, carries_evaluation, evaluation_recording, named_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._names import names_of
 from vlatool.evaluate._sentences import found_wrong
@@ -55,6 +55,7 @@ class Recorded(Measure):
         None,
         description="recorded observations and actions; the bundle's own, or half of its calibration, when not given",
     )
+    map: tuple[str, ...] = Field((), description=MAP_HELP)
     baseline: Path | None = Field(None, description="bundle to compare with, usually float32")
     samples: int = Field(100_000, ge=1, description="largest number of samples, spread over the recording")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
@@ -70,7 +71,8 @@ class Recorded(Measure):
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Evaluate and return a row for the bundle, and one for the baseline when there is one."""
-        recording, reservation = evaluation_recording(source, self.data)
+        recording, reservation = evaluation_recording(source, named_recording(self.data, self.map))
+        recording = recording.with_whole_chunks()
         indices = recording.spread(self.samples)
         action = source.manifest.spec.action
         expert = None if recording.actions is None else recording.actions[indices]

@@ -74,7 +74,9 @@ def _stage(name: str, options: Mapping[str, Any]) -> tuple[Stage | None, tuple[s
         kind = stage_class(name)
     except VlatoolError:
         return None, (f"this vlatool does not know the stage {name}",)
-    kept = {key: value for key, value in options.items() if key in kind.model_fields and key != "calibration"}
+    kept = {
+        key: value for key, value in options.items() if key in kind.model_fields and key not in ("calibration", "map")
+    }
     notes = tuple(f"the option {key}: {value} was not adopted" for key, value in options.items() if key not in kept)
     try:
         return stage_from(kind, kept, name), notes

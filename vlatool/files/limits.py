@@ -41,6 +41,8 @@ LIMITS = {
     "golden_bytes": Limit(256 * MIB, "bytes", "the golden file, unpacked"),
     "golden_steps": Limit(64, "steps", "golden observations in a row"),
     "recording_bytes": Limit(8 * GIB, "bytes", "a recording of observations, unpacked"),
+    "recorded_steps": Limit(100_000_000, "steps", "a dataset of recorded episodes"),
+    "picture_bytes": Limit(256 * MIB, "bytes", "one recorded picture, decoded"),
     "arrays": Limit(4096, "arrays", "arrays in one .npz file"),
     "statistics_bytes": Limit(16 * MIB, "bytes", "a file of normalisation statistics"),
     "tokenizer_bytes": Limit(64 * MIB, "bytes", "a tokenizer or vocabulary"),

@@ -267,3 +267,8 @@ def blocks(values: Array | Rows) -> Iterator[tuple[int, Array]]:
             yield first, values.read(first, min(step, len(values) - first))
         else:
             yield first, values[first : first + step]
+
+
+def in_memory(values: Array | Rows) -> Array:
+    """Return all rows as an array in memory."""
+    return values.read(0, len(values)) if isinstance(values, Rows) else values

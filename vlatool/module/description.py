@@ -13,9 +13,9 @@ from typing import Any
 
 from vlatool.bundle.bundle import LOCATION
 from vlatool.bundle.manifest import Manifest
-from vlatool.bundle.program import ProgramStep, check_program, program_from, single_graph
+from vlatool.bundle.program import ProgramStep, check_program, keeps_values, program_from, single_graph
 from vlatool.bundle.spec import PolicySpec
-from vlatool.data import PURPOSES, carry_recording
+from vlatool.data import PURPOSES, NamedRecording, carry_recording
 from vlatool.errors import MissingExtra, SourceError, SpecError
 from vlatool.files.printable import one_line, truncate
 from vlatool.files.yaml import read_mapping
@@ -46,6 +46,7 @@ class Description:
             ``timeout``: seconds that a call of it may take.
         parts: part name -> globs of module names.
         calibration, evaluation: recordings, each a file or a directory, or None.
+        maps: purpose of a recording -> name in the spec -> name in the recording, where they differ.
         weights: glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
             module alone. Empty when the factory loads the weights.
         training: ``FILE.py:FUNCTION`` of the folder that yields batches of observations to train on; empty for none.
@@ -65,6 +66,7 @@ class Description:
     parts: dict[str, list[str]] = field(default_factory=dict)
     calibration: Path | None = None
     evaluation: Path | None = None
+    maps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     description: str = ""
     license: str = ""
     weights: str = ""
@@ -145,6 +147,7 @@ def read_description(path: Path) -> Description:
         parts=dict(data.get("parts") or {}),
         calibration=_recording(file, data, "calibration"),
         evaluation=_recording(file, data, "evaluation"),
+        maps={purpose: _map(file, data, purpose) for purpose in PURPOSES},
         description=str(data.get("description", "")),
         license=str(data.get("license", "")),
         weights=_weights(file, data.get("weights", "")),
@@ -285,6 +288,13 @@ def read_location(bundle: Path) -> Path:
 def _recording(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
     """Return the recording that is named, which must exist, or the one of the default name, if there is one."""
     named = data.get(key)
+    if isinstance(named, Mapping):
+        if unknown := sorted(map(str, {*named} - {"path", "map"})):
+            raise SourceError(
+                f"{file}: '{key}' has the unknown key '{unknown[0]}'; known: map, path.",
+                f"write it as {key}: {{path: DATASET, map: {{NAME: RECORDED}}}}",
+            )
+        named = named.get("path")
     path = file.parent / str(named or f"{key}.npz")
     if named and not path.exists():
         raise SourceError(
@@ -292,6 +302,18 @@ def _recording(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
             f"correct the path (it begins at {file.parent}), or leave '{key}' out",
         )
     return path if path.exists() else None
+
+
+def _map(file: Path, data: Mapping[str, Any], key: str) -> dict[str, str]:
+    """Return the names that a recording has for those of the spec, where they differ."""
+    entry = data.get(key)
+    names = (entry.get("map") if isinstance(entry, Mapping) else None) or {}
+    if not isinstance(names, Mapping) or not all(isinstance(name, str) for pair in names.items() for name in pair):
+        raise SourceError(
+            f"{file}: 'map' of '{key}' must name the recording's name for each of the spec; got {names!r:.80}.",
+            "write it as map: {NAME: RECORDED}, or leave it out",
+        )
+    return dict(names)
 
 
 def copy_assets(described: Description, out: Path) -> None:
@@ -313,8 +335,10 @@ def copy_assets(described: Description, out: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
     check_assets(described, out / "assets")
+    keeps = keeps_values(described.program)
     for purpose, path in described.recordings().items():
-        carry_recording(path, purpose, described.spec, out)
+        recording = NamedRecording(path, described.maps.get(purpose, {}))
+        carry_recording(recording, purpose, described.spec, out, keeps=keeps)
 
 
 def check_assets(described: Description, copies: Path) -> None:

@@ -17,7 +17,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.module_bundle import no_graph_error
-from vlatool.data import calibration_recording, observations_for
+from vlatool.data import NamedRecording, calibration_recording, named_recording, observations_for
 from vlatool.errors import BundleError, RecipeError
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import foreign_errors, load, read, save, split_phases
@@ -136,9 +136,9 @@ class Quantization(Transform):
         return Result(made, messages)
 
     @property
-    def recording(self) -> Path | None:
+    def recording(self) -> NamedRecording | None:
         """Recording of the golden observations; the bundle's own when None."""
-        return getattr(self, "calibration", None)
+        return named_recording(getattr(self, "calibration", None), getattr(self, "map", ()))
 
     def golden_arguments(self, source: Bundle) -> dict[str, Any]:
         """Return the observations on which ``finish`` compares the new bundle with the old one, as its arguments.

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import (
+    MAP_HELP,
     OBSERVATIONS_FILE,
     Moment,
     Recording,
@@ -42,6 +43,7 @@ class CalibratedQuantization(Quantization):
     """What a user without calibration data can do instead."""
 
     calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
+    map: tuple[str, ...] = Field((), description=MAP_HELP)
     samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
@@ -49,7 +51,7 @@ class CalibratedQuantization(Quantization):
         super().check(source, profile)
         if source is None or (OBSERVATIONS_FILE in source.manifest.files and not self.calibration):
             return
-        if calibration_recording(source, self.calibration) is None:
+        if calibration_recording(source, self.recording) is None:
             raise self._no_calibration_data(source)
 
     def calibration_samples(self, bundle: Bundle) -> tuple[Recording, list[int]]:
@@ -58,7 +60,7 @@ class CalibratedQuantization(Quantization):
         Args:
             bundle: Bundle whose own recording is used when no other is given.
         """
-        recording = calibration_recording(bundle, self.calibration)
+        recording = calibration_recording(bundle, self.recording)
         if recording is None:
             raise self._no_calibration_data(bundle)
         numbers = recording.spread(self.samples)
@@ -91,7 +93,7 @@ class CalibratedQuantization(Quantization):
         """Return observations with NaN and infinity where an input takes them, so that ranges cover their results."""
         if not takes_not_finite(bundle.manifest.spec):
             return []
-        return observations_for(bundle, NON_FINITE_SAMPLES, self.calibration)
+        return observations_for(bundle, NON_FINITE_SAMPLES, self.recording)
 
     def _no_calibration_data(self, bundle: Bundle) -> DataError:
         trainable = self.alternative and bundle.manifest.environment

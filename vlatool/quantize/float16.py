@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Moment, calibration_recording, synthetic_observations
+from vlatool.data import MAP_HELP, Moment, calibration_recording, synthetic_observations
 from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import check_opset
@@ -50,6 +50,7 @@ class Float16(Quantization):
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
 
     calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
+    map: tuple[str, ...] = Field((), description=MAP_HELP)
     samples: int = Field(16, ge=1, description="samples in which to look for values beyond float16")
 
     def run(self, source: Bundle, out: Path, context: Context) -> Result:
@@ -62,7 +63,7 @@ class Float16(Quantization):
             candidates += [node.name for node in model.graph.node]
         selected = self.select_nodes(candidates, source)
         samples = SampleSet()
-        recording = calibration_recording(source, self.calibration)
+        recording = calibration_recording(source, self.recording)
 
         def observations(samples: SampleSet) -> Iterable[Moment | Mapping[str, Any]]:
             if recording is None:

@@ -75,7 +75,7 @@ class WeightOnly(WeightOptions):
             )
         if source is None:
             return
-        if self.method in CALIBRATED_METHODS and not recorded_observations(source, 1, self.calibration):
+        if self.method in CALIBRATED_METHODS and not recorded_observations(source, 1, self.recording):
             raise DataError(
                 f"{source.path} carries no calibration data, which the method {self.method} needs.",
                 "pass --calibration FILE.npz, or use --method rtn or hqq, which need none",

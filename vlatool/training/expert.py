@@ -13,6 +13,7 @@ from vlatool.bundle.spec import TensorSpec
 from vlatool.data import Recording, calibration_recording
 from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError, require
+from vlatool.files.rows import in_memory
 from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.runtime.interface import Array
 from vlatool.runtime.statistics import load_normaliser
@@ -62,6 +63,7 @@ class Expert:
         if not isinstance(recording, Recording) or recording.actions is None:
             where = recording.path if isinstance(recording, Recording) else source.path
             raise DataError(f"A loss against an expert's actions needs them, and {where} has none.", RECORD)
+        recording = recording.with_whole_chunks()
         order = np.random.default_rng((seed, CHOICE)).permutation
         if isinstance(self.frames, Sequences):
             used = select_episodes(episode_begins(recording), share, order)
@@ -113,9 +115,9 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
 def encoded_actions(action: TensorSpec, source: Bundle, actions: Any) -> Array:
     """Return recorded actions as a graph gives them: (N, T, A) normalised float32, or (N, T) int64 indices."""
     if action.kind == "discrete":
-        return np.asarray(actions, np.int64)
+        return np.asarray(in_memory(actions), np.int64)
     normaliser = load_normaliser(action, source)
-    physical = np.asarray(actions, np.float32)
+    physical = np.asarray(in_memory(actions), np.float32)
     return physical if normaliser is None else normaliser.forward(physical)
 
 

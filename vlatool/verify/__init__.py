@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ class Options:
     Args:
         against: ``original.py:act`` or ``package.module:act``.
         data: recorded observations; the policy's own when None.
+        names: name in the spec -> name in ``data``, where they differ.
         samples: observations at most.
         tolerance: largest relative error of an action, of an input and of the network's output.
         seed: seed of the noise that both are given.
@@ -38,6 +39,7 @@ class Options:
     samples: int = 32
     tolerance: float = 1e-3
     seed: int = 0
+    names: Mapping[str, str] = field(default_factory=dict)
 
 
 def verify(bundle: Bundle, options: Options, context: Context) -> Report:
@@ -55,7 +57,8 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
         trust.allow(file.parent)
     job = {
         "bundle": str(bundle.path.absolute()), "against": options.against, "folder": str(Path.cwd()),
-        "data": str(options.data.absolute()) if options.data else "", "samples": options.samples,
+        "data": str(options.data.absolute()) if options.data else "",
+        "names": dict(options.names), "samples": options.samples,
         "tolerance": options.tolerance, "seed": options.seed,
     }  # fmt: skip
     about = split_factory(options.against)[0]

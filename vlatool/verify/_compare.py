@@ -10,7 +10,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
-from vlatool.data import Recording, read_recording, recordings_of, synthetic_observations
+from vlatool.data import NamedRecording, Recording, read_recording, recordings_of, synthetic_observations
 from vlatool.module.torch_policy import torch_policy
 from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import Policy, relative_error
@@ -27,7 +27,7 @@ def compare(job: Mapping[str, Any], tell: OnProgress) -> dict[str, Any]:
     seed, tolerance = int(job["seed"]), float(job["tolerance"])
     policy = Policy.open(bundle, threads=1, seed=seed) if bundle.manifest.graphs else torch_policy(bundle, seed)
     original = Original(job["against"], Path(job["folder"]), policy.spec)
-    recording = _recording(bundle, Path(job["data"]) if job["data"] else None)
+    recording = _recording(bundle, NamedRecording(Path(job["data"]), job["names"]) if job["data"] else None)
     random = np.random.default_rng(seed)
     samples = []
     for index, (number, observation, begins) in enumerate(_observations(policy, recording, int(job["samples"]))):
@@ -49,7 +49,7 @@ def compare(job: Mapping[str, Any], tell: OnProgress) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _recording(bundle: Bundle, data: Path | None) -> Recording | None:
+def _recording(bundle: Bundle, data: NamedRecording | None) -> Recording | None:
     own = recordings_of(bundle)
     path = data or own.evaluation or own.calibration
     return None if path is None else read_recording(path, bundle.manifest.spec)

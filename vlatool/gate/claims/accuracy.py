@@ -100,7 +100,7 @@ class Accuracy(Claim):
 
     def _on_recordings(self, evidence: Evidence, data: Path) -> _Part:
         action = evidence.baseline.manifest.spec.action
-        recording = read_recording(data, evidence.baseline.manifest.spec)
+        recording = read_recording(data, evidence.baseline.manifest.spec).with_whole_chunks()
         indices = recording.spread(MAX_SAMPLES)
         mine, theirs = (
             run_recorded(bundle, recording, indices, evidence.plan.engine, evidence.context)

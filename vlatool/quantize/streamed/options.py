@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from vlatool.data import MAP_HELP
 from vlatool.quantize._base import Quantization
 from vlatool.quantize.streamed._block_quantization import BlockFormat
 
@@ -23,6 +24,7 @@ class WeightOptions(Quantization):
     accuracy_level: int = Field(4, ge=0, le=4, description="MatMulNBits: 4 rounds activations to int8, 1 does not")
     embeddings: Literal["float16", "float32"] = Field("float16", description="dtype of embedding tables")
     calibration: Path | None = Field(None, description="recorded observations for gptq and awq")
+    map: tuple[str, ...] = Field((), description=MAP_HELP)
     samples: int = Field(
         64, ge=1, description="calibration samples for gptq and awq, spread over the recording; up to 1024 of states"
     )

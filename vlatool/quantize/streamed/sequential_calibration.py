@@ -49,7 +49,7 @@ def calibrated_records(
     plan: WeightsPlan, bundle: Bundle, stage: WeightOptions, work_directory: Path, samples: SampleSet
 ) -> list[Record]:
     """Return all records; those of quantized weights run the policy from layer to layer and must stay in order."""
-    recording = calibration_recording(bundle, stage.calibration)
+    recording = calibration_recording(bundle, stage.recording)
     numbers = recording.spread(_sample_count(bundle, stage)) if recording is not None else []
     moments = recorded_moments(bundle, recording, numbers, samples) if recording is not None else ()
     calibration = _SequentialCalibration(plan, bundle, stage, work_directory, list(samples_with_state(bundle, moments)))
