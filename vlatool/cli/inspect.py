@@ -14,11 +14,12 @@ from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
 from vlatool.cli._document import document
 from vlatool.cli._options import BundlePath
-from vlatool.errors import BundleError, GraphError
+from vlatool.errors import BundleError, GraphError, SpecError
 from vlatool.files.printable import printable
 from vlatool.files.verified_read import open_inside
 from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded_files
+from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
 from vlatool.stage.controls import controls
@@ -76,6 +77,7 @@ def describe(bundle: Bundle) -> list[str]:
     if manifest.description:
         lines.append(f"  {manifest.description}")
     spec = manifest.spec
+    lines += [f"  policy     {_identity(bundle)}"]
     rate = f"{spec.control_hz:g} Hz control, {spec.execute or spec.chunk} of {spec.chunk} actions executed"
     lines += [f"  rate       {rate}: {spec.inference_hz:g} inferences per second"]
     lines += [f"  input      {_tensor(tensor)}" for tensor in spec.inputs]
@@ -90,6 +92,14 @@ def describe(bundle: Bundle) -> list[str]:
     lines += [f"  WRONG      {finding['name']}: {finding['message']}" for finding in manifest.findings]
     lines += [f"  CONTROL    {line}" for line in controls(bundle)]
     return lines
+
+
+def _identity(bundle: Bundle) -> str:
+    """Return the identity of the policy in a bundle, or why it has none."""
+    try:
+        return policy_identity(bundle)
+    except (BundleError, GraphError, SpecError) as error:
+        return f"no identity: {error.message}"
 
 
 def _beside(bundle: Bundle, file: str) -> list[str]:
