@@ -5,18 +5,22 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from vlatool.bundle.bundle import Bundle, manifest_bytes
 from vlatool.bundle.manifest import Manifest
-from vlatool.bundle.spec import TensorSpec
+from vlatool.bundle.spec import UNKNOWN, TensorSpec
+from vlatool.cli._console import progress
 from vlatool.cli._document import document
 from vlatool.cli._options import BundlePath
+from vlatool.cli._proposal import propose
 from vlatool.errors import BundleError, GraphError, SpecError
 from vlatool.files.printable import printable
 from vlatool.files.verified_read import open_inside
+from vlatool.module.source import is_bundle
 from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded_files
 from vlatool.runtime.identity import policy_identity
@@ -26,6 +30,8 @@ from vlatool.stage.controls import controls
 
 MAX_OPTION = 120
 """Characters of an option of a build record that are shown."""
+MAX_INFLUENCES = 24
+"""Influences of --sensitivity that are shown in the terminal."""
 
 
 def inspect(
@@ -44,17 +50,63 @@ def inspect(
         float | None,
         typer.Option("--memory", min=1, help="MB that --probe may take; 2,000 and 8 times the graphs when not given"),
     ] = None,
+    sensitivity: Annotated[
+        bool,
+        typer.Option("--sensitivity", help="also show which element of an input moves which element of the action"),
+    ] = False,
+    samples: Annotated[int, typer.Option(min=1, max=1000, help="recorded observations for --sensitivity")] = 8,
 ) -> None:
-    """Verify a bundle and show what is in it."""
-    opened = Bundle.open(bundle)
-    tried = try_once(bundle, first_run_s=first_run, memory_mb=memory) if probe else None
-    if as_json:
+    """Verify a bundle and show what is in it; of a policy, what its bundle would hold."""
+    opened = _opened(bundle)
+    tried = try_once(opened.path, first_run_s=first_run, memory_mb=memory) if probe else None
+    moves = _sensitivity(opened, samples) if sensitivity else None
+    if as_json and moves is not None:
+        document(moves)
+    elif as_json:
         document(opened.manifest.to_dict(), manifest_bytes(opened.manifest).decode())
     else:
-        for line in [*describe(opened), *([] if tried is None else [_probed(tried)])]:
+        shown = [*describe(opened), *([] if tried is None else [_probed(tried)]), *_influences(moves)]
+        for line in shown:
             typer.echo(printable(line))
     if tried is not None and tried["refused"]:
         raise GraphError(*tried["refused"])
+
+
+def _sensitivity(bundle: Bundle, samples: int) -> dict[str, Any]:
+    from vlatool.verify.influence import sensitivity
+
+    with progress() as context:
+        context.progress("moving each input", None)
+        return sensitivity(bundle, samples)
+
+
+def _influences(moves: Mapping[str, Any] | None) -> list[str]:
+    """Return the largest influences, a line each."""
+    if moves is None:
+        return []
+    kind = "recorded" if moves["recorded"] else "random"
+    lines = [f"  moves      on {moves['samples']} {kind} observations; input -> action: slope; effect in spreads; sign"]
+    for each in moves["influences"][:MAX_INFLUENCES]:
+        what = f"{each['input']} -> {each['output']}"
+        slope = f"{each['slope']:+.3g} {each['unit']}"
+        lines.append(f"    {what:32} {slope:>20} {each['effect']:+8.3f}  {each['agreement']:.0%} of the same sign")
+    rest = len(moves["influences"]) - MAX_INFLUENCES
+    lines += [f"    and {rest} smaller ones: --json shows all"] if rest > 0 else []
+    lines += [f"    not moved: {', '.join(moves['left_out'])}"] if moves["left_out"] else []
+    return lines
+
+
+def _opened(named: Path) -> Bundle:
+    """Open a bundle, or that of a policy, exported with the default options."""
+    from vlatool.cli._run import open_with_graphs
+    from vlatool.module.source import claimed_source
+
+    if is_bundle(named) or claimed_source(named) is None:
+        return Bundle.open(named)
+    with progress() as context:
+        opened = open_with_graphs(str(named), context)
+    propose(str(named), opened.manifest, None)
+    return opened
 
 
 def _probed(tried: Mapping[str, Any]) -> str:
@@ -78,8 +130,11 @@ def describe(bundle: Bundle) -> list[str]:
         lines.append(f"  {manifest.description}")
     spec = manifest.spec
     lines += [f"  policy     {_identity(bundle)}"]
-    rate = f"{spec.control_hz:g} Hz control, {spec.execute or spec.chunk} of {spec.chunk} actions executed"
-    lines += [f"  rate       {rate}: {spec.inference_hz:g} inferences per second"]
+    executed = f"{spec.execute or spec.chunk} of {spec.chunk} actions executed"
+    known = spec.control_hz is not None
+    ends = f": {spec.inference_hz:g} inferences per second" if known else ""
+    lines += [f"  rate       {f'{spec.control_hz:g} Hz' if known else UNKNOWN} control, {executed}{ends}"]
+    lines += [f"  unknown    {', '.join(spec.unknown())}"] if spec.unknown() else []
     lines += [f"  input      {_tensor(tensor)}" for tensor in spec.inputs]
     lines += [f"  output     {_tensor(tensor)}" for tensor in spec.outputs]
     for name, graph in manifest.graphs.items():

@@ -28,17 +28,17 @@ MIN_DIFFERENCE = 1 / 255
 def is_image(tensor: TensorSpec) -> bool:
     """Return whether an input is images: height, width, and three or four channels as the last or third last axis."""
     sizes = tensor.shape[1:]
-    return len(sizes) >= 3 and tensor.kind == "tensor" and _channel_axis(tensor) != 0
+    return len(sizes) >= 3 and tensor.kind == "tensor" and channel_axis(tensor) != 0
 
 
-def _channel_axis(tensor: TensorSpec) -> int:
+def channel_axis(tensor: TensorSpec) -> int:
     """Return the axis of the colours, counted from the end; 0 when there is none."""
     return next((axis for axis in (-1, -3) if tensor.shape[axis] in (3, 4)), 0)
 
 
 def changes_of(tensor: TensorSpec) -> dict[tuple[str, str], Change]:
     """Return kind and words of a wrong image -> what it makes of a right one."""
-    channels = _channel_axis(tensor)
+    channels = channel_axis(tensor)
     rows, columns = (-3, -2) if channels == -1 else (-2, -1)
     return {
         ("", ""): lambda image: image,
@@ -53,7 +53,7 @@ def changes_of(tensor: TensorSpec) -> dict[tuple[str, str], Change]:
 
 def small(tensor: TensorSpec, frames: Frames, rows: NDArray[np.int64]) -> Array:
     """Return frames of which every axis of pixels has ``GRID`` elements at most, symmetric so that flips stay exact."""
-    channels = _channel_axis(tensor)
+    channels = channel_axis(tensor)
     axes = (-3, -2) if channels == -1 else (-2, -1)
     return np.stack([_thinned(np.asarray(frames[int(row)], np.float32), axes) for row in rows])
 

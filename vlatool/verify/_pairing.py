@@ -29,10 +29,11 @@ class Pairs:
         return len(self.log)
 
 
-def pair_rows(log: Recording, reference: Recording, control_hz: float) -> dict[int, Pairs]:
+def pair_rows(log: Recording, reference: Recording, control_hz: float | None) -> dict[int, Pairs]:
     """Return delay in control steps -> pairs, by time stamps where both have them, else by episode and step.
 
-    The delay 0 is there whenever a row has a partner; another one with ``MIN_PAIRS`` or more.
+    Time stamps count in steps of the control loop, or of the reference where its rate is unknown. A delay is there with
+    ``MIN_PAIRS`` pairs or more.
     """
     mine, theirs = _keys(log, reference, control_hz)
     if not mine or not theirs:
@@ -49,10 +50,11 @@ def _pairs(keys: list[Key], rows: Mapping[Key, int], delay: int) -> Pairs:
     return Pairs(both[:, 0], both[:, 1])
 
 
-def _keys(log: Recording, reference: Recording, control_hz: float) -> tuple[list[Key], list[Key]]:
+def _keys(log: Recording, reference: Recording, control_hz: float | None) -> tuple[list[Key], list[Key]]:
     """Return episode and step of each row of both; nothing when they cannot be of the same episodes."""
     if log.times is not None and reference.times is not None:
-        return _timed(log, control_hz), _timed(reference, control_hz)
+        hz = control_hz or _rate(reference.times)
+        return _timed(log.times, hz), _timed(reference.times, hz)
     if log.episodes is not None and reference.episodes is not None:
         return _numbered(log.episodes), _numbered(reference.episodes)
     if len(log) != len(reference):
@@ -61,9 +63,14 @@ def _keys(log: Recording, reference: Recording, control_hz: float) -> tuple[list
     return _numbered(episodes), _numbered(episodes)
 
 
-def _timed(recording: Recording, control_hz: float) -> list[Key]:
-    times = np.zeros(0) if recording.times is None else recording.times
-    return [(0, round(float(time) * control_hz)) for time in times]
+def _timed(times: NDArray[np.generic], hz: float) -> list[Key]:
+    return [(0, round(float(time) * hz)) for time in times.tolist()]
+
+
+def _rate(times: NDArray[np.generic]) -> float:
+    """Return the rate in Hz at which rows were recorded, by the median of their distances."""
+    distance = float(np.median(np.diff(times.astype(np.float64)))) if len(times) > 1 else 1.0
+    return 1 / distance if distance > 0 else 1.0
 
 
 def _numbered(episodes: NDArray[np.generic]) -> list[Key]:
