@@ -150,6 +150,24 @@ def test_statistics_of_other_data_are_named(verified, source_bundle, copied):
     assert found(report) == [("proprio", "statistics", where)]
 
 
+def test_frames_and_histories_of_another_size_are_compared_or_left_out(source_bundle, copied):
+    bundle = copied(source_bundle)
+    spec = bundle.manifest.spec
+    image, proprio, text = spec.inputs
+    inputs = (replace(image, shape=(1, "h", "w", 3)), replace(proprio, shape=(1, "n", 3)), text)
+    bundle = seal(bundle.path, replace(bundle.manifest, spec=replace(spec, inputs=inputs)))
+    arrays = recorded()
+    right = {**arrays, "proprio": arrays["proprio"][:, None], "image": arrays["image"].repeat(5, 1).repeat(5, 2)}
+    larger = {**right, "image": right["image"].repeat(2, 1).repeat(2, 2)[..., ::-1]}
+    longer = {**larger, "proprio": right["proprio"].repeat(2, 1), "image": arrays["image"]}
+    log, other, reference = (
+        build_recording(Path("r"), each, bundle.manifest.spec, {}) for each in (larger, longer, right)
+    )
+    ((image_found,), paired) = explain_inputs(bundle, log, [reference], own=False)
+    assert (image_found.kind, paired) == ("bgr", True)
+    assert explain_inputs(bundle, other, [reference], own=False) == ([], False)
+
+
 def test_signals_that_are_exchanged_are_named(source_bundle, copied):
     bundle = copied(source_bundle)
     spec = bundle.manifest.spec

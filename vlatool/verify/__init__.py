@@ -1,4 +1,4 @@
-"""Comparison of a policy directory with its original code, and the stage in which they differ."""
+"""Comparison of a policy with its original code, and of a robot's log with recordings of right wiring."""
 
 from __future__ import annotations
 

@@ -78,14 +78,17 @@ def explain_images(
     whole = spread_pairs(pairings[0])
     mine = small(tensor, log, whole.log)
     right = small(tensor, references[tensor.name], whole.reference)
+    if mine.shape != right.shape:
+        return None, 1.0
     levels = max(1.0, float(right.max()))
     unlike = _size(mine - np.roll(right, len(right) // 2, axis=0)) or 1.0
     before = _size(mine - right)
     found = [(error, kind, where, len(whole)) for (kind, where), error in _errors(tensor, mine, right).items() if kind]
     found += [(error, "delayed", f"{delay} control step{'s' if abs(delay) > 1 else ''}", count)
               for delay, error, count in _late(tensor, log, references[tensor.name], pairings)]  # fmt: skip
-    found += [(_size(mine - small(tensor, frames, whole.reference)), "swapped", f"it shows '{name}'", len(whole))
-              for name, frames in references.items() if name != tensor.name]  # fmt: skip
+    others = [name for name, frames in references.items() if name != tensor.name and frames.shape[1:] == log.shape[1:]]
+    found += [(_size(mine - small(tensor, references[name], whole.reference)), "swapped", f"it shows '{name}'",
+               len(whole)) for name in others]  # fmt: skip
     error, kind, where, count = min(found)
     if before <= MIN_DIFFERENCE * levels or error > BETTER * before:
         return None, before / unlike

@@ -71,7 +71,8 @@ class Signals:
     def vectors(self) -> list[TensorSpec]:
         """Return the inputs that are compared element by element."""
         return [tensor for tensor in self.bundle.manifest.spec.inputs
-                if tensor.kind != "text" and not is_image(tensor) and self._width(tensor) <= MAX_WIDTH]  # fmt: skip
+                if tensor.kind != "text" and not is_image(tensor) and self._width(tensor) <= MAX_WIDTH
+                and self.log.inputs[tensor.name].shape[1:] == self.reference.inputs[tensor.name].shape[1:]]  # fmt: skip
 
     def images(self) -> list[TensorSpec]:
         """Return the inputs that are images."""
