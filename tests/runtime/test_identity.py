@@ -97,6 +97,7 @@ DIFFERENT: dict[str, Edit] = {
     "name of an input": _renamed_input,
     "rate": _with_spec(control_hz=10.5),
     "executed actions": _with_spec(execute=3),
+    "epsilon": _with_tensor("inputs", 1, epsilon=1e-8),
     "NaN allowed": _with_tensor("inputs", 1, finite=False),
     "reordered inputs": _reordered,
     "tokens": _with_tensor("inputs", 2, max_tokens=3),

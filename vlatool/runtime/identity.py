@@ -19,6 +19,8 @@ FORMAT = 1
 """Version of what is hashed: a change of it changes every identity."""
 FILE_FIELDS = ("statistics", "tokenizer")
 """Fields of a tensor that name files: what the files say is hashed, not their names."""
+ROWS = ("offset", "scale", "inverse_scale", "at_offset")
+"""Fields of a normaliser that its values follow from."""
 NO_BEHAVIOUR = ("data/", "golden/", f"{ASSETS}/")
 """Prefixes of the files of a source bundle that hold no weights; assets are hashed with the tensors that name them."""
 
@@ -63,7 +65,8 @@ def _tensor(tensor: TensorSpec, bundle: Bundle) -> dict[str, Any]:
     plain["unit"] = tensor.units() or tensor.unit
     normaliser = load_normaliser(tensor, bundle)
     if normaliser is not None:
-        plain["statistics"] = {"offset": normaliser.offset.tolist(), "scale": normaliser.scale.tolist()}
+        rows = {name: getattr(normaliser, name) for name in ROWS}
+        plain["statistics"] = {name: row.tolist() for name, row in rows.items() if row is not None}
     statistics = tensor.statistics.partition("#")[0]
     others = [file for file in tensor.assets() if file != statistics]
     plain["files"] = [_sha256(bundle, f"{ASSETS}/{file}") for file in others]

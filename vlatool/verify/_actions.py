@@ -46,7 +46,7 @@ def explain_actions(policy: Policy, log: Recording, count: int) -> list[Explanat
     if match.cost > MAX_UNLIKE:
         return []
     found = explain_vector(name, labels, commands, given, pairings, match, load_normaliser(spec.action, policy.bundle))
-    return [Explanation(each.signal, each.kind, each.where, each.before, each.after, each.pairs, REMEDY)
+    return [Explanation(each.signal, each.kind, each.where, each.before, each.after, each.pairs, remedy=REMEDY)
             for each in found]  # fmt: skip
 
 
@@ -86,7 +86,7 @@ def _absolute(
             if less is not None and less.own < BETTER * own.own and less.own < MAX_UNLIKE:
                 where = f"{words}; '{tensor.name}' is between them"
                 return Explanation(spec.action.name, "absolute" if sign > 0 else "delta", where, own.own, less.own,
-                                   len(commands), REMEDY)  # fmt: skip
+                                   len(commands), remedy=REMEDY)  # fmt: skip
     return None
 
 
@@ -108,9 +108,9 @@ def _of_indices(
             for one, other in zip(mine, theirs, strict=True)
             if one != other
         ]
-        yield Explanation(name, "permuted", ", ".join(moved[:6]), before, after, rows, REMEDY)
+        yield Explanation(name, "permuted", ", ".join(moved[:6]), before, after, rows, remedy=REMEDY)
         return
     errors = {delay: float(np.mean(commands[pairs.log] != given[pairs.reference])) for delay, pairs in pairings.items()}
     delay = min(errors, key=lambda each: (errors[each], abs(each)))
     if delay and errors[delay] <= 1 - MIN_AGREEMENT and errors[delay] <= MIN_GAIN * errors[0]:
-        yield Explanation(name, "delayed", f"{delay} control steps", errors[0], errors[delay], rows, REMEDY)
+        yield Explanation(name, "delayed", f"{delay} control steps", errors[0], errors[delay], rows, remedy=REMEDY)

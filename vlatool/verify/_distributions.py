@@ -41,8 +41,10 @@ def explain_moments(
     ]
     after, kind, where, changed = min(found, key=lambda each: each[0])
     if after > 0.1 * before or _is_far(mine, changed, FIT_DEVIATIONS, FIT_RATIO):
-        return Explanation(name, "unexplained", "its values are far from the recorded ones", before, after, len(log))
-    return Explanation(name, kind, where, before, after, len(log))
+        return Explanation(
+            name, "unexplained", "its values are far from the recorded ones", before, after, len(log), paired=False
+        )
+    return Explanation(name, kind, where, before, after, len(log), paired=False)
 
 
 def explain_statistics(
@@ -60,7 +62,7 @@ def explain_statistics(
     if not len(wrong):
         return None
     where = f"those of the spec are not of the recorded data in {', '.join(labels[int(index)] for index in wrong)}"
-    return Explanation(name, "statistics", where, _distance(mine, (offset, scale)), 0.0, len(reference), REMEDY)
+    return Explanation(name, "statistics", where, _distance(mine, (offset, scale)), 0.0, len(reference), remedy=REMEDY)
 
 
 def scales_of(normaliser: Normaliser) -> Moments:

@@ -21,6 +21,7 @@ class Explanation:
         before: error without a change, relative to the spread of the signal, of images to the difference of two frames.
         after: error that the explanation leaves, the same.
         pairs: rows that it rests on.
+        paired: whether rows were of the same moments: nothing is certain by means and spreads alone.
         remedy: what to do.
     """
 
@@ -30,13 +31,14 @@ class Explanation:
     before: float
     after: float
     pairs: int
+    paired: bool = True
     remedy: str = "correct what feeds it on the robot, or its entry in the spec"
 
     @property
     def certainty(self) -> str:
         """How sure it is: ``certain`` or ``likely``."""
         sure = self.after <= CERTAIN_SHARE * self.before and self.pairs >= CERTAIN_PAIRS
-        return "certain" if sure and self.kind != "unexplained" else "likely"
+        return "certain" if sure and self.paired and self.kind != "unexplained" else "likely"
 
     def sentence(self) -> str:
         """Return what is wrong in words, with the evidence."""

@@ -96,7 +96,7 @@ def influences(policy: Policy, observations: Sequence[Mapping[str, Any]]) -> lis
     spreads = _output_spreads(policy, base)
     return [
         influence
-        for tensor in policy.spec.inputs
+        for tensor in (each.observation for each in policy.spec.inputs)
         for element in elements_of(policy, tensor, observations)
         for influence in _of_element(policy, element, observations, noise, spreads)
     ]

@@ -64,19 +64,24 @@ class Signals:
     pairings: Mapping[int, Pairs]
     own: bool
 
+    @property
+    def tensors(self) -> list[TensorSpec]:
+        """The inputs as observations have them: of an image that is preprocessed, the frame of the camera."""
+        return [tensor.observation for tensor in self.bundle.manifest.spec.inputs]
+
     def labels(self, tensor: TensorSpec, width: int) -> Sequence[str]:
         """Return a name for each element of a signal."""
         return tensor.labels if len(tensor.labels) == width else [f"[{index}]" for index in range(width)]
 
     def vectors(self) -> list[TensorSpec]:
         """Return the inputs that are compared element by element."""
-        return [tensor for tensor in self.bundle.manifest.spec.inputs
+        return [tensor for tensor in self.tensors
                 if tensor.kind != "text" and not is_image(tensor) and self._width(tensor) <= MAX_WIDTH
                 and self.log.inputs[tensor.name].shape[1:] == self.reference.inputs[tensor.name].shape[1:]]  # fmt: skip
 
     def images(self) -> list[TensorSpec]:
         """Return the inputs that are images."""
-        return [tensor for tensor in self.bundle.manifest.spec.inputs if is_image(tensor)]
+        return [tensor for tensor in self.tensors if is_image(tensor)]
 
     def values(self, recording: Recording, name: str) -> Array:
         """Return an input of a recording as (N, A)."""
