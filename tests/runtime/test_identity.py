@@ -15,6 +15,7 @@ import onnx
 import pytest
 
 from vlatool.bundle.bundle import Bundle, replace_manifest, seal
+from vlatool.bundle.image import Image, ImageStep
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import PolicySpec, TensorSpec
@@ -187,6 +188,17 @@ def test_a_field_that_the_spec_gains_later_is_part_of_it(float_bundle, monkeypat
     plain = TensorSpec.to_dict
     monkeypatch.setattr(TensorSpec, "to_dict", lambda tensor: {**plain(tensor), "image": {"channels": "bgr"}})
     assert policy_identity(float_bundle) != before
+
+
+def test_what_becomes_of_a_frame_is_part_of_it(float_bundle):
+    resize = ImageStep("resize", (8, 8))
+    images = [None, Image(layout="hwc", steps=(resize,)), Image(frame="bgr", layout="hwc", steps=(resize,)),
+              Image(layout="hwc", like="opencv", steps=(resize,)), Image(layout="hwc", range=(0, 1), steps=(resize,)),
+              Image(layout="hwc", steps=(replace(resize, filter="nearest"),)),
+              Image(layout="hwc", mean=(0.5,), std=(0.25,), steps=(resize,))]  # fmt: skip
+    edits = [_with_tensor("inputs", 0, image=image, dtype="float32") for image in images]
+    found = {policy_identity(replace(float_bundle, manifest=edit(float_bundle))) for edit in edits}
+    assert len(found) == len(images)
 
 
 def test_source_bundles_have_one_by_code_weights_and_spec(source_bundle, copied):
