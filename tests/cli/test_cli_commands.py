@@ -28,6 +28,7 @@ from vlatool.files.npz import open_npz
 from vlatool.hardware.profile import profile_names
 from vlatool.report import Measurement, Report, Row, read_report
 from vlatool.runtime import load
+from vlatool.runtime.identity import policy_identity
 from vlatool.stage.base import Context
 from vlatool.stage.finish import save_npz
 
@@ -217,6 +218,7 @@ def test_inspect_verifies_and_describes(vlatool, int8_bundle):
     assert lines[0].startswith(f"tiny 1.2.0  {int8_bundle.hash[:19]}")
     assert "every file verified" in lines[0]
     assert "  A policy that is as small as a policy can be." in lines
+    assert f"  policy     {policy_identity(int8_bundle)}" in lines
     text = "\n".join(lines)
     assert "10 Hz control, 2 of 4 actions executed: 5 inferences per second" in text
     assert "input      image: uint8 1x8x8x3 [rgb]" in text

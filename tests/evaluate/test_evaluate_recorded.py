@@ -16,8 +16,10 @@ from vlatool.data import evaluation_recording, recorded_observations
 from vlatool.errors import DataError, GraphError
 from vlatool.evaluate import recorded
 from vlatool.evaluate.recorded import Recorded, compare, run_recorded
+from vlatool.measures import tables
 from vlatool.measures.actions import BASELINE, EXPERT
 from vlatool.runtime import Policy, load
+from vlatool.runtime.identity import policy_identity
 from vlatool.stage.base import Context
 
 ARM = TensorSpec("action", (1, 2, 2), labels=("dx", "gripper"), unit=("m", "1"))
@@ -58,6 +60,8 @@ def test_a_baseline_gets_its_row_and_the_bundle_its_distance_to_it(float_bundle,
     assert stage.inputs() == (float_bundle.path / "manifest.json",)
     base, row = stage.run(int8_bundle, Context()).rows
     assert (base.role, row.role) == ("baseline", "subject")
+    identities = [each.details[tables.IDENTITY][0]["identity"] for each in (base, row)]
+    assert identities == [policy_identity(float_bundle), policy_identity(int8_bundle)]
     assert len({base.name, row.name}) == 2, "by their folders: both bundles are of one policy"
     expected = np.abs(chunks(int8_bundle)[0] - chunks(float_bundle)[0]).mean(axis=(0, 1))
     assert row.value("error_baseline.dx") == pytest.approx(expected[0], rel=1e-4)

@@ -19,7 +19,9 @@ from vlatool.gate.config import Gate
 from vlatool.gate.run import run_gate
 from vlatool.measurement.agreement import run_agreement
 from vlatool.measurement.pairs import PairJob, Pairs
+from vlatool.measures import tables
 from vlatool.report import Report
+from vlatool.runtime.identity import policy_identity
 from vlatool.stage.base import Context
 from vlatool.telemetry._reading import THROTTLE, Reader, gauge
 
@@ -56,6 +58,8 @@ def test_the_worst_claim_decides(float_bundle: Bundle, as_fast, slowdown: float,
     assert len(report.rows[1].raw["log_ratio"]) == 10
     assert len(report.rows[0].raw["latency_ms"]) == 800
     assert report.command == "vlatool gate x"
+    identities = [row.details[tables.IDENTITY][0]["identity"] for row in report.rows]
+    assert identities == [policy_identity(float_bundle)] * 2
     assert Report.from_json(report.to_json()) == report
 
 

@@ -33,6 +33,7 @@ from vlatool.measures.latency import DEADLINE_MISSES, GMACS, LATENCY_P50, REACH_
 from vlatool.report import Finding, Measurement, Report, Row
 from vlatool.runtime.engine import engine_class
 from vlatool.stage.base import Context, Measure
+from vlatool.stage.identity import with_identity
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -214,7 +215,8 @@ class Latency(Measure):
                 details[titles.LOG] = [{"line": line} for line in lines[-LOG_LINES:]]
             role = "baseline" if policy is reference and others else "subject"
             placed = tuple(replace(number, where=where) for number in numbers)
-            rows.append(with_derived(Row(policy.name, role, "", placed, raw(run, policy, not others), details)))
+            row = Row(policy.name, role, "", placed, raw(run, policy, not others), details)
+            rows.append(with_identity(with_derived(row), bundle))
         seen = (
             *findings(run, job, bool(self.sustained)),
             *self._limited(run.host, where),

@@ -21,6 +21,7 @@ from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import draw, schedule_arrays
 from vlatool.stage.base import Context, Measure
+from vlatool.stage.identity import with_identity
 from vlatool.stats.intervals import quantile_interval
 
 if TYPE_CHECKING:
@@ -101,7 +102,8 @@ class Overhead(Measure):
         row = with_derived(
             Row(source.manifest.name, measurements=measurements, raw={series.OVERHEAD: differences.tolist()})
         )
-        return Report("benchmark", f"Overhead of the runtime on {source.manifest.name}", summary=(text,), rows=(row,),
+        return Report("benchmark", f"Overhead of the runtime on {source.manifest.name}", summary=(text,),
+                      rows=(with_identity(row, source),),
                       environment=fingerprint())  # fmt: skip
 
 

@@ -30,6 +30,7 @@ from vlatool.module.origin import origin_of
 from vlatool.report import Report
 from vlatool.sources import open_source, source_bundle
 from vlatool.stage.base import Context
+from vlatool.stage.identity import rows_with_identity
 from vlatool.stage.run import cached_transform
 
 WORKLOAD_FILE = "workload.json"
@@ -85,7 +86,8 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     context.progress("predicting", None)
     cloud = _cheapest(rented, load, model, asked) if asked.cloud else None
     choices = choose(owned or rented, load, model, asked)
-    return boards_report(source, load, choices, asked, cloud, context.command)
+    report = boards_report(source, load, choices, asked, cloud, context.command)
+    return replace(report, rows=rows_with_identity(report.rows, bundle))
 
 
 def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wants: Wants) -> Choice | None:

@@ -38,7 +38,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "data inspect": ("inspection",),
     "data sample": ("written",),
     "verify": ("report",),
-    "inspect": ("manifest",),
+    "inspect": ("manifest", "sensitivity"),
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
     "simulate": ("simulation",),
@@ -142,6 +142,11 @@ def _documents() -> dict[str, Schema]:
             "type": "object", "description": "manifest.json of the bundle, byte by byte, when there is no error.",
             "required": ["name", "version", "spec", "graphs", "files"], "properties": {"error": ERROR},
         },
+        "sensitivity": document(
+            "Which element of an input moves which element of the action, the largest effect first.",
+            identity=TEXT, samples=INTEGER, recorded=FLAG, left_out=many(TEXT), influences=many(record(
+                input=TEXT, output=TEXT, slope=NUMBER, unit=TEXT, effect=NUMBER, agreement=NUMBER)),
+        ),
         "rebuilt": document(
             "A bundle that was made again.",
             bundle=TEXT, source=TEXT, identical=FLAG, hash=record(recorded=TEXT, rebuilt=TEXT), left_out=many(TEXT),

@@ -18,18 +18,21 @@ from vlatool.cli._document import document
 from vlatool.cli._frame import describe_image, show_frame
 from vlatool.cli._options import BundlePath, Force
 from vlatool.cli._proposal import propose
-from vlatool.errors import BundleError, GraphError, UsageError
+from vlatool.errors import BundleError, GraphError, SpecError, UsageError
 from vlatool.files.printable import printable
 from vlatool.files.verified_read import open_inside
 from vlatool.module.source import is_bundle
 from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded_files
+from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
 from vlatool.stage.controls import controls
 
 MAX_OPTION = 120
 """Characters of an option of a build record that are shown."""
+MAX_INFLUENCES = 24
+"""Influences of --sensitivity that are shown in the terminal."""
 
 
 def inspect(
@@ -48,6 +51,11 @@ def inspect(
         float | None,
         typer.Option("--memory", min=1, help="MB that --probe may take; 2,000 and 8 times the graphs when not given"),
     ] = None,
+    sensitivity: Annotated[
+        bool,
+        typer.Option("--sensitivity", help="also show which element of an input moves which element of the action"),
+    ] = False,
+    samples: Annotated[int, typer.Option(min=1, max=1000, help="recorded observations for --sensitivity")] = 8,
     frame: Annotated[
         str,
         typer.Option(
@@ -67,14 +75,41 @@ def inspect(
         raise UsageError(f"{wrong} is {'given' if frame else 'missing'}.", "leave one of them out")
     opened = _opened(bundle)
     tried = try_once(opened.path, first_run_s=first_run, memory_mb=memory) if probe else None
-    if as_json:
+    moves = _sensitivity(opened, samples) if sensitivity else None
+    if as_json and moves is not None:
+        document(moves)
+    elif as_json:
         document(opened.manifest.to_dict(), manifest_bytes(opened.manifest).decode())
     else:
         shown = show_frame(opened, frame, output, force=force) if frame else []
-        for line in [*describe(opened), *shown, *([] if tried is None else [_probed(tried)])]:
+        for line in [*describe(opened), *shown, *([] if tried is None else [_probed(tried)]), *_influences(moves)]:
             typer.echo(printable(line))
     if tried is not None and tried["refused"]:
         raise GraphError(*tried["refused"])
+
+
+def _sensitivity(bundle: Bundle, samples: int) -> dict[str, Any]:
+    from vlatool.verify.influence import sensitivity
+
+    with progress() as context:
+        context.progress("moving each input", None)
+        return sensitivity(bundle, samples)
+
+
+def _influences(moves: Mapping[str, Any] | None) -> list[str]:
+    """Return the largest influences, a line each."""
+    if moves is None:
+        return []
+    kind = "recorded" if moves["recorded"] else "random"
+    lines = [f"  moves      on {moves['samples']} {kind} observations; input -> action: slope; effect in spreads; sign"]
+    for each in moves["influences"][:MAX_INFLUENCES]:
+        what = f"{each['input']} -> {each['output']}"
+        slope = f"{each['slope']:+.3g} {each['unit']}"
+        lines.append(f"    {what:32} {slope:>20} {each['effect']:+8.3f}  {each['agreement']:.0%} of the same sign")
+    rest = len(moves["influences"]) - MAX_INFLUENCES
+    lines += [f"    and {rest} smaller ones: --json shows all"] if rest > 0 else []
+    lines += [f"    not moved: {', '.join(moves['left_out'])}"] if moves["left_out"] else []
+    return lines
 
 
 def _opened(named: Path) -> Bundle:
@@ -110,6 +145,7 @@ def describe(bundle: Bundle) -> list[str]:
     if manifest.description:
         lines.append(f"  {manifest.description}")
     spec = manifest.spec
+    lines += [f"  policy     {_identity(bundle)}"]
     executed = f"{spec.execute or spec.chunk} of {spec.chunk} actions executed"
     known = spec.control_hz is not None
     ends = f": {spec.inference_hz:g} inferences per second" if known else ""
@@ -127,6 +163,14 @@ def describe(bundle: Bundle) -> list[str]:
     lines += [f"  WRONG      {finding['name']}: {finding['message']}" for finding in manifest.findings]
     lines += [f"  CONTROL    {line}" for line in controls(bundle)]
     return lines
+
+
+def _identity(bundle: Bundle) -> str:
+    """Return the identity of the policy in a bundle, or why it has none."""
+    try:
+        return policy_identity(bundle)
+    except (BundleError, GraphError, SpecError) as error:
+        return f"no identity: {error.message}"
 
 
 def _beside(bundle: Bundle, file: str) -> list[str]:

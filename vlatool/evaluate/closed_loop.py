@@ -39,6 +39,7 @@ from vlatool.module.source import describe
 from vlatool.report import Report, Row
 from vlatool.runtime.control import layers
 from vlatool.stage.base import Context, Measure
+from vlatool.stage.identity import with_identity
 from vlatool.stats.starts import distinct_starts
 from vlatool.user_code import trust
 
@@ -236,6 +237,7 @@ class ClosedLoop(Measure):
             rows, row = [with_episode(rows[0], again.outcomes[0])], with_episode(row, again.outcomes[1])
         rows = [with_derived(replace(row, measurements=(*row.measurements, latency)) if latency else row)
                 for row, latency in zip([*rows, row], latencies, strict=True)]  # fmt: skip
+        rows = [with_identity(row, bundle) for row, bundle in zip(rows, bundles, strict=True)]
         row = rows[-1]
         count = len(outcomes)
         how = "" if self.instruction == "right" else " told the wrong instruction"

@@ -30,6 +30,7 @@ from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.first_run import run_once_in_child
+from vlatool.stage.identity import with_identity
 from vlatool.stats.intervals import wilson
 
 if TYPE_CHECKING:
@@ -84,12 +85,13 @@ class Recorded(Measure):
         if self.baseline:
             reference = self._reference(bundles[0], source, recording, indices, context)
             own = single_policy_measurements(action, reference, expert, episodes)
-            rows.append(with_derived(Row(names[0], "baseline", measurements=tuple(own))))
+            row = Row(names[0], "baseline", measurements=tuple(own))
+            rows.append(with_identity(with_derived(row), bundles[0]))
         actions = run_recorded(source, recording, indices, self.engine, context)
         measurements = single_policy_measurements(action, actions, expert, episodes)
         if reference is not None:
             measurements += compare(action, actions, reference, BASELINE)
-        rows.append(with_derived(Row(names[-1], measurements=tuple(measurements))))
+        rows.append(with_identity(with_derived(Row(names[-1], measurements=tuple(measurements))), source))
         kind = "calibration" if reservation else "recorded"
         title = f"{source.manifest.name} on {len(indices)} {kind} observations"
         trust = credibility(rows[0]) if self.baseline else Credibility()

@@ -36,6 +36,7 @@ from vlatool.report import Report, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.sensitivity.layers import LayerError, ranges_of, sensitivities
 from vlatool.stage.base import Context
+from vlatool.stage.identity import with_identity
 
 __all__ = ["Options", "explain", "explanation"]
 
@@ -116,7 +117,8 @@ def explain(bundle: Bundle, options: Options, context: Context) -> Report:
         for candidate in (comparison.baseline, comparison.current, *comparison.others):
             if candidate is not None:
                 own = details if candidate is comparison.current else {}
-                rows.append(tables.candidate_row(candidate, comparison, own, findings.source))
+                row = tables.candidate_row(candidate, comparison, own, findings.source)
+                rows.append(row if candidate.bundle is None else with_identity(row, candidate.bundle))
     name = str(bundle.manifest.made_by.get("stage", "")).rpartition(".")[2]
     rows = [replace(row, name=name or row.name) if row.name == "as it is" else row for row in rows]
     title = f"Why {bundle.manifest.name} ({name or 'as it is'}) is as accurate and as fast as it is"

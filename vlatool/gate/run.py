@@ -26,6 +26,7 @@ from vlatool.measures.latency import LATENCY_P50
 from vlatool.report import Finding, Report, Row
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context, content_hash
+from vlatool.stage.identity import with_identity
 from vlatool.telemetry import Recorder, open_all
 
 KIND = "gate"
@@ -64,7 +65,8 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     name = candidate.manifest.name
     row = _row("candidate", candidate, timed, results)
     row = replace(row, details={**row.details, tables.SETTINGS: _measured_with(evidence)})
-    rows = (_row("baseline", baseline, timed, results), row)
+    baseline_row = _row("baseline", baseline, timed, results)
+    rows = (with_identity(baseline_row, baseline), with_identity(row, candidate))
     return Report(KIND, f"Gate of {name}", worst(result.verdict.outcome for result in results).value,
                   (*_summary(name, results), f"{inputs.description()}."), rows,
                   command=context.command, environment=host, warnings=tuple(dict.fromkeys(notes)),

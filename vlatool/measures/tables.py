@@ -14,6 +14,8 @@ PAIRED_SUCCESS = "paired with the baseline"
 UNDER = "under disturbances"
 EPISODE = "the episode that differs most"
 ROUNDS, TEACHER = Pattern("training: {stage}"), Pattern("training: {stage}, and its teacher")
+IDENTITY = "policy identity"
+"""Hash over all that decides how a robot behaves with the policy, and the hash of its bundle."""
 CLAIMS, SETTINGS = "claims", "measured with"
 WAY = "way"
 """How a board is driven: state, power mode, engine, precision."""

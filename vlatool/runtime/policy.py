@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import threading
 import time
@@ -24,6 +25,7 @@ from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
 from vlatool.runtime.golden import GOLDEN_STEPS, golden_arrays, golden_chunks, golden_steps
 from vlatool.runtime.graph_files import open_graph
+from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import Program, Session
@@ -88,6 +90,11 @@ class BundlePolicy:
         }
         check_graphs(manifest, sessions, limit_mb)
         return cls(bundle, Program(manifest.program, sessions, seed), engine)
+
+    @functools.cached_property
+    def identity(self) -> str:
+        """``sha256:...`` over all that decides how a robot behaves with this policy: for telemetry and logs."""
+        return policy_identity(self.bundle)
 
     def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
         """Return the next action chunk.

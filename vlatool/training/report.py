@@ -14,6 +14,7 @@ from vlatool.measures.training import TRAINING_TIME
 from vlatool.module.stage import TRAINING
 from vlatool.render import write_reports
 from vlatool.report import Report, Row
+from vlatool.stage.identity import with_identity
 from vlatool.training.forecast import duration
 from vlatool.training.generalization_gap import ADVICE_RATIO, LOSS_KEY, NEW_ROUND, PREVIOUS_ROUND
 from vlatool.training.supervision import teacher_lines, teacher_record
@@ -44,7 +45,7 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
     )
     result = f"{course(training)} and {duration(seconds)}."
     report = Report(
-        "training", f"{made.manifest.name}: {stage}", rows=(row,), command=command,
+        "training", f"{made.manifest.name}: {stage}", rows=(with_identity(row, made),), command=command,
         summary=(*along_lines(training), result, *teacher_lines(training)),
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"), environment=fingerprint(),
     )  # fmt: skip

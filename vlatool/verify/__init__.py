@@ -1,4 +1,4 @@
-"""Comparison of a policy directory with its original code, and the stage in which they differ."""
+"""Comparison of a policy with its original code, and of a robot's log with recordings of right wiring."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from vlatool.measures.actions import ERROR_MAX_OF, RELATIVE_ERROR_MAX
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.report import Report, Row
 from vlatool.stage.base import Context
+from vlatool.stage.identity import with_identity
 from vlatool.user_code import children, trust
 
 PRELOAD = ("torch", "onnxruntime", "vlatool.verify._compare")
@@ -98,7 +99,7 @@ def _report(bundle: Bundle, options: Options, comparison: Mapping[str, Any]) -> 
     details = {ELEMENTS: list(comparison["elements"]), STAGES: list(comparison["stages"])}
     row = Row(name, measurements=tuple(measurements), details={key: value for key, value in details.items() if value})
     return Report(
-        "verify", title, verdict, tuple(sentences), (row,), environment=fingerprint(),
+        "verify", title, verdict, tuple(sentences), (with_identity(row, bundle),), environment=fingerprint(),
         warnings=tuple(comparison["warnings"]), limits={"tolerance": options.tolerance},
     )  # fmt: skip
 
