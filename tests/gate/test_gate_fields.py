@@ -106,6 +106,7 @@ COMPARED: dict[str, tuple[Change, str]] = {
     "TensorSpec.mode": (tensor("outputs", 0, mode="absolute"), "mode 'absolute'"),
     "TensorSpec.max_tokens": (text_input(max_tokens=1), "max_tokens 1 in the candidate"),
     "TensorSpec.finite": (float_input(finite=False), "finite False in the candidate, True in the baseline"),
+    "TensorSpec.history": (tensor("inputs", 0, history=8), "history 8 in the candidate, 0 in the baseline"),
     "PolicySpec.inputs": (
         lambda before: spec(inputs=(*before.spec.inputs, TensorSpec("gripper", (1, 1))))(before),
         "input gripper: it is in the candidate alone",

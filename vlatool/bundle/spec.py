@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from vlatool.errors import SpecError, suggest
@@ -46,6 +46,8 @@ class TensorSpec:
         max_tokens: number of ids that the tokenizer pads or cuts to (``kind: text``).
         finite: False for a float input in which the policy itself handles NaN and infinity, such as missing returns in
             a depth image; in any other input they are refused.
+        history: number of moments that the second axis of an input holds, oldest first, from 2; 0 for an input of one
+            moment. The robot gives one moment at each control step, and the runtime keeps the last ones.
     """
 
     name: str
@@ -60,11 +62,13 @@ class TensorSpec:
     tokenizer: str = ""
     max_tokens: int = 0
     finite: bool = True
+    history: int = 0
 
     def __post_init__(self) -> None:
         self._check_words()
         self._check_shape()
         self._check_kind()
+        self._check_history()
         if self.normalisation != "none" and "#" not in self.statistics:
             raise SpecError(
                 f"'{self.name}' is normalised by {self.normalisation}, but 'statistics' is '{self.statistics}'.",
@@ -130,6 +134,22 @@ class TensorSpec:
                 "leave it out: NaN and infinity are values of floats alone",
             )
 
+    def _check_history(self) -> None:
+        if not integer(self.history, f"The history of '{self.name}'", SpecError):
+            return
+        if self.kind != "tensor" or self.history < 2 or self.shape[1:2] != (self.history,):
+            raise SpecError(
+                f"'{self.name}' has the history {self.history} and, as {self.kind}, the shape {list(self.shape)}; the "
+                "second axis of a tensor with a history counts its moments, from 2.",
+                f"write its shape as [1, {max(2, self.history)}, ...], or leave the history out: the observation then "
+                "holds what the graph takes",
+            )
+        if not all(isinstance(axis, int) for axis in self.shape):
+            raise SpecError(
+                f"'{self.name}' has a history and the dynamic shape {list(self.shape)}.",
+                "write its axes as numbers: moments of different shapes cannot be stacked",
+            )
+
     def assets(self) -> list[str]:
         """Return the files, relative to the assets, that this tensor needs."""
         file = self.statistics.partition("#")[0]
@@ -140,6 +160,11 @@ class TensorSpec:
         """Length of the last axis; 0 when it is dynamic or there is none."""
         last = self.shape[-1] if self.shape else 0
         return last if isinstance(last, int) else 0
+
+    @property
+    def moment(self) -> TensorSpec:
+        """Spec of what the robot gives at one control step: without the axis of moments, if it has a history."""
+        return replace(self, shape=(self.shape[0], *self.shape[2:]), history=0) if self.history else self
 
     @property
     def elements(self) -> int:
@@ -220,6 +245,8 @@ class PolicySpec:
                     f"The output '{tensor.name}' says finite: false; a policy answers finite values.",
                     "leave it out there; it is for inputs",
                 )
+            if tensor.history:
+                raise SpecError(f"The output '{tensor.name}' has a history.", "leave it out there; it is for inputs")
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
         hz = self.control_hz

@@ -121,6 +121,7 @@ def _tensor(tensor: TensorSpec) -> str:
             tensor.mode,
             tensor.normalisation.replace("none", ""),
             "" if tensor.finite else "takes NaN and infinity",
+            f"the last {tensor.history} moments" if tensor.history else "",
         )
         if part
     )
