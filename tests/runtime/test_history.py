@@ -12,6 +12,7 @@ from _written import written
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import TensorSpec
+from vlatool.episodes.frames import FrameRecorder
 from vlatool.errors import DataError, GraphError, PluginError
 from vlatool.runtime import ChunkQueue, Policy, load
 from vlatool.runtime.control.late import LateController
@@ -167,3 +168,15 @@ def test_kept_values_and_history_go_together(tmp_path: Path):
     policy = echo(tmp_path, text, program=memory)
     assert seen(policy, 1, 2) == [1, 1, 2]
     assert seen(policy, 3) == [2, 3, 5]
+
+
+def test_recorded_frames_hold_what_the_graph_was_given(tmp_path: Path):
+    policy = echo(tmp_path / "bundle")
+    recorder = FrameRecorder(policy, policy.encode)
+    queue = ChunkQueue(recorder, execute=2)
+    with recorder.recording(tmp_path / "frames"):
+        queue.reset()
+        for step in range(6):
+            queue.act({"x": [step, 0]})
+    frames = np.load(tmp_path / "frames/x.npy")
+    assert frames[..., 0].tolist() == [[0, 0, 0], [0, 1, 2], [2, 3, 4]]
