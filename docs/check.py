@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
+OUTPUTS = "out"
+"""Folder of what commands write, which the repository does not have."""
 PLACES = ("", "vlatool", "tests", "docs")
 """Folders that a path on a page may start from, beside the page's own."""
 GROUPS = {"control", "engines", "profiles", "commands", "sections", "videos", "claims", "measures"}
@@ -141,7 +143,7 @@ def paths(page: Page) -> Iterator[str]:
 def belongs(name: str, root: Path) -> bool:
     """Say whether a path claims to be in the repository; a bundle and a policy have ``.json`` files of their own."""
     first, end = name.split("/")[0], Path(name).suffix
-    return (root / first).is_dir() or (
+    return (first != OUTPUTS and (root / first).is_dir()) or (
         end in (".py", ".md") and any((root / place / first).is_dir() for place in PLACES)
     )
 

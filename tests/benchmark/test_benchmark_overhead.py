@@ -34,7 +34,7 @@ def test_a_graph_that_runs_twice_has_no_single_bare_call(float_bundle):
     for program in ((step,), (step, step)):
         twice = Bundle(float_bundle.path, replace(float_bundle.manifest, program=program))
         with pytest.raises(UsageError, match="one graph that runs once"):
-            Overhead(iterations=100).run(twice, Context())
+            Overhead(iterations=100).check(twice, None)
     Overhead().check(None, None)
 
 

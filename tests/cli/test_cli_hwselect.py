@@ -363,7 +363,7 @@ def test_a_measurement_changes_what_is_predicted_for_its_board(vlatool, float_bu
 def test_a_report_is_no_calibration_before_it_is_told(vlatool, float_bundle, tmp_path):
     fast = ["--duration", 0, "--iterations", 20, "--no-cold"]
     assert vlatool("benchmark", float_bundle.path, *fast, "-o", tmp_path / "report")[0] == 0
-    assert "file that `vlatool profiles calibrate` keeps" in " ".join(
+    assert "file that `vlatool profiles calibrate` stored" in " ".join(
         vlatool("hwselect", "select", "--help")[1].split()
     )
     line = ["hwselect", float_bundle.path, "--boards", "raspberry-pi-5"]

@@ -6,13 +6,13 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests._reach import EAGER, GOOD, TREMBLES, bundle_of, folder_of
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.play import EpisodesJob
-from vlatool.episodes.progress import Tally
 from vlatool.errors import DataError, RecipeError, UsageError
 from vlatool.evaluate import _player
 from vlatool.evaluate._sentences import sentences
@@ -235,10 +235,10 @@ def test_an_episode_that_cannot_be_played_again_costs_its_picture_alone(
 ):
     real = _player.run_jobs
 
-    def run(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context, *more: Tally):
+    def run(bundle: Bundle, jobs: list[EpisodesJob], *more: Any, **named: Any):
         if jobs[0].show:
             raise DataError("the environment is gone")
-        return real(bundle, jobs, engine, context, *more)
+        return real(bundle, jobs, *more, **named)
 
     monkeypatch.setattr(_player, "run_jobs", run)
     row = evaluated(bundles, "trembles", 4).rows[-1]

@@ -19,6 +19,7 @@ from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
+from vlatool.stage.run import run_transform
 
 PLAIN_YAML = """\
 name: plain
@@ -231,7 +232,7 @@ def test_a_bundle_of_an_onnx_file_has_nothing_to_export(float_bundle, tmp_path: 
 
 def test_an_export_needs_a_source(tmp_path: Path):
     with pytest.raises(RecipeError, match=r"export.onnx needs a bundle"):
-        ExportOnnx().run(None, tmp_path, Context())
+        run_transform(ExportOnnx(), None, tmp_path / "out", Context())
 
 
 @pytest.mark.parametrize(
@@ -519,3 +520,22 @@ def test_a_policy_that_answers_nan_at_export_is_blamed_itself(plain, tmp_path: P
         export(plain(f"return ({body})[:, :2]"), tmp_path / "out")
     assert caught.value.fix.startswith("correct the policy: ")
     assert "do not execute" not in caught.value.fix
+
+
+def test_a_mismatch_names_the_node_and_its_module(tmp_path: Path) -> None:
+    """A module that computes something else while it is exported."""
+    body = """h = self.linear(x)
+        return (h * 1.5 if torch.compiler.is_exporting() else h).tanh()"""
+    (tmp_path / "policy.yaml").write_text(PLAIN_YAML)
+    inner = "class Inner(nn.Module):\n    def __init__(self):\n        super().__init__()\n        "
+    layer = "self.linear = nn.Linear(3, 2)"
+    code = PLAIN_PY.replace("BODY", "return self.inner(x)").replace(layer, "self.inner = Inner()")
+    inner += f"{layer}\n\n    def forward(self, x):\n        {body}\n\n"
+    code = code.replace("class Policy", f"{inner}class Policy")
+    (tmp_path / "policy.py").write_text(code)
+    source = TorchModule(policy=tmp_path)
+    (tmp_path / "source").mkdir()
+    (tmp_path / "out").mkdir()
+    bundle = source.run(None, tmp_path / "source", Context()).bundle
+    with pytest.raises(GraphError, match=r"they differ from the node 'inner\.linear/Gemm' of the graph 'main' on"):
+        ExportOnnx().run(bundle, tmp_path / "out", Context())

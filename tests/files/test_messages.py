@@ -25,7 +25,7 @@ MODULES = (
     "vlatool.workers._remote_worker",
 )  # fmt: skip
 """Where messages are defined; what they are made of is followed from there."""
-NO_MESSAGES = {"_Call"}
+NO_MESSAGES = {"_Call", "Proposals"}
 
 
 def messages() -> list[type]:

@@ -70,3 +70,27 @@ def test_a_graph_inside_reads_what_the_input_was(tmp_path: Path):
 def test_a_batch_axis_that_is_there_stays_as_it_is(tmp_path: Path):
     made = bundle_of(tmp_path, "g (float[1,5] x) => (float[1,5] y) { y = Neg(x) }")
     assert [node.op_type for node in onnx.load(made.file("graphs/main.onnx")).graph.node] == ["Neg"]
+
+
+def test_a_description_of_a_file_without_batch_axes(tmp_path: Path) -> None:
+    """What is proposed for such a file has a batch axis; read again, it is the same policy."""
+    text = "g (float[2, 1, 4] state) => (float[2, 1, 4] action) { action = Relu(state) }"
+    onnx.save(onnx.parser.parse_model(HEAD + text), tmp_path / "net.onnx")
+    (tmp_path / "policy.yaml").write_text(
+        "name: net\nspec:\n  inputs: [{name: state, shape: [1, 2, 1, 4]}]\n"
+        "  outputs: [{name: action, shape: [1, 2, 1, 4]}]\n  control_hz: unknown\n  chunk: 2\n"
+    )
+    (tmp_path / "out").mkdir()
+    source = OnnxFile(model=tmp_path / "net.onnx", policy=tmp_path / "policy.yaml")
+    bundle = source.run(None, tmp_path / "out", Context()).bundle
+    state = np.random.default_rng(0).normal(size=(2, 1, 4)).astype(np.float32)
+    outputs = load(bundle.path, threads=1).infer({"state": state}).outputs
+    np.testing.assert_array_equal(outputs["action"][0], np.maximum(state, 0))
+
+
+def test_a_first_axis_with_a_name_of_its_own_is_what_a_run_shows(tmp_path: Path) -> None:
+    """An output whose axes have names that no input has: they are lengths that the exporter could not tell."""
+    text = """g (float[batch, 4] state) => (float[batch, 4] action, float[Concat_dim_0, Concat_dim_1] twice)
+        { twice = Concat<axis = 0>(state, state) action = Identity(state) }"""
+    bundle = bundle_of(tmp_path, text)
+    assert [each.shape for each in bundle.manifest.spec.outputs] == [(1, 4), (2, 4)]

@@ -1,5 +1,6 @@
 import itertools
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +24,10 @@ from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.golden import load_golden
 from vlatool.stage.finish import (
     ENGINE_DIFFERENCE,
+    MAX_ROUNDING,
     Difference,
+    Golden,
+    _judge_engine,
     carry_over,
     finish,
     read_difference,
@@ -297,3 +301,9 @@ def test_a_discrete_action_is_another_one_where_another_choice_is_made(tmp_path,
     difference = read_difference(made)
     assert difference is not None
     assert (difference.mean, difference.worst, difference.samples) == (share, share, 16)
+
+
+@pytest.mark.parametrize(("largest", "allowed"), [(1e-7, math.inf), (1e-5, MAX_ROUNDING)])
+def test_a_difference_below_the_rounding_of_one_is_none(float_bundle: Bundle, largest: float, allowed: float) -> None:
+    golden = Golden([], [], difference=0.2, of_chunk=0.2, largest=largest)
+    assert _judge_engine(float_bundle, golden, None) == (0.2, allowed, False)

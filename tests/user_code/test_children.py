@@ -50,7 +50,7 @@ def test_a_signal_while_the_children_end_ends_them_at_once_without_a_traceback(n
 
 def test_what_vlatools_own_code_raises_is_named_and_not_blamed_on_the_policy() -> None:
     """It stays an error with exit code 3: what a child says decides no exit code."""
-    says = r"^vlatool\.stage\._child\.run failed in the process that runs policy\.py: KeyError: 'stage'\.\n"
+    says = r"^vlatool\.stage\._child\._stage_of failed in the process that runs policy\.py: KeyError: 'stage'\.\n"
     with pytest.raises(SourceError, match=says) as caught:
         children.call("vlatool.stage._child:run", {}, lambda *_: None, "policy.py")
     assert caught.value.fix.startswith("that is vlatool's own code: report it")

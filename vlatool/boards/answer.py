@@ -261,6 +261,15 @@ def _change(change: Change) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _busy(ms: float, hz: float | None) -> str:
+    """Return in words which part of its time a policy computes, of ``ms`` for each action at the rate ``hz``."""
+    if hz is None:
+        return "the policy's rate is unknown"
+    share = ms * hz / 1e3
+    words = f"busy {share:.1%} of the time" if share < 1 else f"{share:.3g} times the time that there is"
+    return f"at the policy's {hz:g} Hz {words}"
+
+
 def simulation_lines(simulation: dict[str, Any]) -> list[str]:
     """Return the text of a simulation."""
     ms, low, high = simulation["latency_ms"]
@@ -268,12 +277,11 @@ def simulation_lines(simulation: dict[str, Any]) -> list[str]:
     costs = f"{simulation['memory_mb'][0]:.0f} MB, {simulation['watts'][0]:.0f} W, {simulation['joules']:.3g} J"
     count, hz = simulation["execute"], simulation["control_hz"]
     actions = f"each of the {count} actions that are executed of it" if count > 1 else "each action"
-    share = ms / count * hz / 1e3
-    busy = f"busy {share:.1%} of the time" if share < 1 else f"{share:.3g} times the time that there is"
+    busy = _busy(ms / count, hz)
     lines = [
         f"PREDICTED for {where}; nothing was run there",
         f"{ms:.4g} ms an inference (80 %: {low:.4g}-{high:.4g}), {costs}",
-        f"{actions}: {ms / count:.3g} ms, {simulation['joules'] / count:.3g} J; at the policy's {hz:g} Hz {busy}",
+        f"{actions}: {ms / count:.3g} ms, {simulation['joules'] / count:.3g} J; {busy}",
         "", *simulation["timeline"], *_part_lines(simulation["phases"]), "", "what a change would give",
     ]  # fmt: skip
     for change in simulation["changes"]:

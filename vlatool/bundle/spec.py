@@ -24,6 +24,8 @@ MAX_INDICES = 2**18
 
 
 MAX_HZ = 100_000
+UNKNOWN = "unknown"
+"""What a policy.yaml says in the place of a rate that nobody knows."""
 
 
 @dataclass(frozen=True)
@@ -218,14 +220,14 @@ class PolicySpec:
     Args:
         inputs: inputs in the order in which the source takes them.
         outputs: outputs, the action first.
-        control_hz: rate of the control loop in Hz.
+        control_hz: rate of the control loop in Hz; None where nobody said it (``unknown`` in a policy.yaml).
         chunk: number of actions from one inference.
         execute: number of actions executed before the next inference; 0 for the whole chunk.
     """
 
     inputs: tuple[TensorSpec, ...]
     outputs: tuple[TensorSpec, ...]
-    control_hz: float
+    control_hz: float | None
     chunk: int = 1
     execute: int = 0
 
@@ -250,8 +252,8 @@ class PolicySpec:
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
         hz = self.control_hz
-        if isinstance(hz, bool) or not (isinstance(hz, int | float) and 0 < hz < MAX_HZ):
-            allowed = f"a rate in Hz above 0 and below {MAX_HZ:,}"
+        if hz is not None and (isinstance(hz, bool) or not (isinstance(hz, int | float) and 0 < hz < MAX_HZ)):
+            allowed = f"a rate in Hz above 0 and below {MAX_HZ:,}, or {UNKNOWN}"
             raise SpecError(f"control_hz is {short_repr(self.control_hz)}; allowed: {allowed}.")
         integer(self.chunk, "chunk", SpecError, 1)
         check_limit("elements", self.chunk, "chunk", SpecError)
@@ -264,9 +266,30 @@ class PolicySpec:
         return self.outputs[0]
 
     @property
+    def rate(self) -> float:
+        """Rate of the control loop in Hz.
+
+        Raises:
+            SpecError: when nobody said it.
+        """
+        if self.control_hz is None:
+            raise SpecError(
+                "The rate of the control loop is unknown, and this needs it.",
+                "write control_hz: NUMBER into the policy.yaml (vlatool new POLICY --from SOURCE makes one)",
+            )
+        return self.control_hz
+
+    @property
     def inference_hz(self) -> float:
         """Inferences per second that the control rate and the number of executed actions require."""
-        return self.control_hz / self.executed_actions
+        return self.rate / self.executed_actions
+
+    def unknown(self) -> tuple[str, ...]:
+        """Return what nobody said of the robot: the rate, and unit and mode of the action."""
+        action = self.action
+        silent = () if action.kind == "discrete" else ("unit", "mode")
+        of_action = tuple(f"{word} of '{action.name}'" for word in silent if not getattr(action, word))
+        return (("control rate",) if self.control_hz is None else ()) + of_action
 
     @property
     def executed_actions(self) -> int:
@@ -288,9 +311,18 @@ class PolicySpec:
             values[key] = tuple(TensorSpec.from_dict(item) for item in listed)
         if "control_hz" not in values:
             raise SpecError("The spec needs 'control_hz', the rate of the control loop in Hz.")
+        if values["control_hz"] == UNKNOWN:
+            values["control_hz"] = None
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a mapping that ``from_dict`` turns back into an equal spec."""
         plain: dict[str, Any] = to_json(self, defaults=False)
         return plain
+
+
+def unknown_warning(spec: PolicySpec) -> tuple[str, ...]:
+    """Return a sentence for a report on what nobody said of the robot; none where all is said, or a rate at least."""
+    if spec.control_hz is not None:
+        return ()
+    return (f"unknown, since nobody said it: {', '.join(spec.unknown())}; a policy.yaml says it",)

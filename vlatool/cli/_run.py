@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import unknown_warning
 from vlatool.cli import _complete
 from vlatool.cli._board_summary import BoardSummary, board_summary
 from vlatool.cli._console import crew, file_or_none, progress, refuse_existing, refuse_video, show
 from vlatool.cli._document import document
 from vlatool.cli._options import AsJson, Force, Raw, Workers
+from vlatool.cli._proposal import propose
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.files.printable import one_line, printable
@@ -47,7 +49,7 @@ def _board_flag(about: str) -> inspect.Parameter:
 
 SOURCE = typer.Argument(
     show_default=False,
-    help="a bundle, a policy directory, path.py:make or an .onnx file",
+    help="a bundle, a policy directory, path.py:make, or a file that holds a policy: .onnx, .pt, .pt2, LEAPP",
     autocompletion=_complete.sources,
 )
 SOURCE_FLAG = _flag("source", Annotated[str, SOURCE])
@@ -107,6 +109,7 @@ def transform(
         stage, start, messages = _start(stage, opened, context)
         result, before = run_chain(stage, start, board, out, cache_directory(), context, force=force)
         on_board = board_summary(result.bundle, before, board, context) if board else None
+    propose(source, result.bundle.manifest, out)
     if as_json:
         document(_as_json(result.bundle, out, on_board))
     else:
@@ -278,6 +281,8 @@ def measure(
         report = _measured(stage, bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
+    propose(source, bundle.manifest, out)
+    report = replace(report, warnings=(*report.warnings, *unknown_warning(bundle.manifest.spec)))
     show(report, as_json=as_json, out=out, force=force, raw=raw, unfinished=[work])
 
 

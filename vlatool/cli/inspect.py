@@ -5,18 +5,22 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from vlatool.bundle.bundle import Bundle, manifest_bytes
 from vlatool.bundle.manifest import Manifest
-from vlatool.bundle.spec import TensorSpec
+from vlatool.bundle.spec import UNKNOWN, TensorSpec
+from vlatool.cli._console import progress
 from vlatool.cli._document import document
 from vlatool.cli._options import BundlePath
+from vlatool.cli._proposal import propose
 from vlatool.errors import BundleError, GraphError
 from vlatool.files.printable import printable
 from vlatool.files.verified_read import open_inside
+from vlatool.module.source import is_bundle
 from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded_files
 from vlatool.runtime.policy import FIRST_RUN_S
@@ -44,9 +48,9 @@ def inspect(
         typer.Option("--memory", min=1, help="MB that --probe may take; 2,000 and 8 times the graphs when not given"),
     ] = None,
 ) -> None:
-    """Verify a bundle and show what is in it."""
-    opened = Bundle.open(bundle)
-    tried = try_once(bundle, first_run_s=first_run, memory_mb=memory) if probe else None
+    """Verify a bundle and show what is in it; of a policy, what its bundle would hold."""
+    opened = _opened(bundle)
+    tried = try_once(opened.path, first_run_s=first_run, memory_mb=memory) if probe else None
     if as_json:
         document(opened.manifest.to_dict(), manifest_bytes(opened.manifest).decode())
     else:
@@ -54,6 +58,19 @@ def inspect(
             typer.echo(printable(line))
     if tried is not None and tried["refused"]:
         raise GraphError(*tried["refused"])
+
+
+def _opened(named: Path) -> Bundle:
+    """Open a bundle, or that of a policy, exported with the default options."""
+    from vlatool.cli._run import open_with_graphs
+    from vlatool.module.source import claimed_source
+
+    if is_bundle(named) or claimed_source(named) is None:
+        return Bundle.open(named)
+    with progress() as context:
+        opened = open_with_graphs(str(named), context)
+    propose(str(named), opened.manifest, None)
+    return opened
 
 
 def _probed(tried: Mapping[str, Any]) -> str:
@@ -76,8 +93,11 @@ def describe(bundle: Bundle) -> list[str]:
     if manifest.description:
         lines.append(f"  {manifest.description}")
     spec = manifest.spec
-    rate = f"{spec.control_hz:g} Hz control, {spec.execute or spec.chunk} of {spec.chunk} actions executed"
-    lines += [f"  rate       {rate}: {spec.inference_hz:g} inferences per second"]
+    executed = f"{spec.execute or spec.chunk} of {spec.chunk} actions executed"
+    known = spec.control_hz is not None
+    ends = f": {spec.inference_hz:g} inferences per second" if known else ""
+    lines += [f"  rate       {f'{spec.control_hz:g} Hz' if known else UNKNOWN} control, {executed}{ends}"]
+    lines += [f"  unknown    {', '.join(spec.unknown())}"] if spec.unknown() else []
     lines += [f"  input      {_tensor(tensor)}" for tensor in spec.inputs]
     lines += [f"  output     {_tensor(tensor)}" for tensor in spec.outputs]
     for name, graph in manifest.graphs.items():

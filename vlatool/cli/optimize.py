@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import crew, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
 from vlatool.cli._document import document, put, report_document
 from vlatool.cli._options import Force, Workers
 from vlatool.cli._plan import plan_document
+from vlatool.cli._proposal import propose
 from vlatool.cli._torchrun import launch_for
 from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
@@ -31,7 +33,9 @@ TRAINS = "distill.policy"
 PolicySource = Annotated[
     str,
     typer.Argument(
-        help="policy directory, path.py:make or .onnx file", show_default=False, autocompletion=_complete.sources
+        help="policy directory, path.py:make, or a file that holds a policy: .onnx, .pt, .pt2, LEAPP",
+        show_default=False,
+        autocompletion=_complete.sources,
     ),
 ]
 Board = Annotated[
@@ -130,6 +134,7 @@ def optimize(
         return
     with progress(*crew(workers)) as context:
         report = pipeline.optimize(plan, output, context, force=force)
+    propose(source, Bundle.open(output, verify=False).manifest, output)
     if as_json:
         document(report_document(report, raw=raw, file=output / "reports" / REPORT))
     else:

@@ -30,7 +30,7 @@ class Body:
     """
 
     def __init__(self, spec: PolicySpec) -> None:
-        self._hz = float(spec.control_hz)
+        self._hz = float(spec.rate)
         self._alike, self._grip = same_unit_elements(spec.action), spec.action.gripper
         self._told: dict[str, list[Array]] = {name: [] for name in SERIES}
         self._times: list[float] = []

@@ -34,7 +34,7 @@ class DisturbedController:
     def __init__(self, controller: Controller, spec: PolicySpec, kind: str, strength: float) -> None:
         self._controller, self.fresh = controller, False
         self._names = [tensor.name for tensor in spec.inputs]
-        self._delay = max(1, round(DELAY_S * strength * spec.control_hz)) if kind == DELAY and strength else 0
+        self._delay = max(1, round(DELAY_S * strength * spec.rate)) if kind == DELAY and strength else 0
         self._lost = min(MAX_DROPPED_SHARE, DROPPED_SHARE * strength) if kind == DROPPED_FRAMES else 0.0
         self._forget(None)
 

@@ -168,7 +168,9 @@ class Worker:
     def controller(self, job: EpisodesJob) -> Controller:
         """Return the controller of a job: of the policy, with noise where there is any, or one that does not look."""
         spec = self.policy.spec
-        acting = build_controller(self.policy, job.controller, int(job.latency_ms * spec.control_hz / 1e3))
+        acting = build_controller(
+            self.policy, job.controller, int(job.latency_ms * spec.rate / 1e3) if job.latency_ms else 0
+        )
         if job.control:
             acting = Blind(job.control, spec.action, self._policy_answers())
         if job.noise:

@@ -129,7 +129,7 @@ def _filmed(
                  for name, outcome, folder in zip(names, found, folders, strict=True)]  # fmt: skip
         episode = f"task '{again.task}', seed {again.seeds[0]}"
         asked = f": {found[-1].instruction}" if found[-1].instruction else ""
-        video = filmstrip(shots, f"{episode}{asked}", bundles[-1].manifest.spec.control_hz)
+        video = filmstrip(shots, f"{episode}{asked}", bundles[-1].manifest.spec.rate)
         lacks = write_video(video, Path(context.video), force=context.force)
     return found, "; ".join([episode, *_reservations(shots, before), *([lacks] if lacks else [])])
 

@@ -19,6 +19,7 @@ from vlatool.files.validate import short_repr
 from vlatool.graph.float32_conversion import ROUNDING, describe_conversion, rewrite_as_float32
 from vlatool.graph.loop_invariants import changing_feeds, compute_once, cut_loop_invariants, name_of_once
 from vlatool.machine.engine_calls import engine_call
+from vlatool.module.divergence import first_divergence
 from vlatool.module.edits import is_changed
 from vlatool.module.folding import fold_weights
 from vlatool.module.memory import refuse_kept_values
@@ -97,7 +98,7 @@ class ExportOnnx(Transform):
         changes = {"program": program}
         exported = finish(source, out, made_by=made_by(self), graphs=graphs, observations=observations, changes=changes)
         rounding = max((ROUNDING.get(kind, 0) for types in gone.values() for kind in types), default=0)
-        error = self._compare(exported, observations, expected, max(self.tolerance, rounding))
+        error = self._compare(source, exported, observations, expected, max(self.tolerance, rounding))
         converted = (
             f"{name}: {describe_conversion(types)}; its action differs from torch's by up to {error:.2g}"
             for name, types in gone.items() if types
@@ -181,8 +182,9 @@ class ExportOnnx(Transform):
         return graphs, program
 
     def _compare(
-        self, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any], tolerance: float
-    ) -> float:
+        self, source: Bundle, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any],
+        tolerance: float,
+    ) -> float:  # fmt: skip
         """Return the largest difference from what torch gives."""
         largest = 0.0
         policy = Policy.open(exported, threads=1, seed=0)
@@ -195,8 +197,21 @@ class ExportOnnx(Transform):
             if not error <= tolerance:
                 raise GraphError(
                     f"ONNX Runtime and torch differ on calibration sample {number}: relative L2 error {error:.3g}, "
-                    f"allowed {tolerance:g}.",
+                    f"allowed {tolerance:g}{self._place(source, exported, observation, tolerance)}.",
                     "look for state that forward() keeps in its modules (declare it with 'keep' in the program), or "
                     "raise --tolerance if you know why",
                 )
         return largest
+
+    def _place(self, source: Bundle, exported: Bundle, observation: dict[str, Any], tolerance: float) -> str:
+        """Return in words from which node on the graphs differ; nothing where that is not found."""
+        if is_changed(source) and takes_shards(source):
+            return ""
+        modules = load_modules(source)
+        sessions = {step.graph: TorchSession(modules[step.graph], step) for step in source.manifest.program}
+        self._actions(source, sessions, [observation])
+        for name, session in sessions.items():
+            file = exported.path / exported.manifest.graphs[name].file
+            if node := first_divergence(session.module, file, session.first_feeds or {}, tolerance):
+                return f"; they differ from the node '{node}' of the graph '{name}' on"
+        return ""

@@ -138,7 +138,7 @@ def read_description(path: Path) -> Description:
         name=str(data["name"]),
         version=str(data.get("version", "0.0.0")),
         spec=spec,
-        factory=str(data.get("source", "")),
+        factory="" if (named := str(data.get("source", ""))) and is_file(file, named) else named,
         arguments=dict(data.get("arguments") or {}),
         program=program,
         environment=dict(data.get("environment") or {}),
@@ -152,6 +152,33 @@ def read_description(path: Path) -> Description:
         training=_training(file, data.get("training", "")),
         read_from=(file,),
     )
+
+
+def is_file(described: Path, named: str) -> bool:
+    """Return whether the ``source`` of a policy.yaml is a file that holds the policy, and no function.
+
+    Args:
+        described: the policy.yaml.
+        named: what it names.
+    """
+    return bool(named) and ":" not in named and not named.endswith(".py") and (described.parent / named).exists()
+
+
+def file_source(path: Path) -> tuple[Path, Path] | None:
+    """Return a policy.yaml and the file or directory that it names as its source; None where it names none.
+
+    Args:
+        path: the policy.yaml, or the directory that holds it.
+    """
+    described = path / FILE if path.is_dir() else path
+    if described.suffix not in (".yaml", ".yml") or not described.is_file():
+        return None
+    try:
+        data = read_mapping(described, str(described), SourceError)
+    except SourceError:  # whoever reads it as a policy says so
+        return None
+    named = data.get("source") if "spec" in data else None
+    return (described, described.parent / named) if isinstance(named, str) and is_file(described, named) else None
 
 
 def _check_label(file: Path, key: str, value: Any) -> None:

@@ -39,10 +39,9 @@ def split_factory(factory: str) -> tuple[str, str]:
 
 
 def _no_function(named: str) -> SourceError:
-    if named.endswith(".onnx"):
-        fix = "name the file itself as SOURCE, and leave source out of the policy.yaml beside it: vlatool export "
-        fix += named if "/" in named else f"DIRECTORY/{named}"
-        return SourceError(f"'{named}' is an ONNX file, not a Python function.", fix)
+    if named.endswith((".onnx", ".pt", ".pt2", ".pth", ".ts")):
+        fix = "put the file there (the path begins at the policy.yaml), or correct 'source'"
+        return SourceError(f"'{named}' is neither a Python function nor a file that is there.", fix)
     if named.endswith(".py"):
         return SourceError(f"'{named}' names a file but no function in it.", f"add the function: {named}:NAME")
     return SourceError(f"'{named}' names no factory.", "write path/to/policy.py:make or package.module:make")

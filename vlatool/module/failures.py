@@ -168,7 +168,7 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 def _cause(chain: list[BaseException], module: Any) -> Cause:
     if any(frame.f_code.co_name == "generate" for frame, _line in _frames(chain[-1]) if not _is_tool(frame)):
         return GENERATE
-    if any(type(part).__module__.startswith("torch.jit") for part in module.modules()):
+    if any(type(part).__module__.startswith("torch.jit") for part in getattr(module, "modules", list)()):
         return TORCHSCRIPT
     cause = _cause_in_text(chain) or OTHER_CAUSE
     return CHECKED_DISTRIBUTION if cause is CONTROL_FLOW and _in_distribution(chain) else cause

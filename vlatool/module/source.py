@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from vlatool import registry
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
 from vlatool.errors import SourceError
-from vlatool.module.description import Description
+from vlatool.module.description import Description, file_source
+from vlatool.module.foreign_files import foreign, foreign_format
 from vlatool.registry import Claim
 from vlatool.stage.base import Stage, Transform
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-CHECKPOINT = "; it looks like a checkpoint of another library, which needs a policy.yaml and a few lines of Python"
-WRAP = "docs/guides/lerobot-policy.md and docs/guides/hugging-face-policy.md wrap checkpoints; else "
 
 
 class Source(Transform):
@@ -59,6 +57,10 @@ class Source(Transform):
         described = self.describe()
         return described is None or bool(described.graphs)
 
+    def described_by(self, description: Path) -> Self:
+        """Return the same source with the ``policy.yaml`` that names it."""
+        return self.model_copy(update={"policy": description})
+
     def trust_code(self) -> Self:
         """Allow the policy's code to run in this process: the user typed its folder."""
         return self
@@ -75,7 +77,9 @@ class Source(Transform):
 def is_bundle(typed: str | Path) -> bool:
     """Return whether a path is a bundle: what has a manifest, unless that is of a format that a source reads."""
     path = Path(typed)
-    return (path / MANIFEST).is_file() and ((path / DIGEST).exists() or not registry.is_certain("sources", str(typed)))
+    if not (path / MANIFEST).is_file() or (path / DIGEST).exists():
+        return (path / MANIFEST).is_file()
+    return foreign_format(path / MANIFEST) is None and not registry.is_certain("sources", str(typed))
 
 
 def claimed_source(typed: str | Path) -> Source | None:
@@ -88,8 +92,12 @@ def claimed_source(typed: str | Path) -> Source | None:
     """
     if is_bundle(typed):
         return None
-    source: type[Source] | None = registry.claimant("sources", str(typed), SourceError)
-    return None if source is None else source.of(str(typed))
+    described, named = file_source(Path(typed)) or (None, typed)
+    source: type[Source] | None = registry.claimant("sources", str(named), SourceError)
+    if source is None:
+        return None
+    found = source.of(str(named))
+    return found if described is None else found.described_by(described)
 
 
 def trust_policies(stage: Stage) -> None:
@@ -129,12 +137,15 @@ def _unknown(typed: str) -> SourceError:
     if is_bundle(path):
         return SourceError(f"{path} is a bundle; the policy that it was made from is needed.", "name the policy")
     known = f"give a bundle, or a source: {registry.requirements('sources')}"
+    if not path.exists():
+        return SourceError(f"'{typed}' is neither a bundle nor a policy source; there is no such file.", known)
+    about = foreign(path)
     if not path.is_dir():
-        return SourceError(f"'{typed}' is neither a bundle nor a policy source.", known)
-    names = sorted(file.name for file in path.iterdir())
-    checkpoint = "config.json" in names and any(name.endswith((".safetensors", ".bin")) for name in names)
+        what = "neither a bundle nor a policy source" if about is None else about.what
+        return SourceError(f"'{typed}' is {what}.", known if about is None else about.remedy)
+    names = ", ".join(sorted(file.name for file in path.iterdir())[:6]) or "nothing"
     return SourceError(
-        f"{path} is not a bundle: it has no {MANIFEST}; and no source of policies reads it (found: "
-        f"{', '.join(names[:6]) or 'nothing'}){CHECKPOINT if checkpoint else ''}.",
-        f"{WRAP if checkpoint else ''}{known}",
+        f"{path} is not a bundle: it has no {MANIFEST}; and no source of policies reads it (found: {names})"
+        f"{f'; it looks like {about.what}' if about else ''}.",
+        known if about is None else about.remedy,
     )

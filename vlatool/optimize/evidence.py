@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vlatool.accuracy.success_comparison import compare_success, with_chance
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import unknown_warning
 from vlatool.data import carries_evaluation, recordings_of
 from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
@@ -62,7 +63,8 @@ def gather(
     timed, about_times = Timing(plan.recipe.effort, where, cache, context, plan.fresh).rows(source, bundles)
     rows, about_actions = with_recordings(timed, bundles, loop, cache, context)
     rows = with_episodes(rows, bundles, loop, cache, context, enough) if loop else rows
-    warnings = (*where.warnings(), *about_times, *about_actions, *dict.fromkeys(notes))
+    silent = unknown_warning(source.manifest.spec)
+    warnings = (*where.warnings(), *about_times, *about_actions, *silent, *dict.fromkeys(notes))
     board, apart = plan.profile, {IN_OPENVINO: ENGINE} if where.is_confined else {}
     asked = {**bundles, **dict.fromkeys(apart, bundles[BASELINE])}
     misled = {

@@ -121,7 +121,9 @@ class Engine:
     @classmethod
     def is_installed(cls) -> bool:
         """Return whether the library is installed, without importing it."""
-        return importlib.util.find_spec(cls.package) is not None
+        with contextlib.suppress(ModuleNotFoundError):  # an import hook may raise it
+            return importlib.util.find_spec(cls.package) is not None
+        return False
 
     @classmethod
     def version(cls) -> str:

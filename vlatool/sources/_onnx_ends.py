@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ def _type_of(value: Any) -> str:
 def complete_outputs(model: Any, path: Path, inputs: Sequence[TensorSpec]) -> None:
     """Give outputs the axes that the file does not say, in place, as runs on drawn inputs show them.
 
-    An axis that has a name stays free.
+    An axis that is named as a free one of an input stays free.
 
     Args:
         model: A ``ModelProto``; its inputs have shapes.
@@ -62,7 +62,8 @@ def complete_outputs(model: Any, path: Path, inputs: Sequence[TensorSpec]) -> No
     Raises:
         GraphError: when ONNX Runtime refuses it, or fails.
     """
-    unknown = [value for value in model.graph.output if not _is_said(value)]
+    free = {axis for tensor in inputs for axis in tensor.shape if isinstance(axis, str)}
+    unknown = [value for value in model.graph.output if not _is_said(value, free)]
     if not unknown:
         return
     save(model, path)
@@ -71,7 +72,7 @@ def complete_outputs(model: Any, path: Path, inputs: Sequence[TensorSpec]) -> No
         runs = [session.run(_drawn(inputs, length)) for length in LENGTHS]
     for value in unknown:
         shapes = [tuple(run[value.name].shape) for run in runs]
-        _put_axes(value.type.tensor_type.shape, shapes)
+        _put_axes(value.type.tensor_type.shape, shapes, free)
 
 
 def _drawn(inputs: Sequence[TensorSpec], length: int) -> dict[str, Any]:
@@ -82,18 +83,18 @@ def _drawn(inputs: Sequence[TensorSpec], length: int) -> dict[str, Any]:
     return ObservationEncoder(spec, Path())(random_observations(spec, 1, seed=length)[0])
 
 
-def _is_said(value: Any) -> bool:
+def _is_said(value: Any, free: Set[str]) -> bool:
     shape = value.type.tensor_type
     return bool(shape.HasField("shape")) and all(
-        axis.HasField("dim_param") or axis.HasField("dim_value") for axis in shape.shape.dim
+        axis.dim_param in free or axis.HasField("dim_value") for axis in shape.shape.dim
     )
 
 
-def _put_axes(shape: Any, seen: list[tuple[int, ...]]) -> None:
+def _put_axes(shape: Any, seen: list[tuple[int, ...]], free: Set[str]) -> None:
     if not shape.dim:
         for _ in seen[0]:
             shape.dim.add()
     shape.SetInParent()
     for axis, lengths in zip(shape.dim, zip(*seen, strict=True), strict=True):
-        if not axis.dim_param and not axis.HasField("dim_value") and len(set(lengths)) == 1:
+        if axis.dim_param not in free and not axis.HasField("dim_value") and len(set(lengths)) == 1:
             axis.dim_value = lengths[0]

@@ -2,69 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pydantic import Field
-
-from vlatool.bundle.bundle import Bundle, seal
-from vlatool.bundle.manifest import Graph, Manifest
-from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.data import observations_for
-from vlatool.errors import GraphError, InputError, SourceError, require, suggest
-from vlatool.graph.files import save
-from vlatool.graph.float32_conversion import ROUNDING, as_float32, describe_conversion
-from vlatool.graph.layers import MIN_OPSET
-from vlatool.graph.onnx_graph import type_name
-from vlatool.graph.random_ops import refuse_random_file
-from vlatool.machine.engine_calls import REMEDY, engine_call
-from vlatool.module.description import FILE, Description, copy_assets, read_description
-from vlatool.module.source import Source
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import SourceError
+from vlatool.module.description import FILE, Description
 from vlatool.registry import Claim
-from vlatool.runtime.engine import engine_class
-from vlatool.runtime.observation import ObservationEncoder
-from vlatool.runtime.policy import relative_error
-from vlatool.runtime.program import Program
-from vlatool.sources._onnx_axes import axes_text, fix_axes, opset_of, shapes_from, with_opset
-from vlatool.sources._onnx_batch import add_batch_axes
-from vlatool.sources._onnx_ends import complete_outputs, refuse_types
-from vlatool.sources._onnx_files import refuse_bare
-from vlatool.sources._onnx_plain import plain
-from vlatool.stage.base import Context, Result
-from vlatool.stage.finish import SEED, finish
-from vlatool.stage.precision_shares import count_shares
-from vlatool.stage.record import made_by
+from vlatool.sources._graph_source import GraphSource
+from vlatool.sources._onnx_files import load_onnx, refuse_bare
+from vlatool.sources._onnx_operators import refuse_operators
+from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
     from vlatool.hardware.profile import Profile
 
-WHERE_MADE = "fix the file where it was made; onnx.checker.check_model(FILE, full_check=True) may say more"
 
-TOLERANCE = 1e-3
-"""Largest relative L2 difference between a file and what it was converted to."""
-SAMPLES = 32
-"""Observations on which a file and what it was converted to are compared."""
-
-
-class OnnxFile(Source):
+class OnnxFile(GraphSource):
     """A policy that is one ONNX file; the spec comes from a description, or from the file's inputs and outputs."""
 
-    packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
     needs: ClassVar[str] = "a .onnx file"
-
-    model: Path = Field(description="the ONNX file; external data is found beside it")
-    policy: Path | None = Field(
-        None, description="policy.yaml with spec and assets; the file's own shapes when not given"
-    )
-    opset: int | None = Field(None, ge=7, le=23, description="convert the default ONNX domain to this opset")
-    shape: tuple[str, ...] = Field((), description="lengths of free axes: NAME=1,3,224,224")
-    control_hz: float = Field(10.0, gt=0, description="rate of the control loop when there is no policy.yaml, in Hz")
 
     @classmethod
     def claims(cls, typed: str) -> Claim:
@@ -77,224 +36,17 @@ class OnnxFile(Source):
     @classmethod
     def of(cls, typed: str) -> Self:
         """Return the stage for a .onnx file; point out the file where a directory holds one."""
-        path = Path(typed)
-        if path.is_dir():
+        if (path := Path(typed)).is_dir():
             refuse_bare(path)
-        beside = path.parent / FILE
-        return cls(model=path, policy=beside if beside.is_file() else None)
-
-    def describe(self) -> Description | None:
-        """Read the ``policy.yaml`` beside the file, if there is one."""
-        return replace(read_description(self.policy), graphs={"main": self.model}) if self.policy else None
-
-    def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
-        """Convert to the opset of the record and take its shapes, where it has them."""
-        options = entry.get("options", {})
-        opset, shape = options.get("opset"), options.get("shape")
-        update = {"opset": opset} if isinstance(opset, int) else {}
-        return self.model_copy(update=update | ({"shape": tuple(shape)} if isinstance(shape, list) else {}))
+        return super().of(typed)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The file exists."""
         if not self.model.is_file():
             raise SourceError(f"No such ONNX file: {self.model}.", "check the path")
 
-    def inputs(self) -> tuple[Path, ...]:
-        """The model, its external data and what the description names."""
-        beside = sorted(self.model.parent.glob(self.model.name + "*"))
-        if (described := self.describe()) is None:
-            return tuple(beside)
-        return (*beside, *described.recordings().values(), *described.read_from, *described.assets())
-
-    def run(self, source: Bundle | None, out: Path, context: Context) -> Result:
-        """Load the file, store it, and run it once."""
-        model = plain(_load(self.model))
-        if (description := self.describe()) is not None:
-            _check_program(description)
-        changes = self._prepare(model, description, context)
-        (out / "graphs").mkdir()
-        file = out / "graphs/main.onnx"
-        if description is None:
-            with _named_after(self.model, file):
-                complete_outputs(model, file, _tensors(model.graph.input))
-        described = description or self._described(model)
-        _check_names(model, described.spec)
-        refuse_random_file(model, self.model)
-        copy_assets(described, out)
-        manifest = described.manifest()
-        options = {"opset": self.opset, "shape": list(self.shape)}
-        given = {name: value for name, value in options.items() if value}
-        recorded = {**made_by(self), "options": {"model": self.model.name, **given}}
-        with _named_after(self.model, file):
-            opset, stored = self._store(model, out, manifest, changes)
-            observations = observations_for(Bundle(out, manifest), 2)
-            shares, uncounted = count_shares(file)
-            graphs = {"main": Graph("graphs/main.onnx", shares, opset)}
-            made = finish(Bundle(out, manifest), out, made_by=recorded, graphs=graphs, observations=observations)
-            return Result(made, (*changes.messages, *stored, *uncounted))
-
-    def _prepare(self, model: Any, description: Description | None, context: Context) -> _Changes:
-        """Bring types and axes into the form that stages take, in place."""
-        refuse_types(model, described=description is not None)
-        if description is not None and self.shape:
-            raise SourceError(
-                f"--shape is given, and {self.policy} says the shapes of all inputs.",
-                "leave --shape out, or change them there",
-            )
-        gone = as_float32(model)
-        declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
-        fixed = axes_text(fix_axes(model, declared or shapes_from(self.shape), declared is not None, str(self.model)))
-        further = [] if description else add_batch_axes(model, opset_of(model))
-        if further:
-            axes = f"{', '.join(further)} of the file have no batch axis: one of 1 is put in front"
-            fixed = f"{fixed}; {axes}" if fixed else axes
-        if fixed:
-            context.progress(fixed, None)
-        tolerance = max(TOLERANCE, *(ROUNDING.get(kind, 0) for kind in gone), 0)
-        return _Changes(further, tolerance, (describe_conversion(gone),) if gone else ())
-
-    def _store(self, model: Any, out: Path, manifest: Manifest, changes: _Changes) -> tuple[int, tuple[str, ...]]:
-        """Write the graph, in the opset that is asked for or that stages need; return its opset, and what was done.
-
-        Raises:
-            GraphError: when ONNX Runtime refuses it.
-            SourceError: when it cannot be converted, or computes something else than the file.
-        """
-        opset, file = opset_of(model), out / "graphs/main.onnx"
-        wanted = self.opset or max(opset, MIN_OPSET if opset else 0)
-        save(model, file)
-        before, unbatched = self._before(file, changes.further)
-        stays: tuple[str, ...] = ()
-        if wanted != opset:
-            try:
-                save(with_opset(model, wanted), file)
-                self._compare(before, unbatched, out, manifest, changes.tolerance)
-                return wanted, (f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations",)
-            except InputError as error:
-                if self.opset:
-                    raise
-                words = f"opset {opset} stays, in which nothing can be quantized to int8 ({MIN_OPSET} or later): "
-                stays = (f"{words}{error.message}",)
-                save(model, file)
-        self._compare(before, unbatched, out, manifest, changes.tolerance)
-        return opset, stays
-
-    def _before(self, file: Path, further: list[str]) -> tuple[Any, list[str]]:
-        """Open the file itself, or where ONNX Runtime refuses it what is written of it; and what has no batch axis."""
-        for path, unbatched in ((self.model, further), (file, [])):
-            try:
-                with engine_call(engine_class(), f"opened {path.name}"):
-                    return engine_class()(path, threads=1), unbatched
-            except GraphError:
-                if path == file:
-                    raise
-        raise AssertionError
-
-    def _described(self, model: Any) -> Description:
-        inputs, outputs = _tensors(model.graph.input), _tensors(model.graph.output)
-        rows = math.prod(axis for axis in outputs[0].shape[:-1] if isinstance(axis, int)) if outputs else 1
-        spec = PolicySpec(inputs, outputs, self.control_hz, chunk=rows, execute=1 if rows > 1 else 0)
-        return Description(self.model.parent, self.model.stem, "0.0.0", spec)
-
-    def _compare(self, before: Any, unbatched: list[str], out: Path, manifest: Manifest, tolerance: float) -> None:
-        """Compare the stored graph with a session of the file, which has no batch axis in some tensors.
-
-        Raises:
-            SourceError: when ONNX Runtime computes something else.
-        """
-        with engine_call(engine_class(), "opened main.onnx"):
-            after = engine_class()(out / "graphs/main.onnx", threads=1)
-        programs = [Program(manifest.program, {"main": session}, SEED) for session in (before, after)]
-        encode = ObservationEncoder(manifest.spec, out / "assets")
-        for observation in observations_for(seal(out, manifest), SAMPLES):
-            feeds = encode(observation)
-            as_before = {name: value[0] if name in unbatched else value for name, value in feeds.items()}
-            expected, got = (
-                program.run(inputs) for program, inputs in zip(programs, (as_before, dict(feeds)), strict=True)
-            )
-            for tensor in manifest.spec.outputs:
-                error = relative_error(got[tensor.name], expected[tensor.name])
-                if not error <= tolerance:
-                    raise SourceError(
-                        f"Converted, '{tensor.name}' of the ONNX file is another one: relative L2 error {error:.3g}, "
-                        f"allowed {tolerance:g}.",
-                        "leave --opset out, or export the file again where it was made",
-                    )
-
-
-@dataclass(frozen=True)
-class _Changes:
-    """What was done to a file.
-
-    Args:
-        further: Inputs and outputs that were given a batch axis.
-        tolerance: Relative L2 difference that this may make.
-        messages: Sentences on it.
-    """
-
-    further: list[str]
-    tolerance: float = TOLERANCE
-    messages: tuple[str, ...] = ()
-
-
-def _check_program(described: Description) -> None:
-    """Refuse a program that runs another graph than the one that an ONNX file is."""
-    further = next((step.graph for step in described.program if step.graph != "main"), None)
-    if further is not None:
-        raise SourceError(
-            f"The program in {described.read_from[0]} runs the graph '{further}'; a policy that is one ONNX file only "
-            "has the graph 'main'.",
-            "write graph: main in each step, or leave the program out",
-        )
-
-
-def _load(path: Path) -> Any:
-    onnx = require("onnx", "build")
-    try:
-        model = onnx.load(str(path))
-    except Exception as error:  # the seam: protobuf and onnx raise many foreign types
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-        raise SourceError(f"{path} is not a readable ONNX file: {reason}.", WHERE_MADE) from error
-    if not model.graph.node:
-        raise SourceError(f"{path} is not an ONNX model: its graph has no nodes.", WHERE_MADE)
-    return model
-
-
-def _tensors(values: Iterable[Any]) -> tuple[TensorSpec, ...]:
-    return tuple(_tensor(value) for value in values)
-
-
-def _tensor(value: Any) -> TensorSpec:
-    kind = value.type.tensor_type
-    axes = [axis.dim_value if axis.HasField("dim_value") else (axis.dim_param or "n") for axis in kind.shape.dim]
-    if axes and isinstance(axes[0], str):
-        axes[0] = 1
-    if math.prod(axis for axis in axes if isinstance(axis, int)) < 1:
-        raise SourceError(
-            f"'{value.name}' has the shape {axes}; each axis of a policy's tensors has a length of 1 or more.",
-            "export the file again where it was made, without what is empty",
-        )
-    return TensorSpec(value.name, tuple(axes), type_name(kind.elem_type))
-
-
-def _check_names(model: Any, spec: PolicySpec) -> None:
-    for tensors, values in ((spec.inputs, model.graph.input), (spec.outputs, model.graph.output)):
-        names = [value.name for value in values]
-        for tensor in tensors:
-            if tensor.name not in names:
-                raise SourceError(
-                    f"The ONNX file has no '{tensor.name}', which the spec names; {suggest(tensor.name, names)}.",
-                    "name inputs and outputs in policy.yaml as the file does",
-                )
-
-
-@contextlib.contextmanager
-def _named_after(model: Path, copy: Path) -> Iterator[None]:
-    """Report what is wrong with a copy by the user's own file: the copy is gone by the time they read it."""
-    try:
-        yield
-    except InputError as error:
-        error.message = error.message.replace(str(copy), str(model))
-        if error.fix == REMEDY.format(package=engine_class().package):  # it was not made by vlatool
-            error.fix = WHERE_MADE
-        raise
+    def read(self, description: Description | None, context: Context) -> tuple[Any, Any]:
+        """Load the file, whose operators must be known."""
+        model = load_onnx(self.model)
+        refuse_operators(model, self.model)
+        return model, None

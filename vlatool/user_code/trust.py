@@ -108,16 +108,33 @@ def require(folder: Path, runs: str) -> NamedFolder:
     )
 
 
-def trust(folder: Path) -> None:
-    """Remember that the code in a folder, as it is now, may run.
+def require_file(file: Path) -> None:
+    """Check that a file which may hold code was trusted by name: nobody sees what is in it by looking at it.
 
     Raises:
-        UsageError: when it is not a folder, or has too many files.
+        SourceError: when it was not, or has changed since.
+    """
+    where = str(file.resolve())
+    trusted = _read().get(where)
+    if trusted is None or trusted != hash_file(file):
+        why = "which you did not trust" if trusted is None else "which has changed since you trusted it"
+        raise SourceError(
+            f"Opening {file} may run code that is in it, {why}.",
+            f"if it comes from people whom you trust, run the command again with --trust {file}",
+        )
+
+
+def trust(folder: Path) -> None:
+    """Remember that the code in a folder, or in one file, as it is now, may run.
+
+    Raises:
+        UsageError: when there is no such thing, or it has too many files.
         OutputError: when it cannot be remembered.
     """
-    if not folder.is_dir():
-        raise UsageError(f"--trust {folder} is not a directory.", "name the directory of a policy")
-    trusted = {**_read(), str(folder.resolve()): content_hash(folder)}
+    if not folder.is_dir() and not folder.is_file():
+        raise UsageError(f"--trust {folder} is neither a directory nor a file.", "name the directory of a policy")
+    content = hash_file(folder) if folder.is_file() else content_hash(folder)
+    trusted = {**_read(), str(folder.resolve()): content}
     file = trust_file()
     draft = file.with_name(f".{file.name}.{os.getpid()}")
     try:
