@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from torch import nn
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.export.onnx import ExportOnnx
 from vlatool.graph.macs import COMPUTE
-from vlatool.module.torch_policy import torch_policy
+from vlatool.module.divergence import first_divergence
+from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
@@ -134,6 +136,29 @@ def test_what_follows_takes_the_graph_as_any_other(made, tmp_path: Path, stage):
     before, after = load(made[1].path, seed=0), load(changed.path, seed=0)
     observation = recorded_observations(made[0], 1)[0]
     assert relative_error(after.infer(observation).chunk, before.infer(observation).chunk) < 0.3
+
+
+@pytest.mark.parametrize("graph", ["step_once", "step"])
+def test_a_difference_in_either_part_is_found(made, tmp_path: Path, graph):
+    source, bundle = made
+    (modules, feeds), files = torch_feeds(source), dict[str, Path]()
+    for name in ("step_once", "step"):
+        model = onnx.load(bundle.file(bundle.manifest.graphs[name].file))
+        if name == graph:
+            largest = max(model.graph.initializer, key=lambda each: len(each.raw_data))
+            values = onnx.numpy_helper.to_array(largest)
+            largest.CopyFrom(onnx.numpy_helper.from_array(values * np.float32(1.5), largest.name))
+        files[name] = tmp_path / f"{name}.onnx"
+        onnx.save(model, files[name])
+    node = first_divergence(modules["step"], files["step"], feeds, 1e-3, [files["step_once"]])
+    assert node.startswith(("key_value/", "out/") if graph == "step_once" else "query/")
+
+
+def torch_feeds(source: Bundle) -> tuple[dict[str, nn.Module], dict[str, np.ndarray]]:
+    """Return the modules, and what the step is given first."""
+    random = np.random.default_rng(0)
+    shapes = {"x": (1, 4, 2), "t": (1,), "context": (1, 6, 32)}
+    return load_modules(source), {name: random.normal(size=shape).astype("f4") for name, shape in shapes.items()}
 
 
 def test_two_exports_give_equal_bytes(made, tmp_path: Path):

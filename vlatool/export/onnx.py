@@ -210,8 +210,10 @@ class ExportOnnx(Transform):
         modules = load_modules(source)
         sessions = {step.graph: TorchSession(modules[step.graph], step) for step in source.manifest.program}
         self._actions(source, sessions, [observation])
+        files = {name: exported.path / graph.file for name, graph in exported.manifest.graphs.items()}
+        order = [step.graph for step in exported.manifest.program]
         for name, session in sessions.items():
-            file = exported.path / exported.manifest.graphs[name].file
-            if node := first_divergence(session.module, file, session.first_feeds or {}, tolerance):
+            before = [files[once] for once in order[: order.index(name)][-1:] if once not in sessions]
+            if node := first_divergence(session.module, files[name], session.first_feeds or {}, tolerance, before):
                 return f"; they differ from the node '{node}' of the graph '{name}' on"
         return ""
