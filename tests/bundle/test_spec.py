@@ -204,6 +204,7 @@ def test_an_input_may_hold_several_moments():
         ({"history": 2, "shape": [2]}, "history 2"),
         ({"history": 2, "shape": []}, "history 2"),
         ({"shape": [1, 2, "n"]}, "history and the dynamic shape"),
+        ({"image": {"frame": "rgb", "layout": "hwc", "camera": [8, 8]}}, "history and an image"),
         ({"shape": [1, 2], "kind": "text", "tokenizer": "w.json", "max_tokens": 2}, "history 2 and, as text"),
     ],
 )

@@ -81,6 +81,7 @@ LINES = {
     "profiles validate": "raspberry-pi-5",
     "profiles new": "mine -o {out}.yaml",
     "profiles calibrate": "raspberry-pi-5 --from {report}",
+    "new": "{out} --from {bundle}/graphs/main.onnx",
     "samples list": "",
     "samples make": "vit-s -o {out}",
 }
@@ -246,6 +247,7 @@ BAD = {
     "profiles validate": "{file}",
     "profiles new": "mine --from no-board -o {out}",
     "profiles calibrate": "raspberry-pi-5 --from {nothing}",
+    "new": "{out} --from {nothing}",
     "samples make": "no-sample -o {out}",
 }
 """Command -> a command line of it that names what is not there."""

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from vlatool.bundle.bundle import Bundle, replace_manifest
+from vlatool.bundle.image import Image
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import PolicySpec, TensorSpec
@@ -106,6 +107,10 @@ COMPARED: dict[str, tuple[Change, str]] = {
     "TensorSpec.mode": (tensor("outputs", 0, mode="absolute"), "mode 'absolute'"),
     "TensorSpec.max_tokens": (text_input(max_tokens=1), "max_tokens 1 in the candidate"),
     "TensorSpec.finite": (float_input(finite=False), "finite False in the candidate, True in the baseline"),
+    "TensorSpec.image": (
+        tensor("inputs", 0, image=Image(frame="bgr", layout="hwc", camera=(8, 8))),
+        "frame 'bgr' in the candidate, '' in the baseline",
+    ),
     "TensorSpec.history": (tensor("inputs", 0, history=8), "history 8 in the candidate, 0 in the baseline"),
     "PolicySpec.inputs": (
         lambda before: spec(inputs=(*before.spec.inputs, TensorSpec("gripper", (1, 1))))(before),

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.image import Image, ImageStep
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import BundleError, DataError, GraphError
 from vlatool.gate.claims.accuracy import Accuracy
@@ -31,6 +32,18 @@ def test_statistics_vocabulary_and_cuts_of_the_program_may_differ(float_bundle: 
     )
     spec = replace(float_bundle.manifest.spec, inputs=inputs)
     check(changed(float_bundle, program=(first, step), spec=spec), float_bundle, GATE)
+
+
+def test_what_becomes_of_a_frame_may_differ(float_bundle: Bundle) -> None:
+    first, *others = float_bundle.manifest.spec.inputs
+    mine, theirs = (
+        changed(float_bundle, spec=replace(float_bundle.manifest.spec, inputs=(replace(first, image=image), *others)))
+        for image in (
+            Image(layout="hwc", steps=(ImageStep("resize", (8, 8)),)),
+            Image(layout="hwc", like="opencv", steps=(ImageStep("crop", (8, 8)),)),
+        )
+    )
+    check(mine, theirs, GATE)
 
 
 def test_all_of_a_chunk_may_be_said_in_two_ways(float_bundle: Bundle) -> None:

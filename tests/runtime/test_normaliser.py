@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ from vlatool.bundle.spec import NORMALISATIONS, STATISTICS_OF, TensorSpec
 from vlatool.errors import SpecError
 from vlatool.runtime.statistics import load_normaliser
 
-ROWS = {"mean": [1, 2], "std": [2, 4], "min": [-1, 0], "max": [3, 10], "q01": [0, 1], "q99": [4, 9]}
+ROWS = {"mean": [1, 2], "std": [2, 4], "min": [-1, 0], "max": [3, 10], "q01": [0, 1], "q99": [4, 9],
+        "q10": [1, 2], "q90": [3, 8]}  # fmt: skip
 
 
 def load(folder: Path, normalisation: str, table: object = None, where: str = "stats.json#state"):
@@ -26,7 +28,10 @@ def test_mean_and_std(tmp_path: Path):
     np.testing.assert_array_equal(normaliser.forward(np.array([[3.0, -2.0]], np.float32)), [[1.0, -1.0]])
 
 
-@pytest.mark.parametrize(("normalisation", "low", "high"), [("min_max", "min", "max"), ("quantiles", "q01", "q99")])
+@pytest.mark.parametrize(
+    ("normalisation", "low", "high"),
+    [("min_max", "min", "max"), ("quantiles", "q01", "q99"), ("quantile10", "q10", "q90")],
+)
 def test_ranges_map_to_minus_one_and_one(tmp_path: Path, normalisation, low, high):
     normaliser = load(tmp_path, normalisation)
     ends = np.array([ROWS[low], ROWS[high]], np.float32)
@@ -41,6 +46,48 @@ def test_inverse_undoes_forward_and_stays_float32(tmp_path: Path, normalisation)
     normalised = normaliser.forward(physical)
     assert normalised.dtype == np.float32
     np.testing.assert_allclose(normaliser.inverse(normalised), physical, rtol=1e-5, atol=1e-6)
+
+
+STILL = {"mean": [1, 7], "std": [2, 0], "min": [-1, 7], "max": [3, 7], "q01": [0, 7], "q99": [4, 7], "q10": [1, 7],
+         "q90": [3, 7]}  # fmt: skip
+EPSILON = 1e-8
+
+
+def lerobot(mode: str, values, *, back: bool):
+    """The arithmetic of LeRobot 0.6 (``processor/normalize_processor.py``) in float32."""
+    first, second = (np.array(STILL[key], np.float32) for key in STATISTICS_OF[mode])
+    epsilon = np.float32(EPSILON)
+    if mode == "mean_std":
+        return values * second + first if back else (values - first) / (second + epsilon)
+    span = np.where(second == first, epsilon, second - first)
+    return (values + 1) / 2 * span + first if back else 2 * (values - first) / span - 1
+
+
+@pytest.mark.parametrize("mode", NORMALISATIONS[1:])
+def test_with_an_epsilon_a_joint_that_never_moved_is_as_in_lerobot(tmp_path: Path, mode: str):
+    (tmp_path / "stats.json").write_text(json.dumps({"state": STILL}))
+    tensor = TensorSpec("state", (1, 2), normalisation=mode, statistics="stats.json#state", epsilon=EPSILON)
+    normaliser = load_normaliser(tensor, tmp_path)
+    assert normaliser is not None
+    for physical in ([[2.5, 7]], [[-3, 7.5]], [[0, -7]]):
+        row = np.array(physical, np.float32)
+        wanted = lerobot(mode, row, back=False)
+        np.testing.assert_allclose(normaliser.forward(row), wanted, rtol=1e-6)
+        np.testing.assert_allclose(normaliser.forward_row(row[0].tolist()), wanted, rtol=1e-6)
+    for normalised in ([[0.5, 0]], [[-1, -1]], [[2, 3]]):
+        row = np.array(normalised, np.float32)
+        np.testing.assert_allclose(normaliser.inverse(row), lerobot(mode, row, back=True), rtol=1e-6)
+    with pytest.raises(SpecError, match=r"no spread in the elements \[1\]") as caught:
+        load_normaliser(replace(tensor, epsilon=0), tmp_path)
+    assert "epsilon: 1e-8" in caught.value.fix
+
+
+@pytest.mark.parametrize("epsilon", [-1e-8, 1, float("nan"), float("inf"), "1e-8", True, None])
+def test_an_impossible_epsilon_is_refused(epsilon):
+    with pytest.raises(SpecError, match="epsilon"):
+        TensorSpec("state", (1, 2), normalisation="mean_std", statistics="s.json#x", epsilon=epsilon)
+    with pytest.raises(SpecError, match="above 0 with a normalisation"):
+        TensorSpec("state", (1, 2), epsilon=1e-8)
 
 
 def test_a_missing_file_is_never_identity_in_silence(tmp_path: Path):

@@ -14,7 +14,8 @@ from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values, to_json
 from vlatool.files.validate import finite_number, integer, mapping, path_problem, sequence, short_repr, text
 
-SCHEMA = 1
+SCHEMA = 2
+"""The newest version; a manifest has the first one that has all that it says, so that older readers take it."""
 GOLDEN_TOLERANCE = 0.05
 """Allowed relative L2 difference from the golden action if the manifest does not set one."""
 COMPUTES = ("", "float32", "bfloat16")
@@ -88,7 +89,7 @@ class Manifest:
         description: one sentence.
         license: SPDX identifier of the policy's licence.
         engine: engine that the graphs were made for; ONNX Runtime on the CPU when empty.
-        schema: version of this format.
+        schema: version of this format: 2 with an ``image``, an ``epsilon`` or ``quantile10``, else 1.
     """
 
     name: str
@@ -111,9 +112,10 @@ class Manifest:
     description: str = ""
     license: str = ""
     engine: str = ""
-    schema: int = SCHEMA
+    schema: int = 1
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "schema", max(self.schema, self.spec.schema))
         check_limit("files", len(self.files), "The manifest", BundleError)
         check_limit("graphs", len(self.graphs), "The manifest", BundleError)
         for path in (*self.files, *(graph.file for graph in self.graphs.values())):
@@ -150,6 +152,11 @@ class Manifest:
                 raise BundleError(f"The manifest has no '{key}'.", "export the policy again")
         check_limit("files", len(values.get("files", ())), "The manifest", BundleError)
         values["spec"] = PolicySpec.from_dict(values["spec"])
+        if values["spec"].schema > values["schema"]:
+            raise BundleError(
+                f"The manifest has the schema {values['schema']}, but an 'image', 'epsilon' or 'quantile10', which "
+                f"begin with {values['spec'].schema}."
+            )
         values["graphs"] = {name: _graph(name, graph) for name, graph in values.get("graphs", {}).items()}
         values["program"] = program_from(values.get("program", []))
         values["build"] = _entries(values.get("build", ()), "build", ("stage",))

@@ -7,17 +7,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from vlatool.bundle.image import Image
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values, to_json
-from vlatool.files.validate import integer, path_problem, short_repr, text
+from vlatool.files.validate import finite_number, integer, path_problem, short_repr, text
 
 DTYPES = (
     "float32", "float16", "int64", "int32", "uint8", "bool", "float64", "int8", "int16", "uint16", "uint32", "uint64",
 )  # fmt: skip
 KINDS = ("tensor", "text", "discrete")
-NORMALISATIONS = ("none", "mean_std", "min_max", "quantiles")
-STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99")}
+STATISTICS_OF = {
+    "none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99"),
+    "quantile10": ("q10", "q90"),
+}  # fmt: skip
+NORMALISATIONS = tuple(STATISTICS_OF)
 MODES = ("", "delta", "absolute", "velocity", "relative")
 MAX_INDICES = 2**18
 """Most labels that are generated for a discrete output without labels: more than any token vocabulary has."""
@@ -42,12 +46,16 @@ class TensorSpec:
         labels: names of the elements of the last axis; the indices for a discrete output without names.
         mode: way in which a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
         normalisation: mapping from physical values to the graph's values, and back for outputs: ``none``, ``mean_std``,
-            ``min_max`` or ``quantiles``.
+            ``min_max``, ``quantiles`` or ``quantile10``.
         statistics: ``file#key`` of the statistics that the normalisation needs; file relative to the assets.
         tokenizer: file of the tokenizer, relative to the assets (``kind: text``).
         max_tokens: number of ids that the tokenizer pads or cuts to (``kind: text``).
         finite: False for a float input in which the policy itself handles NaN and infinity, such as missing returns in
             a depth image; in any other input they are refused.
+        image: what a camera frame becomes before the network: the observation then holds a raw frame, uint8 (H, W, C)
+            or (H, W) of any size; None for an input that is given as the graph sees it.
+        epsilon: added to a std on the way in, and put for a range of 0, as LeRobot does with 1e-8: an element that
+            never moved in training then has statistics, too. 0 refuses it.
         history: number of moments that the second axis of an input holds, oldest first, from 2; 0 for an input of one
             moment. The robot gives one moment at each control step, and the runtime keeps the last ones.
     """
@@ -64,17 +72,25 @@ class TensorSpec:
     tokenizer: str = ""
     max_tokens: int = 0
     finite: bool = True
+    image: Image | None = None
+    epsilon: float = 0.0
     history: int = 0
 
     def __post_init__(self) -> None:
         self._check_words()
         self._check_shape()
-        self._check_kind()
         self._check_history()
+        self._check_kind()
         if self.normalisation != "none" and "#" not in self.statistics:
             raise SpecError(
                 f"'{self.name}' is normalised by {self.normalisation}, but 'statistics' is '{self.statistics}'.",
                 "name the statistics as FILE#KEY, for example statistics.json#proprio",
+            )
+        epsilon = finite_number(self.epsilon, f"The epsilon of '{self.name}'", SpecError)
+        if not 0 <= epsilon < 1 or (epsilon and self.normalisation == "none"):
+            raise SpecError(
+                f"'{self.name}' has epsilon {epsilon:g} and normalisation {self.normalisation}; allowed: 0 to 1, and "
+                "above 0 with a normalisation."
             )
         for file in self.assets():
             if reason := path_problem(file):
@@ -135,10 +151,28 @@ class TensorSpec:
                 f"'{self.name}' says finite: false, but is {'text' if self.kind == 'text' else self.dtype}.",
                 "leave it out: NaN and infinity are values of floats alone",
             )
+        if self.image is not None:
+            self._check_image(self.image)
+
+    def _check_image(self, image: Image) -> None:
+        if not isinstance(image, Image):
+            raise SpecError(f"'{self.name}' has image {short_repr(image)}; it must be a mapping.")
+        if self.kind != "tensor" or self.normalisation != "none" or not self.finite:
+            raise SpecError(
+                f"'{self.name}' is an image of kind {self.kind}, normalisation {self.normalisation} and finite: "
+                f"{str(self.finite).lower()}; an image is a finite tensor with a mean and std of its own.",
+                "leave those out; write mean and std into 'image'",
+            )
+        image.check_input(self.name, self.shape, self.dtype)
 
     def _check_history(self) -> None:
         if not integer(self.history, f"The history of '{self.name}'", SpecError):
             return
+        if self.image is not None:
+            raise SpecError(
+                f"'{self.name}' has a history and an image; frames with a history are given as the graph takes them.",
+                "leave the image out, and scale the frames in forward()",
+            )
         if self.kind != "tensor" or self.history < 2 or self.shape[1:2] != (self.history,):
             raise SpecError(
                 f"'{self.name}' has the history {self.history} and, as {self.kind}, the shape {list(self.shape)}; the "
@@ -178,6 +212,24 @@ class TensorSpec:
         return self.unit if isinstance(self.unit, tuple) else (self.unit,) * self.width
 
     @property
+    def observation(self) -> TensorSpec:
+        """The input as observations have it: where it is an image, a frame of the camera."""
+        if self.image is None:
+            return self
+        shape = (1, *self.image.frame_shape(self.shape))
+        return replace(self, shape=shape, dtype="uint8", image=None, unit="", labels=())
+
+    @property
+    def schema(self) -> int:
+        """The first version of the manifest that has all that this tensor says."""
+        return 2 if self.image or self.epsilon or self.history or self.normalisation == "quantile10" else 1
+
+    @property
+    def frame(self) -> str:
+        """Order of the channels of the frames that observations have, empty where they have none."""
+        return self.image.frame if self.image else ""
+
+    @property
     def gripper(self) -> int | None:
         """Index of the action's element whose label contains "grip"; None when there is none or more than one."""
         found = [index for index, label in enumerate(self.labels) if "grip" in label.lower()]
@@ -197,6 +249,8 @@ class TensorSpec:
             values.setdefault("shape", (1, values.get("max_tokens", 1)))
         if "name" not in values or not isinstance(values.get("shape"), tuple):
             raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {short_repr(values.get('shape'))}.")
+        if values.get("image") is not None:
+            values["image"] = Image.from_dict(values["image"])
         if values.get("kind") == "discrete":
             values.setdefault("labels", _indices(values["shape"]))
         return cls(**values)
@@ -247,6 +301,11 @@ class PolicySpec:
                     f"The output '{tensor.name}' says finite: false; a policy answers finite values.",
                     "leave it out there; it is for inputs",
                 )
+            if tensor.image is not None:
+                raise SpecError(
+                    f"The output '{tensor.name}' has an image; only a frame of a camera has one.",
+                    "leave it out there; it is for inputs",
+                )
             if tensor.history:
                 raise SpecError(f"The output '{tensor.name}' has a history.", "leave it out there; it is for inputs")
         if not self.action.shape:
@@ -259,6 +318,11 @@ class PolicySpec:
         check_limit("elements", self.chunk, "chunk", SpecError)
         if integer(self.execute, "execute", SpecError) > self.chunk:
             raise SpecError(f"chunk is {self.chunk!r} and execute {self.execute!r}; allowed: 1 <= execute <= chunk.")
+
+    @property
+    def schema(self) -> int:
+        """The first version of the manifest that has all that this spec says."""
+        return max(tensor.schema for tensor in (*self.inputs, *self.outputs))
 
     @property
     def action(self) -> TensorSpec:

@@ -19,9 +19,11 @@ from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPT_CODE, Failure, failu
 from vlatool.cli._process_server import start_early
 from vlatool.errors import refuse_two_distributions
 from vlatool.files.printable import printable
+from vlatool.machine.host import LEROBOT_PYTHON
 from vlatool.machine.version import VERSION
 from vlatool.user_code import trust
 
+ROOT_OPTIONS = ("--trust", "--python")
 app = typer.Typer(
     name="vlatool",
     cls=Commands,
@@ -37,6 +39,12 @@ def _trust(folders: list[Path]) -> list[Path]:
     for folder in folders:
         trust.trust(folder)
     return folders
+
+
+def _other_python(path: Path | None) -> Path | None:
+    if path is not None:
+        os.environ[LEROBOT_PYTHON] = str(path)
+    return path
 
 
 def _version(asked: bool) -> None:
@@ -56,6 +64,14 @@ def _root(
             "--trust",
             callback=lambda folders: _trust(folders or []),
             help="let a bundle run the code in this policy directory, now and later, until something in it changes",
+        ),
+    ] = None,
+    python: Annotated[
+        Path | None,
+        typer.Option(
+            "--python",
+            callback=_other_python,
+            help="Python that has the library of a checkpoint, such as LeRobot's; also $VLATOOL_LEROBOT_PYTHON",
         ),
     ] = None,
 ) -> None:
@@ -89,17 +105,17 @@ def _say(text: str, fix: str = "") -> None:
         typer.echo(f"{printable(text)}\n  fix: {printable(fix)}" if fix else printable(text), err=True)
 
 
-def _with_trust_first(arguments: list[str]) -> list[str]:
-    """Move ``--trust DIR`` to the front: it is an option of every command."""
+def _with_root_options_first(arguments: list[str]) -> list[str]:
+    """Move ``--trust DIR`` and ``--python PATH`` to the front: they are options of every command."""
     first: list[str] = []
     rest: list[str] = []
     words = iter(arguments)
     for word in words:
         if word == "--":
             rest += [word, *words]
-        elif word == "--trust":
-            first += [word, *[folder for folder in [next(words, None)] if folder is not None]]
-        elif word.startswith("--trust="):
+        elif word in ROOT_OPTIONS:
+            first += [word, *[value for value in [next(words, None)] if value is not None]]
+        elif word.startswith(tuple(f"{option}=" for option in ROOT_OPTIONS)):
             first.append(word)
         else:
             rest.append(word)
@@ -130,7 +146,7 @@ def main(arguments: list[str] | None = None) -> None:
     """
     _open_standard_files()
     _end_on_signals()
-    words = _with_trust_first(sys.argv[1:] if arguments is None else arguments)
+    words = _with_root_options_first(sys.argv[1:] if arguments is None else arguments)
     for_good = arguments is None
     if for_good:
         start_early(words)

@@ -47,6 +47,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "profiles validate": ("validated",),
     "profiles new": ("written",),
     "profiles calibrate": ("calibrated",),
+    "new": ("policy",),
     "samples list": ("samples",),
     "samples make": ("sample",),
 }
@@ -173,6 +174,10 @@ def _documents() -> dict[str, Schema]:
         "validated": document("Profiles by name, and what is wrong with others.", valid=many(TEXT), wrong=many(TEXT)),
         "calibrated": document("Measurements given to the latency model.", kept_in=TEXT, measured=many(ANY_OBJECT)),
         "written": document("Files that were written.", written=many(TEXT)),
+        "policy": document(
+            "A policy directory that was written; unknown: what nobody said.", policy=TEXT, source=TEXT,
+            unknown=many(TEXT),
+        ),
         "samples": many(record(name=TEXT, description=TEXT)),
         "sample": document("A policy that was written.", policy=TEXT, sample=TEXT, seed=INTEGER),
     }  # fmt: skip

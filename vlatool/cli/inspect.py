@@ -15,9 +15,10 @@ from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import UNKNOWN, TensorSpec
 from vlatool.cli._console import progress
 from vlatool.cli._document import document
-from vlatool.cli._options import BundlePath
+from vlatool.cli._frame import describe_image, show_frame
+from vlatool.cli._options import BundlePath, Force
 from vlatool.cli._proposal import propose
-from vlatool.errors import BundleError, GraphError
+from vlatool.errors import BundleError, GraphError, UsageError
 from vlatool.files.printable import printable
 from vlatool.files.verified_read import open_inside
 from vlatool.module.source import is_bundle
@@ -47,14 +48,30 @@ def inspect(
         float | None,
         typer.Option("--memory", min=1, help="MB that --probe may take; 2,000 and 8 times the graphs when not given"),
     ] = None,
+    frame: Annotated[
+        str,
+        typer.Option(
+            "--frame",
+            metavar="[INPUT=]FILE",
+            help="show what the network sees of a camera frame: a picture, or .npy as the camera gives it",
+        ),
+    ] = "",
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="PNG of --frame with what the network sees beside it")
+    ] = None,
+    force: Force = False,
 ) -> None:
     """Verify a bundle and show what is in it; of a policy, what its bundle would hold."""
+    if (output and not frame) or (as_json and frame):
+        wrong = "--json prints the manifest alone, and --frame" if frame else "--output is of --frame, which"
+        raise UsageError(f"{wrong} is {'given' if frame else 'missing'}.", "leave one of them out")
     opened = _opened(bundle)
     tried = try_once(opened.path, first_run_s=first_run, memory_mb=memory) if probe else None
     if as_json:
         document(opened.manifest.to_dict(), manifest_bytes(opened.manifest).decode())
     else:
-        for line in [*describe(opened), *([] if tried is None else [_probed(tried)])]:
+        shown = show_frame(opened, frame, output, force=force) if frame else []
+        for line in [*describe(opened), *shown, *([] if tried is None else [_probed(tried)])]:
             typer.echo(printable(line))
     if tried is not None and tried["refused"]:
         raise GraphError(*tried["refused"])
@@ -141,6 +158,7 @@ def _tensor(tensor: TensorSpec) -> str:
             tensor.mode,
             tensor.normalisation.replace("none", ""),
             "" if tensor.finite else "takes NaN and infinity",
+            f"of {describe_image(tensor.image)}" if tensor.image else "",
             f"the last {tensor.history} moments" if tensor.history else "",
         )
         if part

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from vlatool.bundle.spec import UNKNOWN
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document
@@ -37,13 +38,15 @@ def new(
 ) -> None:
     """Make a policy directory of a file: a copy of it, and a policy.yaml to complete. Refuses one that exists."""
     from vlatool.sources import source_stage
-    from vlatool.sources._graph_source import GraphSource
     from vlatool.stage.run import cache_directory, cached_transform
     from vlatool.user_code import trust
 
     refuse_existing(policy, False, source, kind="")
-    stage = source_stage(source)
-    if stage.describe() is not None or not isinstance(stage, GraphSource):
+    stage: Any = source_stage(source)
+    if (converted := stage.converted_directory()) is not None:
+        _copy(converted, policy, control_hz, as_json, source)
+        return
+    if stage.describe() is not None:
         raise UsageError(f"{source} has a policy.yaml already.", "name it as it is: vlatool optimize SOURCE -o BUNDLE")
     stage = stage.model_copy(update={"shape": tuple(shape or ()), "control_hz": control_hz})
     stage.check(None, None)
@@ -53,7 +56,9 @@ def new(
     text = proposal(manifest, stage.model.name)
     with write_directory(policy) as draft:
         for path in stage.inputs():
-            (shutil.copytree if path.is_dir() else shutil.copyfile)(path, draft / path.name)
+            copy = draft / path.relative_to(stage.model.parent)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            (shutil.copytree if path.is_dir() else shutil.copyfile)(path, copy)
         if (assets := bundle.path / "assets").is_dir():
             shutil.copytree(assets, draft, dirs_exist_ok=True)
         (draft / "policy.yaml").write_text(text, encoding="utf-8")
@@ -61,6 +66,24 @@ def new(
         trust.trust(policy / stage.model.name)
     if as_json:
         document({"policy": str(policy), "source": source, "unknown": list(manifest.spec.unknown())})
+        return
+    typer.echo(text, nl=False)
+    typer.echo(f"{policy}: complete policy.yaml, then: vlatool optimize {policy} -o BUNDLE")
+
+
+def _copy(converted: Path, policy: Path, control_hz: float | None, as_json: bool, source: str) -> None:
+    """Write the directory that a checkpoint was converted into, with the rate that was given."""
+    from vlatool.module.description import FILE, read_description
+
+    with write_directory(policy) as draft:
+        shutil.copytree(converted, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*", "__pycache__"))
+        text = (draft / FILE).read_text(encoding="utf-8")
+        if control_hz is not None:
+            text = text.replace(f"control_hz: {UNKNOWN}", f"control_hz: {control_hz:g}")
+            (draft / FILE).write_text(text, encoding="utf-8")
+    if as_json:
+        unknown = list(read_description(policy).spec.unknown())
+        document({"policy": str(policy), "source": source, "unknown": unknown})
         return
     typer.echo(text, nl=False)
     typer.echo(f"{policy}: complete policy.yaml, then: vlatool optimize {policy} -o BUNDLE")

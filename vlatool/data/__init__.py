@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from vlatool.data._calibration_checks import calibration_checks as calibration_checks
+from vlatool.data._frame_files import picture_of as picture_of
+from vlatool.data._frame_files import read_frame as read_frame
+from vlatool.data._frame_files import write_beside as write_beside
 from vlatool.data._halves import halves as halves
 from vlatool.data._not_finite import takes_not_finite as takes_not_finite
 from vlatool.data._not_finite import with_not_finite as with_not_finite

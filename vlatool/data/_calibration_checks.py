@@ -40,7 +40,7 @@ def calibration_checks(
             f"all {len(numbers)} calibration samples of {recording.path} are identical; "
             "record different moments, or the ranges fit one of them alone"
         )
-    for tensor in spec.inputs:
+    for tensor in (each.observation for each in spec.inputs):
         where = f"'{tensor.name}' in {recording.path}"
         if tensor.dtype == "uint8":
             sentences += _of_pixels(where, recording, tensor.name, numbers)

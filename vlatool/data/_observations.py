@@ -83,7 +83,9 @@ def random_observations(
 ) -> list[dict[str, Any]]:
     """Return seeded random observations that fit a spec; its instructions are of ``words``: input -> vocabulary."""
     random = np.random.default_rng(seed)
-    drawn = [{each.name: _synthetic(each, random, words or {}) for each in spec.inputs} for _ in range(count)]
+    drawn = [
+        {each.name: _synthetic(each.observation, random, words or {}) for each in spec.inputs} for _ in range(count)
+    ]
     return with_not_finite(spec, drawn)
 
 

@@ -89,7 +89,8 @@ class Drawer:
     def _drawn(self, random: np.random.Generator, structured: Structures) -> dict[str, Any]:
         like = self._recorded(random) if self._recordings else {}
         values = {
-            tensor.name: self._value(tensor, like.get(tensor.name), random, structured) for tensor in self._inputs
+            tensor.name: self._value(tensor.observation, like.get(tensor.name), random, structured)
+            for tensor in self._inputs
         }
         if not takes_not_finite(self._spec):
             return values

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.image import Image
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError, suggest
 from vlatool.files.rows import Rows, blocks
@@ -169,7 +170,10 @@ def build_recording(
     for tensor in spec.inputs:
         if tensor.name not in arrays:
             raise DataError(f"{path} has no '{tensor.name}'; {suggest(tensor.name, arrays)}.", RECORD_ALL)
-        inputs[tensor.name] = _checked_input(path, tensor.moment, arrays[tensor.name], spec)
+        observed = _any_size(tensor.moment)
+        inputs[tensor.name] = _checked_input(path, observed, arrays[tensor.name], spec)
+        if tensor.image is not None:
+            _check_frames(f"'{tensor.name}' in {path}", tensor, tensor.image, inputs[tensor.name])
     actions, episodes = _in_memory(arrays, spec.action.name, "action"), _in_memory(arrays, "episode")
     lengths = {name: len(values) for name, values in inputs.items()}
     for name, recorded in (("action", actions), ("episode", episodes), ("times", times)):
@@ -222,7 +226,7 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
     if values.ndim == max(1, len(tensor.shape)) + 1 and values.shape[1] == 1:
         values = values.without_second_axis() if isinstance(values, Rows) else values[:, 0]
     if not _fits(tensor, values):
-        others = [other.name for other in spec.inputs if other.kind != "text" and _fits(other.moment, values)]
+        others = [one.name for one in spec.inputs if one.kind != "text" and _fits(_any_size(one.moment), values)]
         raise DataError(
             f"{where} has the shape {list(values.shape)}; wanted [N, {', '.join(map(str, tensor.shape[1:]))}].",
             f"it would fit '{others[0]}'; are the names swapped?" if others else RECORD_ALL,
@@ -231,6 +235,24 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
     if tensor.finite:
         _check_finite(where, values, f"{REPAIR}; where the policy handles them: finite: false in its spec")
     return values
+
+
+def _any_size(tensor: TensorSpec) -> TensorSpec:
+    """Return an input as recordings have it: frames of any size, where it is an image."""
+    if tensor.image is None:
+        return tensor
+    observed = tensor.observation
+    return replace(observed, shape=(1, "height", "width", *observed.shape[3:]))
+
+
+def _check_frames(where: str, tensor: TensorSpec, image: Image, values: Values) -> None:
+    """Refuse frames of a size of which no input can be made."""
+    height, width = values.shape[1:3]
+    if not image.makes((height, width), tensor.shape):
+        raise DataError(
+            f"{where} has frames of {height}x{width}, of which its image makes no input {list(tensor.shape)}.",
+            "let the image in the spec resize them (a step {op: resize, size: [HEIGHT, WIDTH]}), or record others",
+        )
 
 
 def _fits(tensor: TensorSpec, values: Values) -> bool:

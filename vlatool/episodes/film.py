@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import PolicySpec
 from vlatool.episodes.environment import GUIDE, World
 from vlatool.errors import DataError
+from vlatool.runtime.image import as_rgb
 
 RUN_AGAIN = "run the command again for the video; its episodes count as they are"
 
@@ -84,6 +85,7 @@ class Camera:
     def __init__(self, environment: Any, task: str, spec: PolicySpec) -> None:
         self._environment, self._name = environment, f"The environment of task '{task}'"
         self._images = images_of(spec)
+        self._orders = {tensor.name: tensor.frame for tensor in spec.inputs}
         self._renders: bool | None = None
         self._why = ""
 
@@ -127,6 +129,7 @@ class Camera:
     def _image(self, observation: Mapping[str, Any], name: str) -> Picture:
         """Return an image of an observation: the last one of a history."""
         value = np.asarray(observation[name]) if name in observation else np.zeros(0)
+        value = as_rgb(value, self._orders[name]) if self._orders.get(name) else value
         if value.ndim < 3 or not value.size or not is_picture(value.reshape(-1, *value.shape[-3:])[-1]):
             raise DataError(
                 f"{self._name} gives '{name}' as {_describe_array(value)}; a picture is uint8 (..., H, W, 3).", GUIDE
@@ -217,9 +220,10 @@ def _read(file: Path) -> NDArray[np.uint8]:
 
 
 def images_of(spec: PolicySpec) -> tuple[str, ...]:
-    """Return the names of the inputs that are images: uint8 (..., H, W, 3)."""
+    """Return the names of the inputs that are images: uint8 (..., H, W, 3), or frames of a camera."""
     images = (one for one in spec.inputs if one.kind == "tensor" and one.dtype == "uint8" and len(one.shape) > 3)
-    return tuple(one.name for one in images if one.shape[-1] == 3)
+    plain = {one.name for one in images if one.shape[-1] == 3}
+    return tuple(one.name for one in spec.inputs if one.frame or one.name in plain)
 
 
 def is_picture(value: NDArray[Any]) -> bool:

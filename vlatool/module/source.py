@@ -57,6 +57,10 @@ class Source(Transform):
         described = self.describe()
         return described is None or bool(described.graphs)
 
+    def converted_directory(self) -> Path | None:
+        """Return the policy directory in the cache that a checkpoint was converted into; None where there is none."""
+        return None
+
     def described_by(self, description: Path) -> Self:
         """Return the same source with the ``policy.yaml`` that names it."""
         return self.model_copy(update={"policy": description})

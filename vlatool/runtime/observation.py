@@ -13,6 +13,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError
 from vlatool.runtime.assets import Assets, asset_path
 from vlatool.runtime.history import History
+from vlatool.runtime.image import FrameEncoder
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer, tokenizer_content
 
@@ -30,7 +31,7 @@ class EncodedObservation(dict[str, Array]):
 
 
 class ObservationEncoder:
-    """Checks an observation against the spec, normalises it and turns text into ids.
+    """Checks an observation against the spec, normalises it, turns frames into pictures of the network, text into ids.
 
     Args:
         assets: Directory of statistics and tokenizers, or the bundle that has them.
@@ -50,7 +51,8 @@ class ObservationEncoder:
         """Return one array with a batch axis for each input of the spec; those of an encoded observation as they are.
 
         Args:
-            observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
+            observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``;
+                a raw frame, uint8 (H, W, C) or (H, W), for an input with an ``image``.
 
         Raises:
             DataError: when an input is missing or has another shape or dtype, or holds what its dtype cannot hold, or
@@ -104,6 +106,8 @@ def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None)
         return _text_encoder(tensor, assets)
     if tensor.history and history is not None:
         return _moment_encoder(tensor, assets, history)
+    if tensor.image is not None:
+        return _frame_encoder(tensor, FrameEncoder(tensor, tensor.image))
     dtype = np.dtype(tensor.dtype)
     normaliser = load_normaliser(tensor, assets)
     checked = dtype.kind == "f" and tensor.finite
@@ -116,18 +120,7 @@ def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None)
     )
 
     def encode(value: Any) -> Array:
-        try:
-            array = value if isinstance(value, np.ndarray) else np.asarray(value)
-        except ValueError as error:
-            raise DataError(
-                f"The input '{tensor.name}' is not an array: its rows have different lengths.",
-                "give rows of one length",
-            ) from error
-        except Exception as error:  # the seam: numpy asks the object for an array, a tensor on a GPU has none
-            raise DataError(
-                f"The input '{tensor.name}' is a {type(value).__name__}, which cannot be converted to a numpy array.",
-                "pass numpy arrays; tensors as tensor.detach().cpu().numpy()",
-            ) from error
+        array = value if isinstance(value, np.ndarray) else _as_array(value, tensor)
         if array.dtype != dtype:
             array = _cast(array, dtype, tensor)
         shape = array.shape
@@ -143,6 +136,27 @@ def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None)
             return array
         normalised = normaliser.forward(array)
         return normalised if normalised.dtype == dtype else normalised.astype(dtype)
+
+    return encode
+
+
+def _as_array(value: Any, tensor: TensorSpec) -> Array:
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise DataError(
+            f"The input '{tensor.name}' is not an array: its rows have different lengths.", "give rows of one length"
+        ) from error
+    except Exception as error:  # the seam: numpy asks the object for an array, a tensor on a GPU has none
+        raise DataError(
+            f"The input '{tensor.name}' is a {type(value).__name__}, which cannot be converted to a numpy array.",
+            "pass numpy arrays; tensors as tensor.detach().cpu().numpy()",
+        ) from error
+
+
+def _frame_encoder(tensor: TensorSpec, encode_frame: FrameEncoder) -> Encoder:
+    def encode(value: Any) -> Array:
+        return encode_frame(value if isinstance(value, np.ndarray) else _as_array(value, tensor))
 
     return encode
 

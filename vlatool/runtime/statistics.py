@@ -20,27 +20,34 @@ Array = NDArray[np.float32]
 class Normaliser:
     """Maps physical values to normalised ones and back: ``normalised = (physical - offset) / scale``.
 
-    ``mean_std``: offset = mean, scale = std. ``min_max`` and ``quantiles`` map [low, high] to [-1, 1]:
-    offset = (low + high) / 2, scale = (high - low) / 2.
+    ``mean_std``: offset = mean, scale = std. ``min_max``, ``quantiles`` and ``quantile10`` map [low, high] to [-1, 1]:
+    offset = (low + high) / 2, scale = (high - low) / 2. With an epsilon, as LeRobot has it: a std is that much larger
+    on the way in alone, and an element whose low and high are equal has low = offset -> -1 and the scale epsilon / 2.
 
     Args:
         offset: float32 (A,), in the unit of the tensor.
         scale: float32 (A,), in the unit of the tensor.
+        inverse_scale: float32 (A,): scale on the way back, where it is another one.
+        at_offset: float32 (A,): what the offset becomes, where that is not 0.
     """
 
     offset: Array
     scale: Array
-    _rows: dict[tuple[int, ...], tuple[Array, Array]] = field(default_factory=dict, repr=False, compare=False)
+    inverse_scale: Array | None = None
+    at_offset: Array | None = None
+    _rows: dict[tuple[int, ...], tuple[Array, Array, Array]] = field(default_factory=dict, repr=False, compare=False)
 
     def forward(self, physical: Array) -> Array:
         """Physical to normalised, float32, any shape (..., A)."""
-        offset, scale = self._rows.get(physical.shape) or self._spread(physical.shape)
-        return (physical - offset) / scale
+        offset, scale, _ = self._rows.get(physical.shape) or self._spread(physical.shape)
+        normalised = (physical - offset) / scale
+        return normalised if self.at_offset is None else normalised + self.at_offset
 
     def forward_row(self, physical: list[float]) -> Array:
         """Physical to normalised for one short vector: A numbers to float32 (1, A), without numpy's arithmetic."""
         pairs = zip(physical, self._numbers, strict=True)
-        return np.array([[(value - offset) / scale for value, (offset, scale) in pairs]], np.float32)
+        row = np.array([[(value - offset) / scale for value, (offset, scale) in pairs]], np.float32)
+        return row if self.at_offset is None else row + self.at_offset
 
     @functools.cached_property
     def _numbers(self) -> list[tuple[float, float]]:
@@ -48,16 +55,18 @@ class Normaliser:
 
     def inverse(self, normalised: Array) -> Array:
         """Normalised to physical, float32, any shape (..., A)."""
-        offset, scale = self._rows.get(normalised.shape) or self._spread(normalised.shape)
-        return normalised * scale + offset
+        offset, _, scale = self._rows.get(normalised.shape) or self._spread(normalised.shape)
+        return (normalised if self.at_offset is None else normalised - self.at_offset) * scale + offset
 
-    def _spread(self, shape: tuple[int, ...]) -> tuple[Array, Array]:
-        """Return offset and scale of the full shape, kept: operands of one shape spare numpy the broadcasting.
+    def _spread(self, shape: tuple[int, ...]) -> tuple[Array, Array, Array]:
+        """Return offset, scale and inverse scale of the full shape, kept: it spares numpy the broadcasting.
 
         Right after an inference the processor's caches hold the network, and broadcasting then takes 20 us longer
         (``vlatool benchmark overhead``).
         """
-        operands = np.broadcast_to(self.offset, shape).copy(), np.broadcast_to(self.scale, shape).copy()
+        offset, scale = np.broadcast_to(self.offset, shape).copy(), np.broadcast_to(self.scale, shape).copy()
+        other = self.inverse_scale
+        operands = offset, scale, scale if other is None else np.broadcast_to(other, shape).copy()
         self._rows[shape] = operands
         return operands
 
@@ -75,14 +84,31 @@ def load_normaliser(tensor: TensorSpec, assets: Assets) -> Normaliser | None:
     high = _row(tensor, assets, second)
     with np.errstate(over="ignore"):
         offset, scale = (low, high) if first == "mean" else ((low + high) / 2, (high - low) / 2)
-    if not np.all(scale > 0):
+    without = scale <= 0 if not tensor.epsilon else scale < 0
+    if without.any():
         raise SpecError(
-            f"The statistics of '{tensor.name}' have no spread in the elements {np.flatnonzero(scale <= 0).tolist()}.",
-            "give those elements a positive std (or a wider range)",
+            f"The statistics of '{tensor.name}' have no spread in the elements {np.flatnonzero(without).tolist()}.",
+            "give those elements a positive std (or a wider range); of a joint that never moved, write epsilon: 1e-8, "
+            "as LeRobot has it",
         )
     if not np.isfinite([offset, scale]).all():
         raise SpecError(f"The statistics of '{tensor.name}' span more than float32 holds.", "repair the statistics")
-    return Normaliser(offset.astype(np.float32), scale.astype(np.float32))
+    return _normaliser(offset.astype(np.float32), scale.astype(np.float32), np.float32(tensor.epsilon), first == "mean")
+
+
+def _normaliser(offset: Array, scale: Array, epsilon: np.float32, deviations: bool) -> Normaliser:
+    """Return a normaliser with an epsilon.
+
+    Args:
+        deviations: whether scales are standard deviations, not halves of ranges.
+    """
+    if not epsilon:
+        return Normaliser(offset, scale)
+    if deviations:
+        return Normaliser(offset, scale + epsilon, inverse_scale=scale)
+    still = scale == 0
+    at_offset = np.where(still, np.float32(-1), np.float32(0)) if still.any() else None
+    return Normaliser(offset, np.where(still, epsilon / 2, scale).astype(np.float32), at_offset=at_offset)
 
 
 def _row(tensor: TensorSpec, assets: Assets, key: str) -> Array:

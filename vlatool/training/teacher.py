@@ -154,12 +154,12 @@ def _form(tensor: TensorSpec | None) -> str | None:
 
 def _check_units(name: str, teacher: tuple[TensorSpec, Bundle], student: tuple[TensorSpec, Bundle]) -> None:
     """Refuse what has the same form, and means something else."""
-    for what in (_unit, _statistics, _vocabulary):
+    for what in (_unit, _statistics, _vocabulary, _image):
         if what(*teacher) != what(*student):
             raise RecipeError(
                 f"The teacher and the student have another {(what.__doc__ or '').rstrip('.').lower()} for '{name}': "
                 "what one of them is given, or gives, means something else to the other.",
-                "take a teacher with the same units, statistics and tokenizer",
+                "take a teacher with the same units, statistics, tokenizer and image",
             )
 
 
@@ -177,6 +177,11 @@ def _statistics(tensor: TensorSpec, bundle: Bundle) -> Any:
 def _vocabulary(tensor: TensorSpec, bundle: Bundle) -> Any:
     """Vocabulary."""
     return bundle.manifest.files[f"{ASSETS}/{tensor.tokenizer}"].sha256 if tensor.tokenizer else ""
+
+
+def _image(tensor: TensorSpec, _bundle: Bundle) -> Any:
+    """Image."""
+    return tensor.image
 
 
 def _noise(bundle: Bundle) -> dict[str, str]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import VlatoolError
 from vlatool.runtime.interface import Array
 from vlatool.runtime.policy import Policy
@@ -178,8 +179,10 @@ def _changes(policy: Policy) -> Iterator[tuple[str, Change]]:
         if tensor.kind != "text" and tensor.normalisation != "none":
             words = f"The normalisation of '{name}' differs: the original takes it as it is, this policy with "
             yield words + f"{tensor.normalisation}.", _as_it_is(name)
-        if tensor.dtype == "uint8" and tensor.shape[-1] == 3:
-            yield f"The channels of '{name}' differ: with red and blue exchanged both are equal.", _mirror(name)
+        axis = _channels_axis(tensor)
+        if axis is not None:
+            words = f"The channels of '{name}' differ: with red and blue exchanged both are equal."
+            yield words, _mirror(name, axis)
     for index, one in enumerate(inputs):
         for other in inputs[index + 1 :]:
             if (one.shape, one.dtype) == (other.shape, other.dtype):
@@ -191,8 +194,15 @@ def _as_it_is(name: str) -> Change:
     return lambda sample: {**sample.encoded, name: _physical(sample, name)}
 
 
-def _mirror(name: str) -> Change:
-    return lambda sample: {**sample.encoded, name: np.ascontiguousarray(sample.encoded[name][..., ::-1])}
+def _channels_axis(tensor: TensorSpec) -> int | None:
+    """Return the axis of an image's three channels, None where it has none."""
+    if tensor.image is not None:
+        return len(tensor.shape) - 3 + tensor.image.layout.index("c") if len(tensor.image.channels) == 3 else None
+    return len(tensor.shape) - 1 if tensor.dtype == "uint8" and tensor.width == 3 else None
+
+
+def _mirror(name: str, axis: int) -> Change:
+    return lambda sample: {**sample.encoded, name: np.ascontiguousarray(np.flip(sample.encoded[name], axis))}
 
 
 def _exchange(one: str, other: str) -> Change:

@@ -1,0 +1,219 @@
+"""LeRobot checkpoints read as data: features, statistics, what is refused; tracing needs LeRobot itself.
+
+``tests/validation/foreign/lerobot_checkpoints.py`` traces real checkpoints with LeRobot and compares whole actions.
+"""
+
+import copy
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from vlatool.bundle.spec import TensorSpec
+from vlatool.errors import SourceError
+from vlatool.machine.host import LEROBOT_PYTHON
+from vlatool.registry import Claim
+from vlatool.runtime.statistics import load_normaliser
+from vlatool.sources import _lerobot_directory as directory
+from vlatool.sources._lerobot_checkpoint import EPS, read_checkpoint
+from vlatool.sources.lerobot import LerobotCheckpoint
+
+STATE = {"type": "STATE", "shape": [3]}
+CAMERA = {"type": "VISUAL", "shape": [3, 8, 12]}
+ACTION = {"type": "ACTION", "shape": [2]}
+NORMS = {"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ACTION": "MIN_MAX"}
+CONFIG = {
+    "type": "act", "n_obs_steps": 1, "chunk_size": 4, "n_action_steps": 2, "temporal_ensemble_coeff": None,
+    "normalization_mapping": NORMS,
+    "input_features": {"observation.state": STATE, "observation.images.top": CAMERA},
+    "output_features": {"action": ACTION},
+}  # fmt: skip
+FEATURES = {**CONFIG["input_features"], "action": ACTION}
+STATS = {
+    "observation.state.mean": [0.5, -1, 2], "observation.state.std": [0.1, 0, 3],
+    "observation.images.top.mean": [[[0.485]], [[0.456]], [[0.406]]],
+    "observation.images.top.std": [[[0.229]], [[0.224]], [[0.225]]],
+    "action.min": [-1, 0.25], "action.max": [3, 0.25],
+}  # fmt: skip
+
+
+def normalizer(name: str, features: dict[str, Any]) -> dict[str, Any]:
+    step = {"unnormalizer": "postprocessor_step_0", "normalizer": "preprocessor_step_3"}[name]
+    config = {"eps": 1e-8, "features": features, "norm_map": dict(NORMS)}
+    file = f"policy_{step}_{name}_processor.safetensors"
+    return {"registry_name": f"{name}_processor", "config": config, "state_file": file}
+
+
+def parts() -> dict[str, Any]:
+    """Return the files of a checkpoint as saved by LeRobot 0.6.1: name -> JSON, or tensors."""
+    before = [
+        {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
+        {"registry_name": "to_batch_processor", "config": {}},
+        {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}},
+        normalizer("normalizer", FEATURES),
+    ]
+    return {
+        "config.json": copy.deepcopy(CONFIG),
+        "policy_preprocessor.json": {"name": "policy_preprocessor", "steps": before},
+        "policy_postprocessor.json": {"name": "", "steps": [normalizer("unnormalizer", {"action": ACTION})]},
+        "policy_preprocessor_step_3_normalizer_processor.safetensors": dict(STATS),
+        "policy_postprocessor_step_0_unnormalizer_processor.safetensors": dict(STATS),
+        "model.safetensors": {"w": [0.0]},
+    }
+
+
+def write(folder: Path, files: dict[str, Any]) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, content in files.items():
+        if name.endswith(".json"):
+            (folder / name).write_text(content if isinstance(content, str) else json.dumps(content))
+        else:
+            save_file({key: np.asarray(value, np.float32) for key, value in content.items()}, folder / name)
+    return folder
+
+
+def test_features_and_statistics_are_those_of_the_processors(tmp_path: Path) -> None:
+    checkpoint = read_checkpoint(write(tmp_path / "c", parts()))
+    assert (checkpoint.family, checkpoint.execute, list(checkpoint.inputs)) == (
+        "act",
+        2,
+        list(CONFIG["input_features"]),
+    )
+    top = checkpoint.inputs["observation.images.top"]
+    assert (top.kind, top.shape, top.mode) == ("VISUAL", (3, 8, 12), "MEAN_STD")
+    np.testing.assert_allclose(top.statistics["mean"], [0.485, 0.456, 0.406], rtol=1e-6)
+    assert checkpoint.action.mode == "MIN_MAX"
+
+
+def test_a_camera_has_the_name_that_the_robot_uses(tmp_path: Path) -> None:
+    files = parts()
+    files["policy_preprocessor.json"]["steps"][0]["config"] = {
+        "rename_map": {"observation.images.left": "observation.images.top"}
+    }
+    checkpoint = read_checkpoint(write(tmp_path / "c", files))
+    assert checkpoint.inputs["observation.images.top"].key == "observation.images.left"
+
+
+@pytest.mark.parametrize(("key", "mode"), [("observation.state", "mean_std"), ("action", "min_max")])
+def test_statistics_do_what_lerobot_does_and_a_joint_that_never_moved_is_not_an_error(
+    tmp_path: Path, key: str, mode: str
+) -> None:
+    checkpoint = read_checkpoint(write(tmp_path / "c", parts()))
+    feature = {**checkpoint.inputs, "action": checkpoint.action}[key]
+    (tmp_path / "statistics.json").write_text(json.dumps({"k": directory._rows(feature)}))
+    width = len(STATS["observation.state.mean"]) if key != "action" else 2
+    tensor = TensorSpec(key, (1, width), normalisation=mode, statistics="statistics.json#k")
+    normaliser = load_normaliser(tensor, tmp_path)
+    first, second = (np.asarray(values, np.float64) for values in feature.statistics.values())
+    normalised = np.linspace(-1, 1, width)[None].astype(np.float32)
+    if mode == "mean_std":
+        physical = first + np.array([[0.3, 0, -2]])
+        expected = (physical - first) / (second + EPS)
+        np.testing.assert_allclose(normaliser.forward(physical.astype(np.float32)), expected, rtol=1e-4, atol=1e-5)
+    else:
+        spread = np.where(second == first, EPS, second - first)
+        np.testing.assert_allclose(
+            normaliser.inverse(normalised), (normalised + 1) / 2 * spread + first, rtol=1e-5, atol=1e-7
+        )
+        assert normaliser.forward(np.float32([[-1, 0.25]])).tolist() == [[-1, -1]]
+
+
+def edited(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
+    def edit(files: dict[str, Any]) -> None:
+        *way, last = path
+        inside: Any = files
+        for key in way:
+            inside = inside[key]
+        if to is None:
+            del inside[last]
+        else:
+            inside[last] = to
+
+    return edit
+
+
+def quantiles(files: dict[str, Any]) -> None:
+    files["config.json"]["normalization_mapping"] = {**NORMS, "STATE": "QUANTILES"}
+    files["policy_preprocessor.json"]["steps"][3]["config"]["norm_map"]["STATE"] = "QUANTILES"
+
+
+INPUTS = ("config.json", "input_features")
+STEPS = ("policy_preprocessor.json", "steps")
+STATES = "policy_preprocessor_step_3_normalizer_processor.safetensors"
+BROKEN = {
+    "unknown family": (edited("config.json", "type", to="tdmpc"), "of the type 'tdmpc'"),
+    "ensembling": (edited("config.json", "temporal_ensemble_coeff", to=0.01), "averages overlapping chunks"),
+    "no features": (edited("config.json", "input_features", to={}), "has no input_features"),
+    "features of text": (edited("config.json", "input_features", to={"a": "b"}), "has no input_features"),
+    "negative shape": (edited(*INPUTS, "observation.state", "shape", to=[-3]), r"the shape \[-3\]"),
+    "no shape": (edited(*INPUTS, "observation.state", "shape", to=None), "the shape None"),
+    "two outputs": (
+        edited("config.json", "output_features", to={"action": ACTION, "value": ACTION}), "has the outputs"
+    ),
+    "not JSON": (edited("config.json", to="{"), "is not valid JSON"),
+    "a list": (edited("config.json", to="[]"), "holds no mapping"),
+    "a NaN": (edited("policy_preprocessor.json", to='{"steps": NaN}'), "lists no steps"),
+    "not normalised": (edited(*STEPS, 3, to={"registry_name": "to_batch_processor"}), "its processors do IDENTITY"),
+    "no preprocessor": (edited("policy_preprocessor.json", to=None), "has no policy_preprocessor.json"),
+    "no postprocessor": (edited("policy_postprocessor.json", to=None), "has no policy_postprocessor.json"),
+    "code": (edited(*STEPS, 1, to={"class": "subprocess.Popen", "config": {"args": "touch pwned"}}), "that is code"),
+    "a step of text": (edited(*STEPS, 1, to="to_batch_processor"), "that is code"),
+    "unknown step": (edited(*STEPS, 1, "registry_name", to="relative_actions_processor"), "relative_actions_processor"),
+    "unknown mode": (edited(*STEPS, 3, "config", "norm_map", "STATE", to="ZCA"), "ZCA"),
+    "missing statistic": (edited(STATES, "observation.state.std", to=None), "would pass .* unchanged, silently"),
+    "other key": (edited(STATES, "observation.state.mean", to=None), "has no 'observation.state.mean'"),
+    "missing quantile": (quantiles, "'observation.state.q01'"),
+    "wrong width": (edited(STATES, "observation.state.mean", to=[0.0, 1.0]), r"has the shape \[2\]"),
+    "infinite": (edited(STATES, "observation.state.mean", to=[0.0, 1.0, np.inf]), "not finite"),
+    "no file of statistics": (edited(STATES, to=None), "lacks the file of statistics"),
+    "statistics elsewhere": (edited(*STEPS, 3, "state_file", to="../../etc/passwd"), "lacks the file of statistics"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_a_broken_checkpoint_is_named_with_its_place_and_nothing_runs(tmp_path: Path, kind: str, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(LEROBOT_PYTHON, sys.executable)
+    edit, words = BROKEN[kind]
+    files = parts()
+    edit(files)
+    with pytest.raises(SourceError, match=words) as caught:
+        LerobotCheckpoint.of(str(write(tmp_path / "c", files))).describe()
+    assert caught.value.fix
+    assert not (tmp_path / "pwned").exists()
+
+
+def test_what_claims_a_directory(tmp_path: Path) -> None:
+    folder = write(tmp_path / "c", parts())
+    assert LerobotCheckpoint.claims(str(folder)) is Claim.CERTAIN
+    (folder / "config.json").write_text('{"model_type": "llama"}')
+    assert LerobotCheckpoint.claims(str(folder)) is Claim.NONE
+    (folder / "config.json").write_text("not JSON")
+    assert LerobotCheckpoint.claims(str(folder)) is Claim.NONE
+    assert LerobotCheckpoint.claims(str(tmp_path / "absent")) is Claim.NONE
+
+
+@pytest.mark.parametrize(
+    ("python", "words"),
+    [("/absent/python", "which is not a program"), (sys.executable, "LeRobot cannot trace the policy")],
+)
+def test_a_python_without_lerobot_is_an_error_and_leaves_nothing(
+    tmp_path: Path, python: str, words: str, monkeypatch
+) -> None:
+    monkeypatch.setenv(LEROBOT_PYTHON, python)
+    monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(SourceError, match=words):
+        LerobotCheckpoint.of(str(write(tmp_path / "c", parts()))).describe()
+    assert not list((tmp_path / "cache").rglob("policy.yaml"))
+
+
+def test_without_lerobot_the_error_says_how_to_name_its_python(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.delenv(LEROBOT_PYTHON, raising=False)
+    with pytest.raises(SourceError, match="not installed beside vlatool") as caught:
+        LerobotCheckpoint.of(str(write(tmp_path / "c", parts()))).describe()
+    assert "--python" in caught.value.fix

@@ -1,0 +1,139 @@
+"""Make a LeRobot checkpoint with random weights, and record what its policy does; run in the Python that has LeRobot.
+
+    python _lerobot_checkpoints.py act|diffusion-ddim|diffusion-ddpm FOLDER [--small] [--steps 50]
+
+Writes ``FOLDER/checkpoint`` and ``FOLDER/episode.npz``: the observations of an episode (N, ...), the actions (N, A) of
+``select_action`` with LeRobot's own processors around it, and the noise that each inference drew.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.factory import make_pre_post_processors
+
+JOINTS = 14
+
+
+def features(height, width, cameras):
+    """Return what goes in and out, as a configuration names it."""
+    pictures = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, height, width)) for name in cameras}
+    state = {"observation.state": PolicyFeature(FeatureType.STATE, (JOINTS,))}
+    action = {"action": PolicyFeature(FeatureType.ACTION, (JOINTS,))}
+    return {"input_features": {**state, **pictures}, "output_features": action, "device": "cpu"}
+
+
+def act(small):
+    """Return an ACT policy, in its default configuration (51.6 M parameters) or small."""
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    sizes = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 128, "n_encoder_layers": 2, "chunk_size": 20}
+    sizes = {**sizes, "n_action_steps": 10} if small else {"n_action_steps": 10}
+    seen = features(96, 128, ["top"]) if small else features(480, 640, ["top"])
+    return ACTPolicy(ACTConfig(**seen, **sizes, pretrained_backbone_weights=None))
+
+
+def diffusion(kind, small):
+    """Return a Diffusion Policy of two cameras with that scheduler."""
+    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+
+    sizes = {"down_dims": (64, 128)} if small else {}
+    config = DiffusionConfig(
+        **features(96, 96, ["front", "wrist"]), **sizes, noise_scheduler_type=kind, pretrained_backbone_weights=None,
+        crop_shape=(84, 84), horizon=16, n_action_steps=8, num_inference_steps=10 if kind == "DDIM" else 20,
+    )  # fmt: skip
+    return DiffusionPolicy(config)
+
+
+def statistics(config):
+    """Return statistics as a dataset has them; one joint never moved."""
+    generator = torch.Generator().manual_seed(1)
+    found = {}
+    for key in (*config.input_features, "action"):
+        if "images" in key:
+            mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+            found[key] = {"mean": mean.reshape(3, 1, 1), "std": std.reshape(3, 1, 1)}
+            continue
+        mean, std = torch.randn(JOINTS, generator=generator), torch.rand(JOINTS, generator=generator) + 0.1
+        std[3] = 0
+        found[key] = {"mean": mean, "std": std, "min": mean - 2 * std, "max": mean + 2 * std}
+    return found
+
+
+def observation(config, generator, still):
+    """Return one raw observation: pictures (H, W, 3) uint8 and joints in physical units, one of which never moves."""
+    raw = {}
+    for key, feature in config.input_features.items():
+        if key in config.image_features:
+            _, height, width = feature.shape
+            raw[key] = torch.randint(0, 256, (height, width, 3), generator=generator, dtype=torch.uint8)
+        else:
+            raw[key] = torch.randn(feature.shape, generator=generator)
+            raw[key][3] = still
+    return raw
+
+
+def main(kind, folder, small, steps):
+    """Write the checkpoint and the episode."""
+    torch.manual_seed(0)
+    policy = (act(small) if kind == "act" else diffusion(kind.rpartition("-")[2].upper(), small)).eval()
+    config, stats = policy.config, statistics(policy.config)
+    before, after = make_pre_post_processors(config, dataset_stats=stats)
+    for part in (policy, before, after):
+        part.save_pretrained(folder / "checkpoint")
+    generator, drawn = torch.Generator().manual_seed(5), []
+
+    def noise(shape, *_, **__):
+        drawn.append(torch.empty(tuple(shape)).normal_(generator=generator))
+        return drawn[-1]
+
+    real = torch.randn
+    replaced = [mock.patch.object(torch, "randn", lambda *args, **more: noise(more.get("size", args)))]
+    if kind != "act":
+        scheduler = sys.modules[type(policy.diffusion.noise_scheduler).__module__]
+        replaced.append(mock.patch.object(scheduler, "randn_tensor", noise))
+    seen, actions, counts = [], [], []
+    policy.reset()
+    with torch.no_grad():
+        for _ in range(steps):
+            raw = observation(config, generator, stats["observation.state"]["mean"][3])
+            fed = {
+                key: value.permute(2, 0, 1).float() / 255 if key in config.image_features else value
+                for key, value in raw.items()
+            }
+            start = len(drawn)
+            with mock.patch.object(torch, "randn", real):
+                batch = before(fed)
+            actions.append(
+                after(_with(replaced, policy, batch) if kind != "act" else policy.select_action(batch))[0].numpy()
+            )
+            counts.append(len(drawn) - start)
+            seen.append(raw)
+    rows = {key: np.stack([raw[key].numpy() for raw in seen]) for key in seen[0]}
+    noises = {f"noise_{number}": value.numpy() for number, value in enumerate(drawn)}
+    np.savez(folder / "episode.npz", action=np.stack(actions), drawn=np.array(counts), **rows, **noises)
+
+
+def _with(replaced, policy, batch):
+    from contextlib import ExitStack
+
+    with ExitStack() as stack:
+        for each in replaced:
+            stack.enter_context(each)
+        return policy.select_action(batch)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kind", choices=("act", "diffusion-ddim", "diffusion-ddpm"))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--small", action="store_true")
+    parser.add_argument("--steps", type=int, default=50)
+    given = parser.parse_args()
+    main(given.kind, given.folder, given.small, given.steps)

@@ -1,0 +1,82 @@
+"""LeRobot checkpoints through one command each, held against ``select_action`` over an episode.
+
+    python tests/validation/foreign/lerobot_checkpoints.py --python ~/lerobot/bin/python [--small] [--steps 50]
+
+``--python`` has LeRobot 0.6 (``pip install 'lerobot[diffusion]==0.6.1'`` on Python 3.12); vlatool is not needed there.
+For each policy: LeRobot makes a checkpoint with random weights and plays an episode with its own processors; then
+``vlatool export onnx CHECKPOINT --python ...`` and ``vlatool.load`` here, fed the same observations and noise. Prints
+the relative L2 distance of the action chunks, and exits 1 when one is above 1e-4.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import vlatool
+
+KINDS = ("act", "diffusion-ddim", "diffusion-ddpm")
+LIMIT = 1e-4
+MAKE = Path(__file__).with_name("_lerobot_checkpoints.py")
+
+
+def moments(policy: Any, episode: Any, step: int) -> dict[str, Any]:
+    """Return the observation at a step; of an input that takes a history, its moments, the first one copied."""
+    fed = {}
+    for tensor in policy.spec.inputs:
+        rows = episode[tensor.name]
+        history = tensor.shape[1] if len(tensor.shape) == rows.ndim + 1 else 0
+        fed[tensor.name] = rows[[max(0, step - back) for back in reversed(range(history))]] if history else rows[step]
+    return fed
+
+
+def errors(bundle: Path, recorded: Path) -> list[float]:
+    """Return the relative L2 distance of each executed chunk from what LeRobot executed."""
+    policy, episode = vlatool.load(bundle), np.load(recorded)
+    execute, drawn, found = policy.spec.executed_actions, 0, []
+    for step in range(0, len(episode["action"]), execute):
+        count = int(episode["drawn"][step])
+        first, *fresh = [episode[f"noise_{drawn + index}"] for index in range(count)] or [None]
+        drawn += count
+        noise = None if first is None else {"sample": first, **({"fresh": np.stack(fresh)} if fresh else {})}
+        if fresh:  # the last step of DDPM draws none
+            steps = next(each.repeat for each in policy.program.steps if each.repeat > 1)
+            noise["fresh"] = np.concatenate([noise["fresh"], np.zeros((steps - len(fresh), *first.shape), np.float32)])
+        chunk = policy.infer(moments(policy, episode, step), noise=noise).chunk
+        expected = episode["action"][step : step + execute]
+        got = chunk[: len(expected)]
+        found.append(float(np.linalg.norm(got - expected) / np.linalg.norm(expected)))
+    return found
+
+
+def main(arguments: list[str]) -> int:
+    """Print a row for each kind of policy."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--python", required=True)
+    parser.add_argument("--small", action="store_true")
+    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("kinds", nargs="*", default=KINDS)
+    asked = parser.parse_args(arguments)
+    worst = 0.0
+    print("| policy | chunks | error, median | error, largest |\n|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as place:
+        for kind in asked.kinds:
+            folder = Path(place) / kind
+            sizes = ["--steps", str(asked.steps), *(["--small"] if asked.small else [])]
+            subprocess.run([asked.python, MAKE, kind, folder, *sizes], check=True, capture_output=True)
+            command = ["export", "onnx", folder / "checkpoint", "-o", folder / "bundle", "--python", asked.python]
+            subprocess.run([sys.executable, "-m", "vlatool", *command], check=True, capture_output=True)
+            found = errors(folder / "bundle", folder / "episode.npz")
+            worst = max(worst, *found)
+            print(f"| {kind} | {len(found)} | {np.median(found):.1e} | {max(found):.1e} |", flush=True)
+    return int(not worst <= LIMIT)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,217 @@
+"""What a LeRobot checkpoint says of its policy: features, normalisation and statistics, read as data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import SourceError, require, suggest
+from vlatool.files.json import read_json
+from vlatool.files.printable import truncate
+
+FAMILIES = ("act", "diffusion", "smolvla")
+"""Types of policies that ``_lerobot_child`` traces."""
+HARMLESS = ("to_batch_processor", "device_processor")
+TEXT_STEPS = ("smolvla_new_line_processor", "tokenizer_processor")
+"""Steps of SmolVLA's instruction; ``_lerobot_child`` writes the tokenizer that does both."""
+RENAME, NORMALIZER, UNNORMALIZER = "rename_observations_processor", "normalizer_processor", "unnormalizer_processor"
+MODES = {
+    "IDENTITY": (), "MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}  # fmt: skip
+"""Normalisation of LeRobot (``processor/normalize_processor.py`` of 0.6) -> the statistics that it takes."""
+EMPTY_CAMERA = "observation.images.empty_camera_"
+"""Cameras that the policy fills with a constant itself."""
+EPS = 1e-8
+"""LeRobot adds it to a standard deviation on the way in, not on the way out, and takes it for a range of 0."""
+COMPLETE = "save the policy again with save_pretrained, its processors, too: config.json, model.safetensors and both "
+COMPLETE += "policy_*processor.json with their .safetensors"
+Statistics = Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Feature:
+    """An input or output of the policy.
+
+    Args:
+        key: name that a robot uses (``observation.state``), before LeRobot renames it.
+        kind: ``STATE``, ``VISUAL``, ``ENV`` or ``ACTION``.
+        mode: how LeRobot normalises it, of ``MODES``.
+        statistics: what the mode takes, float64 of the feature's elements; (3,) for pictures.
+    """
+
+    key: str
+    kind: str
+    shape: tuple[int, ...]
+    mode: str
+    statistics: Statistics
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint as its files say.
+
+    Args:
+        inputs: key in the policy -> the feature, in the order of config.json.
+        execute: actions that are executed of a chunk.
+    """
+
+    folder: Path
+    family: str
+    inputs: Mapping[str, Feature]
+    action: Feature
+    execute: int
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """Read the JSON files and statistics of a checkpoint; nothing that they name is imported or run.
+
+    Raises:
+        SourceError: when a file is missing or damaged, a type of policy or a processing step is unknown, a statistic is
+            missing, or a step is code.
+    """
+    config = _mapping(folder, "config.json")
+    family = config.get("type")
+    if family not in FAMILIES:
+        raise SourceError(
+            f"{folder} is a LeRobot policy of the type {truncate(repr(family), 60)}; {suggest(str(family), FAMILIES)}.",
+            "write a policy.yaml and a few lines of Python: docs/guides/lerobot-policy.md",
+        )
+    if config.get("temporal_ensemble_coeff") is not None:
+        raise SourceError(
+            f"{folder} averages overlapping chunks (temporal_ensemble_coeff), which no controller of vlatool does yet.",
+            "set it to null and n_action_steps to the actions that are executed of each chunk, if the policy can do "
+            "without",
+        )
+    steps = _steps(
+        folder,
+        "policy_preprocessor.json",
+        (*HARMLESS, *(TEXT_STEPS if family == "smolvla" else ()), RENAME, NORMALIZER),
+    )
+    behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER))
+    mapping = config.get("normalization_mapping")
+    trained_with = mapping if isinstance(mapping, dict) else {}
+    robot_key = {policy: robot for robot, policy in steps.get(RENAME, {}).get("rename_map", {}).items()}
+    inputs = {
+        key: _feature(folder, (key, robot_key.get(key, key)), about, steps.get(NORMALIZER, {}), trained_with)
+        for key, about in _features(folder, config, "input_features").items()
+        if not key.startswith(EMPTY_CAMERA)
+    }
+    outputs = _features(folder, config, "output_features")
+    if list(outputs) != ["action"]:
+        raise SourceError(f"{folder} has the outputs {sorted(outputs)}; wanted: action.", COMPLETE)
+    action = _feature(folder, ("action", "action"), outputs["action"], behind.get(UNNORMALIZER, {}), trained_with)
+    execute = config.get("n_action_steps", 1)
+    return Checkpoint(folder, str(family), inputs, action, execute if isinstance(execute, int) else 1)
+
+
+def _mapping(folder: Path, name: str) -> dict[str, Any]:
+    try:
+        content = (folder / name).read_bytes()
+    except OSError as error:
+        raise SourceError(f"The LeRobot checkpoint {folder} has no {name} ({error.strerror}).", COMPLETE) from error
+    value = read_json(content, f"{folder / name}", SourceError, COMPLETE)
+    if not isinstance(value, dict):
+        raise SourceError(f"{folder / name} holds no mapping.", COMPLETE)
+    return value
+
+
+def _features(folder: Path, config: Mapping[str, Any], name: str) -> dict[str, Any]:
+    found = config.get(name)
+    if not isinstance(found, dict) or not found or not all(isinstance(each, dict) for each in found.values()):
+        raise SourceError(f"config.json of {folder} has no {name}.", COMPLETE)
+    return found
+
+
+def _steps(folder: Path, name: str, known: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """Return the configuration of each processing step by its registry name, with its file of statistics.
+
+    Raises:
+        SourceError: for a step that is code, or that vlatool does not know: leaving it out would change the actions.
+    """
+    steps: dict[str, dict[str, Any]] = {}
+    listed = _mapping(folder, name).get("steps")
+    if not isinstance(listed, list):
+        raise SourceError(f"{folder / name} lists no steps.", COMPLETE)
+    for step in listed:
+        if not isinstance(step, dict) or "registry_name" not in step:
+            code = truncate(str(step.get("class") if isinstance(step, dict) else step), 80)
+            raise SourceError(
+                f"{folder / name} has the step {code}, which names a class: that is code, and was not run.",
+                "a step must have a registry_name of LeRobot; write such a step into a policy.yaml and Python of your "
+                "own: docs/guides/lerobot-policy.md",
+            )
+        registered = str(step["registry_name"])
+        if registered not in known:
+            raise SourceError(
+                f"{folder / name} has the step '{truncate(registered, 80)}'; {suggest(registered, known)}.",
+                "what the step does must be part of a policy.yaml of your own: docs/guides/lerobot-policy.md",
+            )
+        settings = step.get("config")
+        steps[registered] = {**(settings if isinstance(settings, dict) else {}), "state_file": step.get("state_file")}
+    return steps
+
+
+def _feature(
+    folder: Path,
+    keys: tuple[str, str],
+    about: Mapping[str, Any],
+    step: Mapping[str, Any],
+    trained_with: Mapping[str, Any],
+) -> Feature:
+    """Return a feature with the statistics that the processing step applies to it.
+
+    Args:
+        keys: key in the policy, and the one that a robot uses.
+        trained_with: kind of feature -> mode, as config.json says.
+    """
+    key, robot_key = keys
+    shape, kind = about.get("shape"), str(about.get("type"))
+    if not isinstance(shape, list) or not shape or not all(isinstance(size, int) and size > 0 for size in shape):
+        raise SourceError(f"config.json of {folder} gives '{key}' the shape {truncate(repr(shape), 60)}.", COMPLETE)
+    known = step.get("features")
+    mode = str((step.get("norm_map") or {}).get(kind, "IDENTITY")) if isinstance(known, dict) and key in known else ""
+    mode = mode or "IDENTITY"
+    if mode not in MODES:
+        raise SourceError(f"{folder} normalises '{key}' by {truncate(mode, 40)}; {suggest(mode, MODES)}.", COMPLETE)
+    trained = str(trained_with.get(kind, mode))
+    if trained != mode:
+        raise SourceError(
+            f"config.json of {folder} normalises {kind} by {truncate(trained, 40)}, its processors do {mode} to "
+            f"'{key}'; LeRobot would pass it on as it is, silently.",
+            COMPLETE,
+        )
+    statistics = {name: _statistic(folder, step, key, name, mode) for name in MODES[mode]}
+    width = shape[0] if kind == "VISUAL" else shape[-1]
+    for name, values in statistics.items():
+        if values.shape != (width,) or not np.isfinite(values).all():
+            raise SourceError(
+                f"The statistic '{key}.{name}' of {folder} has the shape {list(values.shape)} or is not finite; wanted "
+                f"{width} numbers.",
+                COMPLETE,
+            )
+    return Feature(robot_key, kind, tuple(shape), mode, statistics)
+
+
+def _statistic(folder: Path, step: Mapping[str, Any], key: str, name: str, mode: str) -> NDArray[np.float64]:
+    """Return one statistic of a feature from the file of a step, without axes of length 1.
+
+    Raises:
+        SourceError: when it is not there; LeRobot would pass the feature on unchanged, without a word.
+    """
+    file = str(step.get("state_file") or "")
+    path = folder / Path(file).name
+    if not file or not path.is_file():
+        raise SourceError(f"{folder} lacks the file of statistics {file or '(state_file)'} for '{key}'.", COMPLETE)
+    tensors = require("safetensors.numpy", "build").load_file(path)
+    if f"{key}.{name}" not in tensors:
+        raise SourceError(
+            f"{path} has no '{key}.{name}', which {mode} needs; LeRobot would pass '{key}' on unchanged, silently.",
+            f"save the processors with the statistics of the dataset; {suggest(f'{key}.{name}', tensors)}",
+        )
+    return np.atleast_1d(np.asarray(tensors[f"{key}.{name}"], np.float64).squeeze())
