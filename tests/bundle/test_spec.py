@@ -183,6 +183,41 @@ def test_an_impossible_spec_is_refused(change, message):
         PolicySpec.from_dict({**SPECS[0], **change})
 
 
+MOMENTS = {"name": "state", "shape": [1, 2, 6], "history": 2}
+
+
+def test_an_input_may_hold_several_moments():
+    tensor = TensorSpec.from_dict(MOMENTS)
+    assert tensor.moment == TensorSpec("state", (1, 6))
+    assert TensorSpec.from_dict(tensor.to_dict()) == tensor
+    assert "history" not in TensorSpec("state", (1, 6)).to_dict()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"history": 1, "shape": [1, 1, 6]}, "history 1 and, as tensor, the shape"),
+        ({"history": 3}, r"history 3 .* shape \[1, 2, 6\]; the second axis of a tensor with a history counts"),
+        ({"history": -2}, "history of 'state' must be a whole number"),
+        ({"history": True}, "history of 'state'"),
+        ({"history": 2.0}, "history of 'state'"),
+        ({"history": 2, "shape": [2]}, "history 2"),
+        ({"history": 2, "shape": []}, "history 2"),
+        ({"shape": [1, 2, "n"]}, "history and the dynamic shape"),
+        ({"image": {"frame": "rgb", "layout": "hwc", "camera": [8, 8]}}, "history and an image"),
+        ({"shape": [1, 2], "kind": "text", "tokenizer": "w.json", "max_tokens": 2}, "history 2 and, as text"),
+    ],
+)
+def test_an_impossible_history_is_refused(change, message):
+    with pytest.raises(SpecError, match=message):
+        TensorSpec.from_dict({**MOMENTS, **change})
+
+
+def test_an_output_has_no_history():
+    with pytest.raises(SpecError, match="output 'action' has a history"):
+        PolicySpec.from_dict({**SPECS[0], "outputs": [{"name": "action", "shape": [1, 2, 6], "history": 2}]})
+
+
 def test_a_spec_needs_its_rate():
     with pytest.raises(SpecError, match="needs 'control_hz'"):
         PolicySpec.from_dict({"inputs": [IMAGE], "outputs": [ACTION]})

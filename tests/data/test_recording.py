@@ -11,6 +11,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import npz, observations_for, read_recording, recorded_observations, synthetic_observations
 from vlatool.data._random_observations import words_of
 from vlatool.errors import DataError
+from vlatool.files.rows import Rows
 
 COUNT = 6
 SPEC = PolicySpec(
@@ -65,6 +66,43 @@ def test_a_stored_batch_axis_is_taken_away(tmp_path: Path):
     recording = read(tmp_path, image=plain["image"][:, None], state=plain["state"][:, None])
     assert recording.observation(0)["image"].shape == (2, 2, 3)
     assert recording.observation(0)["state"].shape == (2,)
+
+
+MOMENTS = PolicySpec(
+    (TensorSpec("image", (1, 2, 2, 2, 3), "uint8", history=2), TensorSpec("state", (1, 3, 2), history=3)),
+    SPEC.outputs,
+    10.0,
+    3,
+)
+
+
+def test_earlier_moments_come_from_the_episode(tmp_path: Path):
+    recording = read(tmp_path, MOMENTS, episode=np.array([0, 0, 0, 0, 1, 1]))
+    firsts = [row[:, 0].tolist() for row in (each["state"] for each in recording)]
+    assert firsts == [[0, 0, 0], [0, 0, 2], [0, 2, 4], [2, 4, 6], [8, 8, 8], [8, 8, 10]]
+    assert recording.observation(3)["image"].shape == (2, 2, 2, 3)
+    np.testing.assert_array_equal(recording.observation(3)["image"][1], arrays()["image"][3])
+    np.testing.assert_array_equal(recording.observation(4)["image"][0], arrays()["image"][4])
+
+
+def test_earlier_moments_of_rows_on_the_disk_are_read(tmp_path: Path):
+    image = np.zeros((COUNT, 1024, 1024, 3), np.uint8)
+    image[:, 0, 0, 0] = range(COUNT)
+    large = PolicySpec((TensorSpec("image", (1, 2, 1024, 1024, 3), "uint8", history=2),), SPEC.outputs, 10.0, 3)
+    recording = read(tmp_path, large, image=image)
+    assert isinstance(recording.inputs["image"], Rows)
+    assert recording.subset(np.arange(COUNT) > 2).observation(0)["image"][:, 0, 0, 0].tolist() == [2, 3]
+
+
+def test_a_selection_looks_back_beyond_itself(tmp_path: Path):
+    half = read(tmp_path, MOMENTS, episode=np.array([0, 0, 0, 0, 1, 1])).subset(np.arange(COUNT) % 2 == 1)
+    again = half.subset(np.array([False, True, True]))
+    assert [each["state"][:, 0].tolist() for each in again] == [[2, 4, 6], [8, 8, 10]]
+
+
+def test_a_sample_of_an_input_with_history_is_one_moment(tmp_path: Path):
+    whole = np.zeros((COUNT, 3, 2), np.float32)
+    refused(tmp_path, r"'state' .* shape \[6, 3, 2\]; wanted \[N, 2\]", MOMENTS, state=whole)
 
 
 def test_text_with_a_batch_axis_is_the_text_itself(tmp_path: Path):

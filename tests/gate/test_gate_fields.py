@@ -111,6 +111,7 @@ COMPARED: dict[str, tuple[Change, str]] = {
         tensor("inputs", 0, image=Image(frame="bgr", layout="hwc", camera=(8, 8))),
         "frame 'bgr' in the candidate, '' in the baseline",
     ),
+    "TensorSpec.history": (tensor("inputs", 0, history=8), "history 8 in the candidate, 0 in the baseline"),
     "PolicySpec.inputs": (
         lambda before: spec(inputs=(*before.spec.inputs, TensorSpec("gripper", (1, 1))))(before),
         "input gripper: it is in the candidate alone",

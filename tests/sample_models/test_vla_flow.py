@@ -65,9 +65,9 @@ def imported(monkeypatch: pytest.MonkeyPatch) -> Iterator[Imported]:
 
 def with_steps(bundle: Bundle, steps: int) -> Bundle:
     """Change nothing but the schedule and how often it is gone through."""
-    prefix, step = bundle.manifest.program
+    *before, step = bundle.manifest.program
     schedule = {"t": [1.0 - turn / steps for turn in range(steps)], "dt": [-1.0 / steps] * steps}
-    program = (prefix, replace(step, repeat=steps, schedule=schedule))
+    program = (*before, replace(step, repeat=steps, schedule=schedule))
     return seal(bundle.path, replace(bundle.manifest, program=program))
 
 

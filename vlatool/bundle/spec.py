@@ -56,6 +56,8 @@ class TensorSpec:
             or (H, W) of any size; None for an input that is given as the graph sees it.
         epsilon: added to a std on the way in, and put for a range of 0, as LeRobot does with 1e-8: an element that
             never moved in training then has statistics, too. 0 refuses it.
+        history: number of moments that the second axis of an input holds, oldest first, from 2; 0 for an input of one
+            moment. The robot gives one moment at each control step, and the runtime keeps the last ones.
     """
 
     name: str
@@ -72,10 +74,12 @@ class TensorSpec:
     finite: bool = True
     image: Image | None = None
     epsilon: float = 0.0
+    history: int = 0
 
     def __post_init__(self) -> None:
         self._check_words()
         self._check_shape()
+        self._check_history()
         self._check_kind()
         if self.normalisation != "none" and "#" not in self.statistics:
             raise SpecError(
@@ -161,6 +165,27 @@ class TensorSpec:
             )
         image.check_input(self.name, self.shape, self.dtype)
 
+    def _check_history(self) -> None:
+        if not integer(self.history, f"The history of '{self.name}'", SpecError):
+            return
+        if self.image is not None:
+            raise SpecError(
+                f"'{self.name}' has a history and an image; frames with a history are given as the graph takes them.",
+                "leave the image out, and scale the frames in forward()",
+            )
+        if self.kind != "tensor" or self.history < 2 or self.shape[1:2] != (self.history,):
+            raise SpecError(
+                f"'{self.name}' has the history {self.history} and, as {self.kind}, the shape {list(self.shape)}; the "
+                "second axis of a tensor with a history counts its moments, from 2.",
+                f"write its shape as [1, {max(2, self.history)}, ...], or leave the history out: the observation then "
+                "holds what the graph takes",
+            )
+        if not all(isinstance(axis, int) for axis in self.shape):
+            raise SpecError(
+                f"'{self.name}' has a history and the dynamic shape {list(self.shape)}.",
+                "write its axes as numbers: moments of different shapes cannot be stacked",
+            )
+
     def assets(self) -> list[str]:
         """Return the files, relative to the assets, that this tensor needs."""
         file = self.statistics.partition("#")[0]
@@ -171,6 +196,11 @@ class TensorSpec:
         """Length of the last axis; 0 when it is dynamic or there is none."""
         last = self.shape[-1] if self.shape else 0
         return last if isinstance(last, int) else 0
+
+    @property
+    def moment(self) -> TensorSpec:
+        """Spec of what the robot gives at one control step: without the axis of moments, if it has a history."""
+        return replace(self, shape=(self.shape[0], *self.shape[2:]), history=0) if self.history else self
 
     @property
     def elements(self) -> int:
@@ -192,7 +222,7 @@ class TensorSpec:
     @property
     def schema(self) -> int:
         """The first version of the manifest that has all that this tensor says."""
-        return 2 if self.image or self.epsilon or self.normalisation == "quantile10" else 1
+        return 2 if self.image or self.epsilon or self.history or self.normalisation == "quantile10" else 1
 
     @property
     def frame(self) -> str:
@@ -276,6 +306,8 @@ class PolicySpec:
                     f"The output '{tensor.name}' has an image; only a frame of a camera has one.",
                     "leave it out there; it is for inputs",
                 )
+            if tensor.history:
+                raise SpecError(f"The output '{tensor.name}' has a history.", "leave it out there; it is for inputs")
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
         hz = self.control_hz

@@ -203,6 +203,7 @@ def _tensor(tensor: TensorSpec) -> str:
             tensor.normalisation.replace("none", ""),
             "" if tensor.finite else "takes NaN and infinity",
             f"of {describe_image(tensor.image)}" if tensor.image else "",
+            f"the last {tensor.history} moments" if tensor.history else "",
         )
         if part
     )

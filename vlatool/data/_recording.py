@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,7 @@ class Recording:
         whole: Recording that it is a selection of; None when it is all that was recorded.
         indices: (N,) index of each observation in ``whole``.
         left_out: Number of observations that ``with_whole_chunks`` left out.
+        histories: Input name -> number of moments in an observation, of inputs of which a sample is one moment.
     """
 
     path: Path
@@ -74,6 +76,7 @@ class Recording:
     indices: Array | None = None
     padded: Array | None = None
     left_out: int = 0
+    histories: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.inputs.values())))
@@ -83,11 +86,25 @@ class Recording:
             yield self.observation(index)
 
     def observation(self, index: int) -> dict[str, Any]:
-        """Return one observation without the batch axis; text as ``str``."""
-        return {
-            name: str(values[index]) if values.dtype.kind == "U" else values[index]
-            for name, values in self.inputs.items()
-        }
+        """Return one observation without the batch axis; text as ``str``, moments before it from its episode."""
+        return {name: self._value(name, index) for name in self.inputs}
+
+    def _value(self, name: str, index: int) -> Any:
+        if count := self.histories.get(name):
+            whole, at = self.whole or self, index if self.indices is None else int(self.indices[index])
+            return whole.inputs[name][whole._last(count, at)]
+        value = self.inputs[name][index]
+        return str(value) if self.inputs[name].dtype.kind == "U" else value
+
+    def _last(self, count: int, index: int) -> list[int]:
+        """Return the indices of the last moments, oldest first; an episode's first one stands for those before it."""
+        first = int(self._firsts[np.searchsorted(self._firsts, index, side="right") - 1])
+        return [max(first, number) for number in range(index - count + 1, index + 1)]
+
+    @functools.cached_property
+    def _firsts(self) -> NDArray[np.intp]:
+        """Index of the first observation of each episode."""
+        return np.flatnonzero(self.begins())
 
     def subset(self, chosen: NDArray[np.bool_]) -> Recording:
         """Return some observations, in their order."""
@@ -130,7 +147,7 @@ class Recording:
         whole = self.whole or self
         own = {int(number if self.indices is None else self.indices[number]): int(number) for number in numbers}
         begins = whole.begins()
-        firsts = np.flatnonzero(begins)
+        firsts = whole._firsts
         last = {int(np.searchsorted(firsts, index, side="right")): index for index in own}
         for episode, end in last.items():
             for index in range(int(firsts[episode - 1]), end + 1):
@@ -183,7 +200,7 @@ def build_recording(
     for tensor in spec.inputs:
         if tensor.name not in arrays:
             raise DataError(f"{path} has no '{tensor.name}'; {suggest(tensor.name, arrays)}.", RECORD_ALL)
-        observed = _any_size(tensor)
+        observed = _any_size(tensor.moment)
         inputs[tensor.name] = _checked_input(path, observed, arrays[tensor.name], spec)
         if tensor.image is not None:
             _check_frames(f"'{tensor.name}' in {path}", tensor, tensor.image, inputs[tensor.name])
@@ -205,7 +222,9 @@ def build_recording(
     known = {*inputs, *EXPERT, *(tensor.name for tensor in spec.outputs)}
     ignored = tuple(name for name in arrays if name not in known)
     action = None if actions is None else _checked_action(path, spec, actions)
-    return Recording(path, inputs, action, episodes, times, ignored, spec.chunk, padded=_checked_padding(path, padded))
+    histories = {tensor.name: tensor.history for tensor in spec.inputs if tensor.history}
+    whole = _checked_padding(path, padded)
+    return Recording(path, inputs, action, episodes, times, ignored, spec.chunk, padded=whole, histories=histories)
 
 
 def _checked_padding(path: Path, values: Array | None) -> Array | None:
@@ -249,7 +268,7 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
     if values.ndim == max(1, len(tensor.shape)) + 1 and values.shape[1] == 1:
         values = values.without_second_axis() if isinstance(values, Rows) else values[:, 0]
     if not _fits(tensor, values):
-        others = [other.name for other in spec.inputs if other.kind != "text" and _fits(_any_size(other), values)]
+        others = [one.name for one in spec.inputs if one.kind != "text" and _fits(_any_size(one.moment), values)]
         raise DataError(
             f"{where} has the shape {list(values.shape)}; wanted [N, {', '.join(map(str, tensor.shape[1:]))}].",
             f"it would fit '{others[0]}'; are the names swapped?" if others else RECORD_ALL,

@@ -12,7 +12,7 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import BEGINS
-from vlatool.runtime.interface import Action, Array, Controller, Policy
+from vlatool.runtime.interface import Action, Array, Controller, Policy, observer_of
 from vlatool.runtime.observation import ObservationEncoder
 
 
@@ -26,7 +26,7 @@ class FrameRecorder:
 
     def __init__(self, policy: Policy, encode: ObservationEncoder) -> None:
         self.spec: PolicySpec = policy.spec
-        self._policy, self._encode = policy, encode
+        self._policy, self._observer, self._encode = policy, observer_of(policy), encode
         self._frames: list[dict[str, Array]] | None = None
         self._begins: list[bool] = []
         self._new = True
@@ -39,6 +39,11 @@ class FrameRecorder:
             self._begins.append(self._new)
             self._new = False
         return self._policy.infer(observation, noise=noise)
+
+    def observe(self, observation: Mapping[str, Any]) -> None:
+        """Give the policy the observation of a control step at which it does not infer."""
+        if self._observer is not None:
+            self._observer.observe(observation)
 
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode: it begins with the frame that is recorded next."""

@@ -12,10 +12,12 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
+from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, RecipeError, SourceError, require, require_present
 from vlatool.files.validate import short_repr
 from vlatool.graph.float32_conversion import ROUNDING, describe_conversion, rewrite_as_float32
+from vlatool.graph.loop_invariants import changing_feeds, compute_once, cut_loop_invariants, name_of_once
 from vlatool.machine.engine_calls import engine_call
 from vlatool.module.divergence import first_divergence
 from vlatool.module.edits import is_changed
@@ -65,6 +67,7 @@ class ExportOnnx(Transform):
     shape: tuple[str, ...] = Field((), description="lengths of an ONNX file's free axes: NAME=1,3,224,224")
     samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")
     tolerance: float = Field(1e-3, gt=0, description="largest relative L2 difference between torch and ONNX Runtime")
+    loop_invariants: bool = Field(True, description="compute once what is alike in all repeats of a graph")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """What exports is installed: the child process that imports it takes seconds to say so."""
@@ -84,7 +87,7 @@ class ExportOnnx(Transform):
         """Export, run, compare, and write the bundle."""
         check_chunk(source.manifest.spec)
         observations = observations_for(source, self.samples)
-        expected, graphs = self._run_and_export(source, observations, out, context)
+        expected, graphs, program = self._run_and_export(source, observations, out, context)
         gone = {name: rewrite_as_float32(out / graph.file) for name, graph in graphs.items()}
         messages: tuple[str, ...] = ()
         for name, graph in graphs.items():
@@ -92,7 +95,8 @@ class ExportOnnx(Transform):
             graphs[name], messages = replace(graph, precision=shares), messages + uncounted
         carry_over(source, out)
         context.progress("checking in ONNX Runtime", None)
-        exported = finish(source, out, made_by=made_by(self), graphs=graphs, observations=observations)
+        changes = {"program": program}
+        exported = finish(source, out, made_by=made_by(self), graphs=graphs, observations=observations, changes=changes)
         rounding = max((ROUNDING.get(kind, 0) for types in gone.values() for kind in types), default=0)
         error = self._compare(source, exported, observations, expected, max(self.tolerance, rounding))
         converted = (
@@ -103,8 +107,8 @@ class ExportOnnx(Transform):
 
     def _run_and_export(
         self, bundle: Bundle, observations: list[dict[str, Any]], out: Path, context: Context
-    ) -> tuple[list[Any], dict[str, Graph]]:
-        """Return what torch gives for the observations, and the graphs; no module is in memory afterwards.
+    ) -> tuple[list[Any], dict[str, Graph], tuple[ProgramStep, ...]]:
+        """Return what torch gives, the graphs, and the program that runs them; no module is in memory afterwards.
 
         A pruned policy whose weights stay in shards may be too large to be there as a whole: it runs with one weight at
         a time, and the weights of one graph are read to export it, which go into a file of their own.
@@ -117,12 +121,13 @@ class ExportOnnx(Transform):
             expected = self._actions(bundle, sessions, observations)
             for session in sessions.values():
                 refuse_kept_values(session.module, session.step, session.last_feeds)
-        graphs = {}
+        graphs, program = dict[str, Graph](), bundle.manifest.program
         for number, (name, session) in enumerate(sessions.items()):
             context.progress(f"exporting {name}", number / len(sessions))
             with graph_weights(stored, name) if stored else contextlib.nullcontext():
-                graphs[name] = self._export(name, session, out, beside=stored is not None)
-        return expected, graphs
+                made, program = self._export(name, session, program, out, beside=stored is not None)
+            graphs |= made
+        return expected, graphs, program
 
     def _actions(
         self, bundle: Bundle, sessions: dict[str, TorchSession], observations: list[dict[str, Any]]
@@ -148,20 +153,33 @@ class ExportOnnx(Transform):
 
         return [run(number, observation) for number, observation in enumerate(observations)]
 
-    def _export(self, name: str, session: TorchSession, out: Path, beside: bool) -> Graph:
+    def _export(
+        self, name: str, session: TorchSession, program: tuple[ProgramStep, ...], out: Path, beside: bool
+    ) -> tuple[dict[str, Graph], tuple[ProgramStep, ...]]:
+        """Write a graph, and one of what it would compute anew in each repeat; return both, and the program."""
         torch = require("torch", "build")
         for module in ("onnxscript", "onnx"):
             require(module, "build")
         feeds = [np.asarray(feed, order="C") for feed in (session.first_feeds or {}).values()]
         arguments = tuple(map(torch.from_numpy, feeds))
         exported = exported_by_torch(session.module, arguments, session.step, self.opset)
-        file = f"graphs/{name}.onnx"
         (out / "graphs").mkdir(exist_ok=True)
         fold_weights(exported.model)
         name_by_module(exported.model)
         strip_notes(exported.model)
-        exported.save(str(out / file), external_data=beside or weight_bytes(session.module) > EXTERNAL_DATA_BYTES)
-        return Graph(file, {"float32": 1.0}, self.opset)
+        beside = beside or weight_bytes(session.module) > EXTERNAL_DATA_BYTES
+        graphs = {name: Graph(f"graphs/{name}.onnx", {"float32": 1.0}, self.opset)}
+        changing = changing_feeds(program, name) if self.loop_invariants else None
+        cut = None if changing is None else cut_loop_invariants(exported.model, changing)
+        if cut is not None:
+            once = name_of_once(program, name)
+            graphs[once] = replace(graphs[name], file=f"graphs/{once}.onnx")
+            program = compute_once(program, name, once, cut)
+            require("onnx_ir", "build").save(
+                cut.model, str(out / graphs[once].file), external_data=f"{once}.onnx.data" if beside else None
+            )
+        exported.save(str(out / graphs[name].file), external_data=beside)
+        return graphs, program
 
     def _compare(
         self, source: Bundle, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any],
@@ -192,8 +210,10 @@ class ExportOnnx(Transform):
         modules = load_modules(source)
         sessions = {step.graph: TorchSession(modules[step.graph], step) for step in source.manifest.program}
         self._actions(source, sessions, [observation])
+        files = {name: exported.path / graph.file for name, graph in exported.manifest.graphs.items()}
+        order = [step.graph for step in exported.manifest.program]
         for name, session in sessions.items():
-            file = exported.path / exported.manifest.graphs[name].file
-            if node := first_divergence(session.module, file, session.first_feeds or {}, tolerance):
+            before = [files[once] for once in order[: order.index(name)][-1:] if once not in sessions]
+            if node := first_divergence(session.module, files[name], session.first_feeds or {}, tolerance, before):
                 return f"; they differ from the node '{node}' of the graph '{name}' on"
         return ""

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 Values = dict[str, Any]
 
 
-def first_divergence(module: nn.Module, file: Path, feeds: Mapping[str, Any], tolerance: float) -> str:
+def first_divergence(
+    module: nn.Module, file: Path, feeds: Mapping[str, Any], tolerance: float, before: Sequence[Path] = ()
+) -> str:
     """Return the node of a graph from which on it differs from a module, as ``module.path/Operator``; empty for none.
 
     The output of each submodule is looked for among the values that nodes of that module give in the graph. A submodule
@@ -30,11 +32,14 @@ def first_divergence(module: nn.Module, file: Path, feeds: Mapping[str, Any], to
     Args:
         module: in evaluation mode; takes the feeds in their order.
         file: the graph, whose nodes are named by their modules.
-        feeds: graph input -> numpy array.
+        feeds: input of the module -> numpy array.
         tolerance: relative L2 difference up to which values are the same.
+        before: graphs of the same module that run first, and give inputs of the graph by name.
     """
     expected = _module_outputs(module, list(feeds.values()))
-    given = _node_outputs(file, feeds)
+    given: dict[str, tuple[str, Any]] = {}
+    for part in (*before, file):
+        given |= _node_outputs(part, {**feeds, **{name: value for name, (_, value) in given.items()}})
     known = {path: _candidates(path, given) for path in expected}
     same = {path: any(relative_error(value, expected[path]) <= tolerance for _, value in known[path]) for path in known}
     paths = list(expected)
@@ -83,7 +88,8 @@ def _node_outputs(file: Path, feeds: Mapping[str, Any]) -> dict[str, tuple[str, 
     model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in nodes if name not in known)
     with scratch_directory() as folder:
         save(model, folder / "all.onnx")
-        values = engine_class()(folder / "all.onnx", threads=1).run(dict(feeds))
+        taken = {value.name: feeds[value.name] for value in model.graph.input}
+        values = engine_class()(folder / "all.onnx", threads=1).run(taken)
     return {name: (node, values[name]) for name, node in nodes.items() if np.asarray(values[name]).dtype.kind == "f"}
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec
+from vlatool.errors import PluginError
 
 Array = NDArray[Any]
 
@@ -50,6 +51,14 @@ class Policy(Protocol):
 
 
 @runtime_checkable
+class Observer(Protocol):
+    """A policy whose inputs hold several moments (``TensorSpec.history``): it sees every control step."""
+
+    def observe(self, observation: Mapping[str, Any]) -> None:
+        """Keep the observation of a control step at which the policy does not infer."""
+
+
+@runtime_checkable
 class Controller(Protocol):
     """Maps the observation of each control step to one action."""
 
@@ -62,3 +71,21 @@ class Controller(Protocol):
 
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode, with noise of this seed; that of the policy when None."""
+
+
+def observer_of(policy: Policy) -> Observer | None:
+    """Return the policy if a controller has to give it the observation of every control step, else None.
+
+    Raises:
+        PluginError: when inputs of its spec hold several moments, but it lacks ``observe``.
+    """
+    looking_back = [tensor.name for tensor in policy.spec.inputs if tensor.history]
+    if not looking_back:
+        return None
+    if not isinstance(policy, Observer):
+        raise PluginError(
+            f"{type(policy).__name__} has no method observe(); its input '{looking_back[0]}' holds several moments, of "
+            "control steps at which it does not infer, too.",
+            "add observe(observation), which passes the observation on to the wrapped policy",
+        )
+    return policy

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError
 from vlatool.runtime.assets import Assets, asset_path
+from vlatool.runtime.history import History
 from vlatool.runtime.image import FrameEncoder
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer, tokenizer_content
@@ -34,14 +35,16 @@ class ObservationEncoder:
 
     Args:
         assets: Directory of statistics and tokenizers, or the bundle that has them.
+        history: Earlier moments of inputs that hold several, which may then be given as one moment; without it, they
+            are given whole.
 
     Raises:
         SpecError: when statistics or a tokenizer are missing or do not fit.
     """
 
-    def __init__(self, spec: PolicySpec, assets: Assets) -> None:
+    def __init__(self, spec: PolicySpec, assets: Assets, history: History | None = None) -> None:
         self.names = [tensor.name for tensor in spec.inputs]
-        self._encoders = [(tensor.name, _encoder(tensor, assets)) for tensor in spec.inputs]
+        self._encoders = [(tensor.name, _encoder(tensor, assets, history)) for tensor in spec.inputs]
         self._dtypes = {tensor.name: tensor.dtype for tensor in spec.inputs}
 
     def __call__(self, observation: Mapping[str, Any]) -> EncodedObservation:
@@ -98,9 +101,11 @@ class ObservationEncoder:
         return f"{only}pass {{{written}}}"
 
 
-def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
+def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None) -> Encoder:
     if tensor.kind == "text":
         return _text_encoder(tensor, assets)
+    if tensor.history and history is not None:
+        return _moment_encoder(tensor, assets, history)
     if tensor.image is not None:
         return _frame_encoder(tensor, FrameEncoder(tensor, tensor.image))
     dtype = np.dtype(tensor.dtype)
@@ -154,6 +159,27 @@ def _frame_encoder(tensor: TensorSpec, encode_frame: FrameEncoder) -> Encoder:
         return encode_frame(value if isinstance(value, np.ndarray) else _as_array(value, tensor))
 
     return encode
+
+
+def _moment_encoder(tensor: TensorSpec, assets: Assets, history: History) -> Encoder:
+    """Return an encoder of one moment, to which those before it are added, or of all moments at once."""
+    whole, moment = _encoder(tensor, assets), _encoder(tensor.moment, assets)
+
+    def encode(value: Any) -> Array:
+        shape = _shape(value)
+        if len(shape) == len(tensor.shape) or (len(shape) == len(tensor.shape) - 1 and shape[0] != 1):
+            return whole(value)
+        return history.window(tensor.name, moment(value))
+
+    return encode
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    """Return the shape of what may become an array; none of what may not, which its encoder refuses."""
+    try:
+        return tuple(value.shape) if hasattr(value, "shape") else np.shape(value)
+    except Exception:  # the seam: numpy asks the object for an array
+        return ()
 
 
 def _text_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:

@@ -25,6 +25,7 @@ from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
 from vlatool.runtime.golden import GOLDEN_STEPS, golden_arrays, golden_chunks, golden_steps
 from vlatool.runtime.graph_files import open_graph
+from vlatool.runtime.history import History
 from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.observation import ObservationEncoder
@@ -51,7 +52,8 @@ class BundlePolicy:
         self.engine = engine
         self.spec: PolicySpec = bundle.manifest.spec
         self.program = program
-        self.encode = ObservationEncoder(self.spec, bundle)
+        self._history = History(self.spec)
+        self.encode = ObservationEncoder(self.spec, bundle, self._history)
         self._decode = Decoder(self.spec, bundle)
         certain = written_as_declared(bundle.manifest, program.sessions)
         self._outputs = Outputs(self.spec.outputs, action=False, certain=certain)
@@ -103,7 +105,9 @@ class BundlePolicy:
 
         Args:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
-                An ``EncodedObservation``, as ``encode`` returns it, is used unchanged.
+                An input with a ``history`` is given as this moment, to which the last ones since ``reset`` are added
+                (``observe``), or with all its moments, which are then its history. An ``EncodedObservation``, as
+                ``encode`` returns it, is used unchanged.
             noise: Value name -> float32 array that replaces the noise that the program would draw.
 
         Raises:
@@ -113,6 +117,29 @@ class BundlePolicy:
             UsageError: when another inference is in progress, of a policy that keeps values or in the same thread.
         """
         start = time.perf_counter_ns()
+        if not self._history.lengths:
+            return self._infer(observation, noise, start)
+        if self._busy:
+            self._check_overlap()
+        with self._history.with_moment(self.encode, observation) as encoded:
+            return self._infer(encoded, noise, start)
+
+    def observe(self, observation: Mapping[str, Any]) -> None:
+        """Keep the observation of a control step without an inference, for inputs with a ``history``.
+
+        Where there is none, this does nothing. It does not wait for an inference in another thread.
+
+        Args:
+            observation: As ``infer`` takes it.
+
+        Raises:
+            DataError: when the observation does not fit; it is then not kept.
+        """
+        if self._history.lengths:
+            with self._history.with_moment(self.encode, observation):
+                pass
+
+    def _infer(self, observation: Mapping[str, Any], noise: Mapping[str, Array] | None, start: int) -> Action:
         if self._busy:
             self._check_overlap()
         limit = contextlib.nullcontext() if self.limit_s is None else self._stopped_after(self.limit_s)
@@ -148,14 +175,14 @@ class BundlePolicy:
                 raise UsageError(
                     "The policy is called again during an inference, in the same thread (a signal handler?).", fix
                 )
-        elif self.program.keeps:
+        elif self.program.keeps or self._history.lengths:
             raise UsageError(
                 "Two threads call a policy that keeps values between steps at once; that would mix their episodes.",
                 fix,
             )
 
     def reset(self, seed: int | None = None) -> None:
-        """Start a new episode: forget kept values, restart the noise.
+        """Start a new episode: forget kept values and earlier moments, restart the noise.
 
         Args:
             seed: Seed of this episode's noise; the policy's own when None, so that all episodes draw the same noise.
@@ -168,6 +195,7 @@ class BundlePolicy:
             if self._busy:
                 self._check_overlap()
             self._sequence = 0
+            self._history.forget()
             self.program.reset(seed)
 
     @contextlib.contextmanager

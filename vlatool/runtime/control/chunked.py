@@ -10,7 +10,7 @@ import numpy as np
 
 from vlatool.errors import UsageError
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.interface import Array, Policy
+from vlatool.runtime.interface import Array, Policy, observer_of
 
 
 class ChunkQueue:
@@ -24,11 +24,13 @@ class ChunkQueue:
 
     Raises:
         UsageError: when ``execute`` is not a whole number from 0.
+        PluginError: when inputs of the policy hold several moments, and it has no ``observe``.
     """
 
     def __init__(self, policy: Policy, execute: int = 0) -> None:
         check_whole("execute", execute, 0)
         self.policy = policy
+        self._observer = observer_of(policy)
         self.execute = execute or policy.spec.execute or policy.spec.chunk
         self.fresh = False
         """Whether the last action was the first of a chunk."""
@@ -42,11 +44,12 @@ class ChunkQueue:
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step: (A,) float32, or a 0-d int64 index of a discrete action.
 
-        The observation is used only if a new chunk is needed. If the inference raises, the next step tries again.
+        The observation is used only if a new chunk is needed, or if inputs of the policy hold several moments. If the
+        inference raises, the next step tries again.
 
         Raises:
             UsageError: when another step is in progress.
-            DataError, GraphError: as the policy's ``infer`` does.
+            DataError, GraphError: as the policy's ``infer`` or ``observe`` does.
         """
         if self._owner:
             raise UsageError("A control step begins before the last one has ended.", "make one queue for each thread")
@@ -61,6 +64,8 @@ class ChunkQueue:
         self.fresh = not self._pending
         if self.fresh:
             self._pending = list(self.policy.infer(observation).chunk[: self.execute])
+        elif self._observer is not None:
+            self._observer.observe(observation)
         return self._pending.pop(0)
 
     def reset(self, seed: int | None = None) -> None:

@@ -49,6 +49,8 @@ class LateController(ChunkQueue):
         if not self._pending and self._coming is None:
             self._coming = self.policy.infer(observation).chunk
             self._wait, self._taken = (0 if self._last is None else self._delay), 0
+        elif self._observer is not None:
+            self._observer.observe(observation)
         self.fresh = self._coming is not None and self._wait == 0
         if self._coming is not None and self._wait == 0:
             chunk = list(self._coming[self._taken :])
