@@ -394,6 +394,7 @@ def main(request):
         "program": program,
         "shapes": {key: list(value.shape) for key, value in zip(keys, first, strict=True)},
         "action": list(action.shape), "chunk": chunk, "error": max(errors),
+        "history": config.n_obs_steps,
         "tokens": None if pad is None else config.tokenizer_max_length,
         "versions": {name: version(name) for name in ("lerobot", "torch")},
     }  # fmt: skip

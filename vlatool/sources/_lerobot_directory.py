@@ -186,8 +186,9 @@ def _code(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> str:
 
 def _description(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of policy.yaml; units and modes, which a checkpoint does not say, are left out."""
+    history = {"history": facts["history"]} if facts["history"] > 1 else {}
     inputs = [
-        {"name": feature.key, "shape": facts["shapes"][key], **_tensor(feature)}
+        {"name": feature.key, "shape": facts["shapes"][key], **history, **_tensor(feature)}
         for key, feature in checkpoint.inputs.items()
     ]
     if facts["tokens"]:

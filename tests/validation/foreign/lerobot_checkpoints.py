@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,21 +25,15 @@ LIMIT = 1e-4
 MAKE = Path(__file__).with_name("_lerobot_checkpoints.py")
 
 
-def moments(policy: Any, episode: Any, step: int) -> dict[str, Any]:
-    """Return the observation at a step; of an input that takes a history, its moments, the first one copied."""
-    fed = {}
-    for tensor in policy.spec.inputs:
-        rows = episode[tensor.name]
-        history = tensor.shape[1] if len(tensor.shape) == rows.ndim + 1 else 0
-        fed[tensor.name] = rows[[max(0, step - back) for back in reversed(range(history))]] if history else rows[step]
-    return fed
-
-
 def errors(bundle: Path, recorded: Path) -> list[float]:
     """Return the relative L2 distance of each executed chunk from what LeRobot executed."""
     policy, episode = vlatool.load(bundle), np.load(recorded)
     execute, drawn, found = policy.spec.executed_actions, 0, []
-    for step in range(0, len(episode["action"]), execute):
+    for step in range(len(episode["action"])):
+        moment = {tensor.name: episode[tensor.name][step] for tensor in policy.spec.inputs}
+        if step % execute:
+            policy.observe(moment)
+            continue
         count = int(episode["drawn"][step])
         first, *fresh = [episode[f"noise_{drawn + index}"] for index in range(count)] or [None]
         drawn += count
@@ -48,9 +41,8 @@ def errors(bundle: Path, recorded: Path) -> list[float]:
         if fresh:  # the last step of DDPM draws none
             steps = next(each.repeat for each in policy.program.steps if each.repeat > 1)
             noise["fresh"] = np.concatenate([noise["fresh"], np.zeros((steps - len(fresh), *first.shape), np.float32)])
-        chunk = policy.infer(moments(policy, episode, step), noise=noise).chunk
         expected = episode["action"][step : step + execute]
-        got = chunk[: len(expected)]
+        got = policy.infer(moment, noise=noise).chunk[: len(expected)]
         found.append(float(np.linalg.norm(got - expected) / np.linalg.norm(expected)))
     return found
 
