@@ -149,7 +149,8 @@ def describe(bundle: Bundle) -> list[str]:
     executed = f"{spec.execute or spec.chunk} of {spec.chunk} actions executed"
     known = spec.control_hz is not None
     ends = f": {spec.inference_hz:g} inferences per second" if known else ""
-    lines += [f"  rate       {f'{spec.control_hz:g} Hz' if known else UNKNOWN} control, {executed}{ends}"]
+    rate = f"{spec.control_hz:g} Hz control" if known else f"control at an {UNKNOWN} rate"
+    lines += [f"  rate       {rate}, {executed}{ends}"]
     lines += [f"  unknown    {', '.join(spec.unknown())}"] if spec.unknown() else []
     lines += [f"  input      {_tensor(tensor)}" for tensor in spec.inputs]
     lines += [f"  output     {_tensor(tensor)}" for tensor in spec.outputs]

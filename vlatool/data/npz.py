@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,7 +33,7 @@ class NpzReader(Reader):
         """Claim a .npz file, and perhaps what else is an archive."""
         if path.name.endswith(cls.suffix):
             return Claim.CERTAIN
-        return Claim.MAYBE if path.is_file() and zipfile.is_zipfile(path) else Claim.NONE
+        return Claim.MAYBE if path.is_file() and _holds_arrays(path) else Claim.NONE
 
     def open(self, path: Path, spec: PolicySpec, names: Mapping[str, str]) -> Recording:
         """Open a recording, large arrays as rows that stay on the disk.
@@ -66,3 +67,10 @@ def _free_mb() -> float | None:
     figures = memory()
     known = [figures[name] for name in ("memory_available_mb", "memory_limit_mb")]
     return min((value for value in known if value is not None), default=None)
+
+
+def _holds_arrays(path: Path) -> bool:
+    """Return whether a file is an archive with an array of NumPy's in it; torch's checkpoints are archives, too."""
+    with contextlib.suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        return any(name.endswith(".npy") for name in archive.namelist())
+    return False

@@ -151,5 +151,5 @@ def _unknown(typed: str) -> SourceError:
     return SourceError(
         f"{path} is not a bundle: it has no {MANIFEST}; and no source of policies reads it (found: {names})"
         f"{f'; it looks like {about.what}' if about else ''}.",
-        known if about is None else about.remedy,
+        known if about is None else f"{about.remedy}; else {known}",
     )
