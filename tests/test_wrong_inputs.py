@@ -355,7 +355,7 @@ BUNDLES = [
         lambda at: ["inspect", at.bundle("manifest.json", b"\xff\xfe\x00")]),
     Row("a manifest that is a list", "must be a mapping; got []", 3,
         lambda at: ["inspect", at.bundle("manifest.json", b"[]")]),
-    Row("a newer manifest", "upgrade vlatool", 3, lambda at: ["inspect", at.manifest(put("schema", 2))]),
+    Row("a newer manifest", "upgrade vlatool", 3, lambda at: ["inspect", at.manifest(put("schema", 3))]),
     Row("a manifest without a spec", "The manifest has no 'spec'", 3,
         lambda at: ["inspect", at.manifest(take("spec"))]),
     Row("a manifest that leads out of the bundle", "'../../etc/passwd', which is not inside the bundle", 3,
@@ -463,8 +463,8 @@ SOURCES = [
 ]  # fmt: skip
 DATA = [
     Row("no data", "none.npz not found", 3, lambda at: ["evaluate", at.float, "--data", at.root / "none.npz"]),
-    Row("data of an unknown format", "is of an unknown format; known: npz", 3,
-        lambda at: ["evaluate", at.float, "--data", at.file("a.csv", "1,2")]),
+    Row("data of an unknown format", "is of an unknown format; known: hdf5", 3,
+        lambda at: ["evaluate", at.float, "--data", at.file("a.txt", "1,2")]),
     Row("corrupt data", "cannot be read", 3,
         lambda at: ["evaluate", at.float, "--data", at.file("a.npz", "no archive")]),
     Row("data cut short", "cannot be read", 3,

@@ -31,7 +31,7 @@ def test_what_is_no_factory(factory):
 @pytest.mark.parametrize(
     ("named", "says", "fix"),
     [
-        ("model.onnx", "is an ONNX file", "name the file itself as SOURCE"),
+        ("model.onnx", "is neither a Python function nor a file that is there", "put the file there"),
         ("original.py", "names a file but no function", "original.py:NAME"),
     ],
 )

@@ -247,7 +247,7 @@ def test_without_a_recording_there_is_nothing_to_compare_with(source_bundle, cop
     [
         ([], "takes one of --against and --log; got neither"),
         (["--log", "x.npz", "--against", "y.py:act"], "got both"),
-        (["--log", "x.npz", "--data", "z.npz"], "--data is for --against"),
+        (["--log", "x.npz", "--data", "z.npz"], "--data and --map are for --against"),
         (["--against", "y.py:act", "--reference", "z.npz"], "--reference is for --log"),
     ],
 )

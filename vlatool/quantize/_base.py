@@ -137,8 +137,13 @@ class Quantization(Transform):
 
     @property
     def recording(self) -> NamedRecording | None:
-        """Recording of the golden observations; the bundle's own when None."""
+        """Recording that ``calibration`` names; the bundle's own when None."""
         return named_recording(getattr(self, "calibration", None), getattr(self, "map", ()))
+
+    @property
+    def golden_recording(self) -> NamedRecording | None:
+        """Recording of the golden observations; the bundle's own when None."""
+        return self.recording
 
     def golden_arguments(self, source: Bundle) -> dict[str, Any]:
         """Return the observations on which ``finish`` compares the new bundle with the old one, as its arguments.
@@ -146,8 +151,9 @@ class Quantization(Transform):
         They are taken from the stage's own recording, where it has one: synthetic observations, whose ids are zero, do
         not reveal every fault of an engine.
         """
-        recorded = calibration_recording(source, self.recording) is not None
-        return {"observations": observations_for(source, MAX_COMPARED, self.recording), "recorded": recorded}
+        recording = self.golden_recording
+        recorded = calibration_recording(source, recording) is not None
+        return {"observations": observations_for(source, MAX_COMPARED, recording), "recorded": recorded}
 
     def chosen_graphs(self, bundle: Bundle) -> list[str]:
         """Return the names of the graphs to quantize."""

@@ -96,7 +96,7 @@ class SmoothQuant(CalibratedQuantization):
         return result
 
     @property
-    def recording(self) -> None:
+    def golden_recording(self) -> None:
         """None, for that of the smoothed bundle: its golden action must not change."""
 
     def summarize(self, smoothed: Bundle) -> tuple[str, ...]:
