@@ -19,8 +19,8 @@ from pathlib import Path
 
 import vlatool
 
-WANT_TORCH = ("vlatool.samples._",)
-"""Modules that are networks: they subclass torch's own."""
+WANT_TORCH = ("vlatool.samples._", "vlatool.sources._lerobot_child")
+"""Modules that are networks, which subclass torch's own, and the script that the Python of LeRobot runs."""
 
 
 def main() -> int:
