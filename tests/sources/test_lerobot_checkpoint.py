@@ -20,7 +20,7 @@ from vlatool.machine.host import LEROBOT_PYTHON
 from vlatool.registry import Claim
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.sources import _lerobot_directory as directory
-from vlatool.sources._lerobot_checkpoint import EPS, read_checkpoint
+from vlatool.sources._lerobot_checkpoint import read_checkpoint
 from vlatool.sources.lerobot import LerobotCheckpoint
 
 STATE = {"type": "STATE", "shape": [3]}
@@ -70,7 +70,9 @@ def parts() -> dict[str, Any]:
 def write(folder: Path, files: dict[str, Any]) -> Path:
     folder.mkdir(exist_ok=True)
     for name, content in files.items():
-        if name.endswith(".json"):
+        if isinstance(content, bytes):
+            (folder / name).write_bytes(content)
+        elif name.endswith(".json"):
             (folder / name).write_text(content if isinstance(content, str) else json.dumps(content))
         else:
             save_file({key: np.asarray(value, np.float32) for key, value in content.items()}, folder / name)
@@ -105,22 +107,37 @@ def test_statistics_do_what_lerobot_does_and_a_joint_that_never_moved_is_not_an_
 ) -> None:
     checkpoint = read_checkpoint(write(tmp_path / "c", parts()))
     feature = {**checkpoint.inputs, "action": checkpoint.action}[key]
-    (tmp_path / "statistics.json").write_text(json.dumps({"k": directory._rows(feature)}))
-    width = len(STATS["observation.state.mean"]) if key != "action" else 2
-    tensor = TensorSpec(key, (1, width), normalisation=mode, statistics="statistics.json#k")
-    normaliser = load_normaliser(tensor, tmp_path)
+    (tmp_path / "statistics.json").write_text(json.dumps({key: directory._rows(feature)}))
     first, second = (np.asarray(values, np.float64) for values in feature.statistics.values())
-    normalised = np.linspace(-1, 1, width)[None].astype(np.float32)
+    tensor = TensorSpec(key, (1, len(first)), **directory._tensor(feature))
+    assert (tensor.normalisation, tensor.epsilon) == (mode, 1e-8)
+    normaliser = load_normaliser(tensor, tmp_path)
+    normalised = np.linspace(-1, 1, len(first))[None].astype(np.float32)
     if mode == "mean_std":
         physical = first + np.array([[0.3, 0, -2]])
-        expected = (physical - first) / (second + EPS)
+        expected = (physical - first) / (second + 1e-8)
         np.testing.assert_allclose(normaliser.forward(physical.astype(np.float32)), expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(normaliser.inverse(normalised), normalised * second + first, rtol=1e-5, atol=1e-7)
     else:
-        spread = np.where(second == first, EPS, second - first)
-        np.testing.assert_allclose(
-            normaliser.inverse(normalised), (normalised + 1) / 2 * spread + first, rtol=1e-5, atol=1e-7
-        )
+        spread = np.where(second == first, 1e-8, second - first)
+        expected = (normalised + 1) / 2 * spread + first
+        np.testing.assert_allclose(normaliser.inverse(normalised), expected, rtol=1e-5, atol=1e-7)
         assert normaliser.forward(np.float32([[-1, 0.25]])).tolist() == [[-1, -1]]
+
+
+HOSTILE = 'c""" + __import__("os").system("touch pwned") + """'
+
+
+@pytest.mark.parametrize("name", [HOSTILE, "c\n'''", "{name}", "a b"])
+def test_the_name_of_a_directory_is_not_code(tmp_path: Path, name: str, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    checkpoint = read_checkpoint(write(tmp_path / name, parts()))
+    facts = {"graphs": {"main": {"inputs": ["in_observation_state"]}}, "versions": {}}
+    code = directory._code(facts)
+    assert "pwned" not in code
+    exec(compile(code, "policy.py", "exec"), {"__file__": str(tmp_path / "policy.py")})
+    assert not (tmp_path / "pwned").exists()
+    assert checkpoint.folder.name == name
 
 
 def edited(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
@@ -158,9 +175,22 @@ BROKEN = {
     "not JSON": (edited("config.json", to="{"), "is not valid JSON"),
     "a list": (edited("config.json", to="[]"), "holds no mapping"),
     "a NaN": (edited("policy_preprocessor.json", to='{"steps": NaN}'), "lists no steps"),
-    "not normalised": (edited(*STEPS, 3, to={"registry_name": "to_batch_processor"}), "its processors do IDENTITY"),
+    "not normalised": (edited(*STEPS, 3, to=None), "its processors do IDENTITY"),
     "no preprocessor": (edited("policy_preprocessor.json", to=None), "has no policy_preprocessor.json"),
     "no postprocessor": (edited("policy_postprocessor.json", to=None), "has no policy_postprocessor.json"),
+    "names that collide": (edited(*INPUTS, "observation_state", to=STATE), "of one name in the graph"),
+    "rename map of text": (edited(*STEPS, 0, "config", "rename_map", to=["a"]), "rename_map"),
+    "rename map of lists": (edited(*STEPS, 0, "config", "rename_map", to={"a": ["b"]}), "rename_map"),
+    "two robot keys": (
+        edited(*STEPS, 0, "config", "rename_map", to={"a": "observation.state", "b": "observation.state"}),
+        "rename_map",
+    ),
+    "modes of text": (edited(*STEPS, 3, "config", "norm_map", to="MEAN_STD"), "norm_map"),
+    "a step twice": (edited(*STEPS, 1, to=normalizer("normalizer", FEATURES)), "twice"),
+    "corrupt statistics": (edited(STATES, to=b"\x08" + bytes(7) + b"{"), "cannot be read"),
+    "empty statistics": (edited(STATES, to=b""), "cannot be read"),
+    "epsilon of text": (edited(*STEPS, 3, "config", "eps", to="small"), "eps"),
+    "no steps to execute": (edited("config.json", "n_action_steps", to=-2), "n_action_steps"),
     "code": (edited(*STEPS, 1, to={"class": "subprocess.Popen", "config": {"args": "touch pwned"}}), "that is code"),
     "a step of text": (edited(*STEPS, 1, to="to_batch_processor"), "that is code"),
     "unknown step": (edited(*STEPS, 1, "registry_name", to="relative_actions_processor"), "relative_actions_processor"),

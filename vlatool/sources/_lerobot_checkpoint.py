@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,6 @@ MODES = {
 """Normalisation of LeRobot (``processor/normalize_processor.py`` of 0.6) -> the statistics that it takes."""
 EMPTY_CAMERA = "observation.images.empty_camera_"
 """Cameras that the policy fills with a constant itself."""
-EPS = 1e-8
-"""LeRobot adds it to a standard deviation on the way in, not on the way out, and takes it for a range of 0."""
 COMPLETE = "save the policy again with save_pretrained, its processors, too: config.json, model.safetensors and both "
 COMPLETE += "policy_*processor.json with their .safetensors"
 Statistics = Mapping[str, NDArray[np.float64]]
@@ -43,6 +42,7 @@ class Feature:
         kind: ``STATE``, ``VISUAL``, ``ENV`` or ``ACTION``.
         mode: how LeRobot normalises it, of ``MODES``.
         statistics: what the mode takes, float64 of the feature's elements; (3,) for pictures.
+        epsilon: what LeRobot adds to a standard deviation on the way in, not on the way out, and puts for a range of 0.
     """
 
     key: str
@@ -50,6 +50,7 @@ class Feature:
     shape: tuple[int, ...]
     mode: str
     statistics: Statistics
+    epsilon: float
 
 
 @dataclass(frozen=True)
@@ -96,10 +97,12 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER))
     mapping = config.get("normalization_mapping")
     trained_with = mapping if isinstance(mapping, dict) else {}
-    robot_key = {policy: robot for robot, policy in steps.get(RENAME, {}).get("rename_map", {}).items()}
+    robot_key = _robot_keys(folder, steps.get(RENAME, {}).get("rename_map", {}))
+    features = _features(folder, config, "input_features")
+    _check_names(folder, features)
     inputs = {
         key: _feature(folder, (key, robot_key.get(key, key)), about, steps.get(NORMALIZER, {}), trained_with)
-        for key, about in _features(folder, config, "input_features").items()
+        for key, about in features.items()
         if not key.startswith(EMPTY_CAMERA)
     }
     outputs = _features(folder, config, "output_features")
@@ -107,7 +110,27 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise SourceError(f"{folder} has the outputs {sorted(outputs)}; wanted: action.", COMPLETE)
     action = _feature(folder, ("action", "action"), outputs["action"], behind.get(UNNORMALIZER, {}), trained_with)
     execute = config.get("n_action_steps", 1)
-    return Checkpoint(folder, str(family), inputs, action, execute if isinstance(execute, int) else 1)
+    if not isinstance(execute, int) or execute < 1:
+        raise SourceError(f"config.json of {folder} has n_action_steps {truncate(repr(execute), 40)}.", COMPLETE)
+    return Checkpoint(folder, str(family), inputs, action, execute)
+
+
+def _robot_keys(folder: Path, renames: Any) -> dict[str, str]:
+    """Return key in the policy -> key that a robot uses, of what LeRobot renames."""
+    known = isinstance(renames, dict) and all(isinstance(policy, str) for policy in renames.values())
+    if not known or len(set(renames.values())) < len(renames):
+        raise SourceError(f"{folder} has the rename_map {truncate(repr(renames), 80)}; wanted: key -> key.", COMPLETE)
+    return {policy: robot for robot, policy in renames.items()}
+
+
+def _check_names(folder: Path, keys: Iterable[str]) -> None:
+    """Refuse features that the graphs cannot tell apart: their inputs are named by letters and digits alone."""
+    names: dict[str, str] = {}
+    for key in keys:
+        if (other := names.setdefault(re.sub(r"\W", "_", key, flags=re.ASCII), key)) != key:
+            raise SourceError(
+                f"{folder} has the inputs '{other}' and '{key}', of one name in the graph.", "rename one of them"
+            )
 
 
 def _mapping(folder: Path, name: str) -> dict[str, Any]:
@@ -152,6 +175,8 @@ def _steps(folder: Path, name: str, known: tuple[str, ...]) -> dict[str, dict[st
                 f"{folder / name} has the step '{truncate(registered, 80)}'; {suggest(registered, known)}.",
                 "what the step does must be part of a policy.yaml of your own: docs/guides/lerobot-policy.md",
             )
+        if registered in steps:
+            raise SourceError(f"{folder / name} has the step '{registered}' twice.", COMPLETE)
         settings = step.get("config")
         steps[registered] = {**(settings if isinstance(settings, dict) else {}), "state_file": step.get("state_file")}
     return steps
@@ -174,8 +199,12 @@ def _feature(
     shape, kind = about.get("shape"), str(about.get("type"))
     if not isinstance(shape, list) or not shape or not all(isinstance(size, int) and size > 0 for size in shape):
         raise SourceError(f"config.json of {folder} gives '{key}' the shape {truncate(repr(shape), 60)}.", COMPLETE)
-    known = step.get("features")
-    mode = str((step.get("norm_map") or {}).get(kind, "IDENTITY")) if isinstance(known, dict) and key in known else ""
+    known, modes, epsilon = step.get("features"), step.get("norm_map") or {}, step.get("eps", 1e-8)
+    if not isinstance(modes, dict):
+        raise SourceError(f"{folder} has the norm_map {truncate(repr(modes), 60)}; wanted: kind -> mode.", COMPLETE)
+    if isinstance(epsilon, bool) or not isinstance(epsilon, int | float) or not 0 <= epsilon < 1:
+        raise SourceError(f"{folder} has the eps {truncate(repr(epsilon), 40)}; wanted: 0 to 1.", COMPLETE)
+    mode = str(modes.get(kind, "IDENTITY")) if isinstance(known, dict) and key in known else ""
     mode = mode or "IDENTITY"
     if mode not in MODES:
         raise SourceError(f"{folder} normalises '{key}' by {truncate(mode, 40)}; {suggest(mode, MODES)}.", COMPLETE)
@@ -195,7 +224,7 @@ def _feature(
                 f"{width} numbers.",
                 COMPLETE,
             )
-    return Feature(robot_key, kind, tuple(shape), mode, statistics)
+    return Feature(robot_key, kind, tuple(shape), mode, statistics, float(epsilon))
 
 
 def _statistic(folder: Path, step: Mapping[str, Any], key: str, name: str, mode: str) -> NDArray[np.float64]:
@@ -208,7 +237,11 @@ def _statistic(folder: Path, step: Mapping[str, Any], key: str, name: str, mode:
     path = folder / Path(file).name
     if not file or not path.is_file():
         raise SourceError(f"{folder} lacks the file of statistics {file or '(state_file)'} for '{key}'.", COMPLETE)
-    tensors = require("safetensors.numpy", "build").load_file(path)
+    error_type = require("safetensors", "build").SafetensorError
+    try:
+        tensors = require("safetensors.numpy", "build").load_file(path)
+    except (error_type, OSError, ValueError, TypeError) as error:  # TypeError: a dtype that NumPy has not
+        raise SourceError(f"{path} cannot be read: {truncate(str(error), 200)}.", COMPLETE) from error
     if f"{key}.{name}" not in tensors:
         raise SourceError(
             f"{path} has no '{key}.{name}', which {mode} needs; LeRobot would pass '{key}' on unchanged, silently.",

@@ -29,8 +29,8 @@ TEXT = "task"
 
 
 def identifier(key):
-    """Return a name that a graph's input may have, for the key of an observation."""
-    return re.sub(r"\W", "_", key)
+    """Return the name of a graph's input for the key of an observation; not a keyword, whatever the key is."""
+    return "in_" + re.sub(r"\W", "_", key, flags=re.ASCII)
 
 
 class Pictures(nn.Module):
@@ -88,11 +88,7 @@ class Condition(nn.Module):
 
     def __init__(self, policy, observation):
         super().__init__()
-        self.diffusion, self.observation, self.cameras = (
-            policy.diffusion,
-            observation,
-            list(policy.config.image_features),
-        )
+        self.diffusion, self.observation, self.cameras = policy.diffusion, observation, observation.cameras
 
     def forward(self, *values):
         batch = self.observation(values)

@@ -23,17 +23,12 @@ from vlatool.files.directory_writer import write_directory
 from vlatool.files.printable import truncate
 from vlatool.machine.host import LEROBOT_PYTHON, cache_directory
 from vlatool.module.description import FILE
-from vlatool.sources._lerobot_checkpoint import EPS, Checkpoint, Feature, read_checkpoint
+from vlatool.sources._lerobot_checkpoint import Checkpoint, Feature, read_checkpoint
 from vlatool.stage.base import content_hash
 
 CHILD = Path(__file__).with_name("_lerobot_child.py")
 TIMEOUT_S = 3600
-NORMALISATIONS = {"MEAN_STD": "mean_std", "MIN_MAX": "min_max", "QUANTILES": "quantiles", "QUANTILE10": "quantiles"}
-ROWS = {
-    "MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q01", "q99"),
-}  # fmt: skip
-"""Mode of LeRobot -> the names that the normalisation of a spec gives its two rows."""
-POLICY = '''"""The graphs of {name}, traced from a LeRobot checkpoint ({versions})."""
+POLICY = '''"""The graphs of a LeRobot checkpoint, traced by LeRobot; policy.yaml says how they are run."""
 
 from pathlib import Path
 
@@ -105,7 +100,7 @@ def write_policy(checkpoint: Checkpoint, python: str, out: Path) -> None:
     (out / "statistics.json").write_text(
         json.dumps({key: rows for key, rows in statistics.items() if rows}, indent=1) + "\n", encoding="utf-8"
     )
-    (out / "policy.py").write_text(_code(checkpoint, facts), encoding="utf-8")
+    (out / "policy.py").write_text(_code(facts), encoding="utf-8")
     described = _description(checkpoint, facts)
     (out / FILE).write_text(yaml.safe_dump(described, sort_keys=False, width=120), encoding="utf-8")
 
@@ -149,39 +144,25 @@ def _offset_and_scale(feature: Feature) -> tuple[NDArray[np.float64], NDArray[np
     """Return what LeRobot subtracts from a feature, and what it divides by then."""
     first, second = feature.statistics.values()
     if feature.mode == "MEAN_STD":
-        return first, second + EPS
-    spread = np.where(second == first, EPS, second - first) / 2
+        return first, second + feature.epsilon
+    spread = np.where(second == first, feature.epsilon, second - first) / 2
     return first + spread, spread
 
 
 def _rows(feature: Feature) -> dict[str, list[float]]:
-    """Return the statistics of a vector for the spec; none for what is not normalised, or inside of the graph.
-
-    On the way in, LeRobot divides by std + 1e-8. A joint that never moved has a std, or a range, of 0: the smallest
-    scale that keeps an action of such a joint within 1e-8 of the recorded one stands for it.
-    """
-    if feature.kind == "VISUAL" or feature.mode == "IDENTITY":
-        return {}
-    names = ROWS[feature.mode]
-    first, second = feature.statistics.values()
-    if feature.mode == "MEAN_STD":
-        second = second + EPS if feature.kind != "ACTION" else np.where(second > 0, second, EPS)
-    else:
-        first, second = first.astype(np.float32), second.astype(np.float32)
-        step = np.nextafter(np.abs(first), np.float32(np.inf)) - np.abs(first)
-        second = np.where(second > first, second, first + 2 * np.maximum(step, np.float32(EPS)))
-    return {names[0]: first.tolist(), names[1]: second.tolist()}
+    """Return the statistics of a vector for the spec; none for what is not normalised, or inside of the graph."""
+    named = {} if feature.kind == "VISUAL" else feature.statistics
+    return {name: values.tolist() for name, values in named.items()}
 
 
-def _code(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> str:
-    """Return policy.py, which opens the traced graphs."""
+def _code(facts: Mapping[str, Any]) -> str:
+    """Return policy.py, which opens the traced graphs; nothing that the checkpoint says becomes code."""
     graphs = facts["graphs"]
     classes = "".join(
         GRAPH.format(title=name.title(), name=name, inputs=", ".join(about["inputs"])) for name, about in graphs.items()
     )
     modules = ", ".join(f'"{name}": {name.title()}()' for name in graphs)
-    versions = ", ".join(f"{name} {version}" for name, version in facts["versions"].items())
-    return POLICY.format(name=checkpoint.folder.name, versions=versions, classes=classes, modules=modules)
+    return POLICY.format(classes=classes, modules=modules)
 
 
 def _description(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -222,5 +203,5 @@ def _tensor(feature: Feature) -> dict[str, Any]:
         return {"dtype": "uint8", "unit": "rgb"}
     if feature.mode == "IDENTITY":
         return {"dtype": "float32"}
-    statistics = {"normalisation": NORMALISATIONS[feature.mode], "statistics": f"statistics.json#{feature.key}"}
-    return {"dtype": "float32", **statistics}
+    how = {"normalisation": feature.mode.lower(), "epsilon": feature.epsilon}  # a spec calls the modes as LeRobot does
+    return {"dtype": "float32", **how, "statistics": f"statistics.json#{feature.key}"}
