@@ -111,15 +111,15 @@ def definitions(report: Schema) -> dict[str, Schema]:
             "additionalProperties": False,
         },
         "profile": {**_inlined(Profile.model_json_schema(mode="serialization")), "description": "A hardware profile."},
-        **_documents(),
+        **_documents_of_bundles(),
+        **_documents_of_stores(),
+        **_documents_of_machines(),
     }
 
 
-def _documents() -> dict[str, Schema]:
-    """Return the documents that only the command line has."""
+def _documents_of_bundles() -> dict[str, Schema]:
+    """Return the documents on policies and bundles that only the command line has."""
     files = many(record(file=TEXT, bytes=INTEGER, identical=FLAG, why=TEXT))
-    status = {"enum": ["ok", "warn", "missing"]}
-    both = {"type": "array", "items": NUMBER}
     return {
         "plan": document("What optimize would do.", plan=PLAN),
         "made": document(
@@ -153,6 +153,18 @@ def _documents() -> dict[str, Schema]:
             versions=by_name(SHIFT), stages=many(record(stage=TEXT, graphs_identical=FLAG)), files=files,
             output={"type": ["string", "null"]},
         ),
+        "policy": document(
+            "A policy directory that was written; unknown: what nobody said.", policy=TEXT, source=TEXT,
+            unknown=many(TEXT),
+        ),
+        "samples": many(record(name=TEXT, description=TEXT)),
+        "sample": document("A policy that was written.", policy=TEXT, sample=TEXT, seed=INTEGER),
+    }  # fmt: skip
+
+
+def _documents_of_stores() -> dict[str, Schema]:
+    """Return the documents on the cache and on recordings."""
+    return {
         "cache_size": document("What the cache holds, stage by stage.", **CACHE, stages=many(
             record(stage=TEXT, entries=INTEGER, bytes=INTEGER))),
         "cache_list": document("What the cache holds, the least recently used first.", **CACHE, entries=many(
@@ -169,6 +181,14 @@ def _documents() -> dict[str, Schema]:
                 constant=many(INTEGER), drift_ms=NUMBER)),
             gaps=many(record(episode=INTEGER, step=INTEGER, seconds=NUMBER)), gap_count=INTEGER, findings=many(TEXT),
         ),
+    }  # fmt: skip
+
+
+def _documents_of_machines() -> dict[str, Schema]:
+    """Return the documents on this machine and on boards."""
+    status = {"enum": ["ok", "warn", "missing"]}
+    both = {"type": "array", "items": NUMBER}
+    return {
         "checks": many(record(name=TEXT, status=status, finding=TEXT, fix=TEXT)),
         "simulation": document(
             "Predicted, not measured; latency_ms: value, low, high.",
@@ -189,12 +209,6 @@ def _documents() -> dict[str, Schema]:
         "validated": document("Profiles by name, and what is wrong with others.", valid=many(TEXT), wrong=many(TEXT)),
         "calibrated": document("Measurements given to the latency model.", kept_in=TEXT, measured=many(ANY_OBJECT)),
         "written": document("Files that were written.", written=many(TEXT)),
-        "policy": document(
-            "A policy directory that was written; unknown: what nobody said.", policy=TEXT, source=TEXT,
-            unknown=many(TEXT),
-        ),
-        "samples": many(record(name=TEXT, description=TEXT)),
-        "sample": document("A policy that was written.", policy=TEXT, sample=TEXT, seed=INTEGER),
     }  # fmt: skip
 
 

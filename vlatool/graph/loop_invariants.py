@@ -7,32 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import require
+from vlatool.graph.graph_cut import GraphCut, names_of
 
 PRODUCTS = ("MatMul", "Gemm", "Conv")
 MACS_PER_ELEMENT = 8
 """Fewest multiply-accumulates that are saved for each element that goes from one graph to the other."""
-
-
-@dataclass(frozen=True)
-class LoopInvariants:
-    """The part of a graph that is computed once.
-
-    Args:
-        model: An ``onnx_ir.Model`` that computes ``values`` from ``inputs``.
-        inputs: Inputs of the original graph that it reads.
-        values: Values that the rest of the graph reads from it.
-        kept: Inputs of the original graph that the rest still reads.
-    """
-
-    model: Any
-    inputs: tuple[str, ...]
-    values: tuple[str, ...]
-    kept: tuple[str, ...]
 
 
 def changing_feeds(program: Sequence[ProgramStep], name: str) -> set[str] | None:
@@ -57,7 +41,7 @@ def name_of_once(program: Sequence[ProgramStep], name: str) -> str:
     return once
 
 
-def compute_once(program: Iterable[ProgramStep], name: str, once: str, cut: LoopInvariants) -> tuple[ProgramStep, ...]:
+def compute_once(program: Iterable[ProgramStep], name: str, once: str, cut: GraphCut) -> tuple[ProgramStep, ...]:
     """Return the program in which the graph ``once`` runs before each loop over the graph ``name``."""
     steps: list[ProgramStep] = []
     for step in program:
@@ -74,7 +58,7 @@ def compute_once(program: Iterable[ProgramStep], name: str, once: str, cut: Loop
     return tuple(steps)
 
 
-def cut_loop_invariants(model: Any, changing: Collection[str]) -> LoopInvariants | None:
+def cut_loop_invariants(model: Any, changing: Collection[str]) -> GraphCut | None:
     """Move the nodes that depend on no changing input into another graph, in place.
 
     They are products, what leads to them, and what follows without becoming larger (biases, transpositions).
@@ -103,7 +87,7 @@ def cut_loop_invariants(model: Any, changing: Collection[str]) -> LoopInvariants
         if not value.uses():
             graph.inputs.remove(value)
     kept = [value.name for value in graph.inputs[: len(graph.inputs) - len(values)]]
-    return LoopInvariants(once, _names(inputs), _names(values), tuple(kept))
+    return GraphCut(once, names_of(inputs), names_of(values), tuple(kept))
 
 
 def _nodes_worth_moving(graph: Any, changing: Collection[str]) -> set[Any]:
@@ -182,7 +166,3 @@ def _size(value: Any) -> float:
     if value.shape is None or not all(isinstance(axis, int) for axis in value.shape):
         return math.inf
     return float(math.prod(value.shape))
-
-
-def _names(values: Iterable[Any]) -> tuple[str, ...]:
-    return tuple(value.name for value in values)

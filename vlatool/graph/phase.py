@@ -6,10 +6,9 @@ bits, so a phase of 300 radians is off by up to one radian and its sine is noise
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
+from vlatool.graph.graph_cut import GraphCut, names_of
 from vlatool.graph.nodes import read_names, reads, varying_values
 from vlatool.graph.onnx_graph import OnnxGraph
 
@@ -17,24 +16,7 @@ PERIODIC = ("Sin", "Cos")
 HEAVY = ("MatMul", "Gemm", "Conv", "Einsum", "Attention")
 
 
-@dataclass(frozen=True)
-class PhaseCut:
-    """The float32 part of a graph.
-
-    Args:
-        model: An ``onnx.ModelProto`` that computes ``values`` from ``inputs``.
-        inputs: Inputs of the original graph that it reads.
-        values: Values that the rest of the graph reads from it.
-        kept: Inputs of the original graph that the rest still reads.
-    """
-
-    model: Any
-    inputs: tuple[str, ...]
-    values: tuple[str, ...]
-    kept: tuple[str, ...]
-
-
-def cut_phases(model: Any) -> PhaseCut | None:
+def cut_phases(model: Any) -> GraphCut | None:
     """Move the nodes that lead to Sin and Cos into a separate graph, in place.
 
     Args:
@@ -64,7 +46,7 @@ def cut_phases(model: Any) -> PhaseCut | None:
     inputs = [value for value in model.graph.input if value.name in read]
     del model.graph.input[:]
     model.graph.input.extend([*inputs, *(types[name] for name in values)])
-    return PhaseCut(part, _names(part.graph.input), tuple(values), _names(inputs))
+    return GraphCut(part, names_of(part.graph.input), tuple(values), names_of(inputs))
 
 
 def periodic_nodes(model: Any) -> list[Any]:
@@ -92,7 +74,3 @@ def _model_of(nodes: list[Any], graph: OnnxGraph) -> Any:
     constants = [tensor for name, tensor in graph.constants.items() if name in read]
     part = helper.make_graph(nodes, "phases", inputs, [], constants)
     return helper.make_model(part, opset_imports=graph.model.opset_import, ir_version=graph.model.ir_version)
-
-
-def _names(values: Iterable[Any]) -> tuple[str, ...]:
-    return tuple(value.name for value in values)
