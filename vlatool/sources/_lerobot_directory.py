@@ -80,7 +80,9 @@ def lerobot_python() -> str:
     """
     named = os.environ.get(LEROBOT_PYTHON)
     if named and not (os.path.isfile(named) and os.access(named, os.X_OK)):
-        raise SourceError(f"{LEROBOT_PYTHON} names {named}, which is not a program.", "name a python that has lerobot")
+        raise SourceError(
+            f"--python (or {LEROBOT_PYTHON}) names '{named}', which is not a program.", "name a python that has lerobot"
+        )
     if not named and find_spec("lerobot") is None:
         raise SourceError(
             "A LeRobot checkpoint is traced by LeRobot itself, which is not installed beside vlatool.",

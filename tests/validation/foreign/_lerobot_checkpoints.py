@@ -1,12 +1,13 @@
 """Make a LeRobot checkpoint with random weights, and record what its policy does; run in the Python that has LeRobot.
 
-    python _lerobot_checkpoints.py act|diffusion-ddim|diffusion-ddpm FOLDER [--small] [--steps 50]
+    python _lerobot_checkpoints.py act|diffusion-ddim|diffusion-ddpm|smolvla FOLDER [--small] [--steps 50]
 
 Writes ``FOLDER/checkpoint`` and ``FOLDER/episode.npz``: the observations of an episode (N, ...), the actions (N, A) of
 ``select_action`` with LeRobot's own processors around it, and the noise that each inference drew.
 """
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from unittest import mock
@@ -17,6 +18,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 
 JOINTS = 14
+TEXTS = ("red cup", "green bowl", "cup into the bowl\n")
 
 
 def features(height, width, cameras):
@@ -51,6 +53,18 @@ def diffusion(kind, small):
     return DiffusionPolicy(config)
 
 
+def smolvla(folder):
+    """Return a small SmolVLA, as the foreign policy of that name has it, with its backbone beside the checkpoint."""
+    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+
+    sys.path += [str(Path(__file__).with_name(name)) for name in ("lerobot_smolvla", "_lerobot")]
+    from original import backbone, config
+
+    os.chdir(folder)  # the checkpoint names its backbone relative to where it lies
+    backbone("backbone")
+    return SmolVLAPolicy(config())
+
+
 def statistics(config):
     """Return statistics as a dataset has them; one joint never moved."""
     generator = torch.Generator().manual_seed(1)
@@ -60,7 +74,8 @@ def statistics(config):
             mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
             found[key] = {"mean": mean.reshape(3, 1, 1), "std": std.reshape(3, 1, 1)}
             continue
-        mean, std = torch.randn(JOINTS, generator=generator), torch.rand(JOINTS, generator=generator) + 0.1
+        shape = {**config.input_features, **config.output_features}[key].shape
+        mean, std = torch.randn(shape, generator=generator), torch.rand(shape, generator=generator) + 0.1
         std[3] = 0
         found[key] = {"mean": mean, "std": std, "min": mean - 2 * std, "max": mean + 2 * std}
     return found
@@ -82,7 +97,9 @@ def observation(config, generator, still):
 def main(kind, folder, small, steps):
     """Write the checkpoint and the episode."""
     torch.manual_seed(0)
-    policy = (act(small) if kind == "act" else diffusion(kind.rpartition("-")[2].upper(), small)).eval()
+    folder.mkdir(parents=True, exist_ok=True)
+    make = {"act": lambda: act(small), "smolvla": lambda: smolvla(folder)}
+    policy = make.get(kind, lambda: diffusion(kind.rpartition("-")[2].upper(), small))().eval()
     config, stats = policy.config, statistics(policy.config)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     for part in (policy, before, after):
@@ -95,7 +112,9 @@ def main(kind, folder, small, steps):
 
     real = torch.randn
     replaced = [mock.patch.object(torch, "randn", lambda *args, **more: noise(more.get("size", args)))]
-    if kind != "act":
+    if kind == "smolvla":
+        policy.model.sample_noise = noise
+    elif kind != "act":
         scheduler = sys.modules[type(policy.diffusion.noise_scheduler).__module__]
         replaced.append(mock.patch.object(scheduler, "randn_tensor", noise))
     seen, actions, counts = [], [], []
@@ -107,15 +126,16 @@ def main(kind, folder, small, steps):
                 key: value.permute(2, 0, 1).float() / 255 if key in config.image_features else value
                 for key, value in raw.items()
             }
+            if kind == "smolvla":
+                fed["task"] = raw["task"] = f"pick up the {TEXTS[len(seen) % len(TEXTS)]}"
             start = len(drawn)
             with mock.patch.object(torch, "randn", real):
                 batch = before(fed)
-            actions.append(
-                after(_with(replaced, policy, batch) if kind != "act" else policy.select_action(batch))[0].numpy()
-            )
+            chosen = _with(replaced, policy, batch) if kind.startswith("diffusion") else policy.select_action(batch)
+            actions.append(after(chosen)[0].numpy())
             counts.append(len(drawn) - start)
             seen.append(raw)
-    rows = {key: np.stack([raw[key].numpy() for raw in seen]) for key in seen[0]}
+    rows = {key: np.array([raw[key] if key == "task" else raw[key].numpy() for raw in seen]) for key in seen[0]}
     noises = {f"noise_{number}": value.numpy() for number, value in enumerate(drawn)}
     np.savez(folder / "episode.npz", action=np.stack(actions), drawn=np.array(counts), **rows, **noises)
 
@@ -131,9 +151,9 @@ def _with(replaced, policy, batch):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kind", choices=("act", "diffusion-ddim", "diffusion-ddpm"))
+    parser.add_argument("kind", choices=("act", "diffusion-ddim", "diffusion-ddpm", "smolvla"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--small", action="store_true")
     parser.add_argument("--steps", type=int, default=50)
     given = parser.parse_args()
-    main(given.kind, given.folder, given.small, given.steps)
+    main(given.kind, given.folder.resolve(), given.small, given.steps)

@@ -2,7 +2,7 @@
 
     python tests/validation/foreign/lerobot_checkpoints.py --python ~/lerobot/bin/python [--small] [--steps 50]
 
-``--python`` has LeRobot 0.6 (``pip install 'lerobot[diffusion]==0.6.1'`` on Python 3.12); vlatool is not needed there.
+``--python`` has LeRobot 0.6 (``pip install 'lerobot[diffusion,smolvla]==0.6.1'``, Python 3.12); it needs no vlatool.
 For each policy: LeRobot makes a checkpoint with random weights and plays an episode with its own processors; then
 ``vlatool export onnx CHECKPOINT --python ...`` and ``vlatool.load`` here, fed the same observations and noise. Prints
 the relative L2 distance of the action chunks, and exits 1 when one is above 1e-4.
@@ -15,12 +15,13 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import vlatool
 
-KINDS = ("act", "diffusion-ddim", "diffusion-ddpm")
+KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla")
 LIMIT = 1e-4
 MAKE = Path(__file__).with_name("_lerobot_checkpoints.py")
 
@@ -28,16 +29,17 @@ MAKE = Path(__file__).with_name("_lerobot_checkpoints.py")
 def errors(bundle: Path, recorded: Path) -> list[float]:
     """Return the relative L2 distance of each executed chunk from what LeRobot executed."""
     policy, episode = vlatool.load(bundle), np.load(recorded)
+    drawn_name = next((name for step in policy.program.steps for name in step.noise), "")
     execute, drawn, found = policy.spec.executed_actions, 0, []
     for step in range(len(episode["action"])):
-        moment = {tensor.name: episode[tensor.name][step] for tensor in policy.spec.inputs}
+        moment = {each.name: _value(episode[each.name][step]) for each in policy.spec.inputs}
         if step % execute:
             policy.observe(moment)
             continue
         count = int(episode["drawn"][step])
         first, *fresh = [episode[f"noise_{drawn + index}"] for index in range(count)] or [None]
         drawn += count
-        noise = None if first is None else {"sample": first, **({"fresh": np.stack(fresh)} if fresh else {})}
+        noise = None if first is None else {drawn_name: first, **({"fresh": np.stack(fresh)} if fresh else {})}
         if fresh:  # the last step of DDPM draws none
             steps = next(each.repeat for each in policy.program.steps if each.repeat > 1)
             noise["fresh"] = np.concatenate([noise["fresh"], np.zeros((steps - len(fresh), *first.shape), np.float32)])
@@ -45,6 +47,10 @@ def errors(bundle: Path, recorded: Path) -> list[float]:
         got = policy.infer(moment, noise=noise).chunk[: len(expected)]
         found.append(float(np.linalg.norm(got - expected) / np.linalg.norm(expected)))
     return found
+
+
+def _value(recorded: Any) -> Any:
+    return str(recorded) if recorded.dtype.kind == "U" else recorded
 
 
 def main(arguments: list[str]) -> int:
