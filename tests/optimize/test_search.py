@@ -217,6 +217,7 @@ def made_of(search, monkeypatch):
             run._try(f"int8{ending}", ({"quantize.static_int8": options},))
         for base in list(run.trials):
             run._combine(base)
+        run._try_methods()
         return run
 
     return start
@@ -242,13 +243,26 @@ def test_what_may_be_as_fast_on_a_busy_machine_is_combined_too(made_of) -> None:
 
 def test_of_three_the_one_that_costs_most_is_left_out_again(made_of) -> None:
     three = {**ALONE, "elementwise": (2.2, 0.06), "attention+elementwise+method": (2.8, 0.08)}
-    run = made_of({**three, "attention+method": (2.4, 0.038)}, 0.04)
-    assert [trial.name for trial in run.trials[4:]] == ["int8_attention_elementwise_mse", "int8_attention_mse"]
+    run = made_of({**three, "attention+method": (2.4, 0.038), "elementwise+method": (2.2, 0.05)}, 0.04)
+    assert [trial.name for trial in run.trials[4:6]] == ["int8_attention_elementwise_mse", "int8_attention_mse"]
 
 
 def test_a_way_to_choose_ranges_that_is_no_more_accurate_is_not_combined(made_of) -> None:
-    run = made_of({**ALONE, "method": (2.1, 0.031)}, 0.04)
+    run = made_of({**ALONE, "method": (2.1, 0.031), "attention": (2.1, 0.045)}, 0.04)
     assert len(run.trials) == 4
+
+
+def test_a_way_to_choose_ranges_is_tried_on_a_fast_plan_though_it_lost_on_a_slow_one(made_of) -> None:
+    lost = {**ALONE, "method": (2.0, 0.031)}
+    run = made_of({**lost, "attention+method": (2.4, 0.034)}, 0.04)
+    assert [trial.name for trial in run.trials[4:]] == ["int8_attention_mse"]
+    assert run._finalists()[0].name == "int8_attention_mse"
+    worse = made_of({**lost, "elementwise": (2.6, 0.06), "attention+method": (2.4, 0.034),
+                     "elementwise+method": (2.6, 0.05), "attention+elementwise": (2.9, 0.09),
+                     "attention+elementwise+method": (2.9, 0.08)}, 0.04)  # fmt: skip
+    names = [trial.name for trial in worse.trials]
+    assert len(names) == len(set(names))
+    assert {"int8_attention_mse", "int8_elementwise_mse"} <= set(names)
 
 
 def test_finalists_reach_a_hair_beyond_the_budget_and_hold_a_plan_inside(search) -> None:
