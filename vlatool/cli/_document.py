@@ -12,7 +12,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -78,6 +78,15 @@ def document(value: Any, text: str = "") -> None:
         _now[-1].take(value, text)
     else:
         typer.echo(text or json_text(value), nl=False)
+
+
+def answer(as_json: bool, value: Any, lines: Iterable[str]) -> None:
+    """Hand over a result for ``--json``, or print what a person reads of it."""
+    if as_json:
+        document(value)
+        return
+    for line in lines:
+        typer.echo(line)
 
 
 def json_text(value: Any) -> str:

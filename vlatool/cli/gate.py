@@ -80,9 +80,10 @@ def run(
         )
     if not base.exists():
         raise BundleError(f"No baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
-    refuse_existing(output, force, candidate, *_read_by(gate, base), config)
+    inputs = (candidate, base, *gate.paths, config)
+    refuse_existing(output, force, *inputs)
     if junit is not None:
-        _check_junit(junit, candidate, *_read_by(gate, base), config)
+        _check_junit(junit, inputs)
     with progress(*crew(workers)) as context:
         bundle = open_with_graphs(candidate, context)
         work = cache_directory() / STREAMS / f"gate-{bundle.hash[-16:]}"
@@ -147,11 +148,6 @@ def _folders(files: Iterable[Path]) -> Iterator[None]:
         raise
 
 
-def _read_by(gate: Gate, base: Path) -> tuple[Path | None, ...]:
-    """Return what a gate reads beside the candidate."""
-    return (base, *gate.paths)
-
-
 def _gate(config: Path | None, margin: float | None) -> Gate:
     from vlatool.gate.config import Gate, read_gate
 
@@ -159,7 +155,7 @@ def _gate(config: Path | None, margin: float | None) -> Gate:
     return gate if margin is None else gate.with_options("latency", margin=margin)
 
 
-def _check_junit(junit: Path, *inputs: str | Path | None) -> None:
+def _check_junit(junit: Path, inputs: Iterable[str | Path | None]) -> None:
     """Refuse, before the work, a file that cannot be written, lies in an input, or is not vlatool's to replace."""
     if junit.is_dir():
         raise OutputError(f"--junit {junit} is a directory.", "name a file")

@@ -12,7 +12,7 @@ import typer
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import crew, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
-from vlatool.cli._document import document, put, report_document
+from vlatool.cli._document import answer, document, put, report_document
 from vlatool.cli._options import Force, Workers
 from vlatool.cli._plan import plan_document
 from vlatool.cli._proposal import propose
@@ -25,7 +25,6 @@ from vlatool.runtime.engine import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
-    from vlatool.optimize.plan import Plan
     from vlatool.optimize.recipe import Pruning, Recipe
 
 TRAINS = "distill.policy"
@@ -130,7 +129,7 @@ def optimize(
         chosen = chosen.model_copy(update={"search": search})
     plan = make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
     if dry_run:
-        _show_plan(plan, as_json)
+        answer(as_json, plan_document(plan), plan.lines())
         return
     with progress(*crew(workers)) as context:
         report = pipeline.optimize(plan, output, context, force=force)
@@ -190,14 +189,6 @@ def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str
             )
         update["recover"] = tuple(recover)
     return pruning.model_copy(update={name: value for name, value in update.items() if value is not None})
-
-
-def _show_plan(plan: Plan, as_json: bool) -> None:
-    if as_json:
-        document(plan_document(plan))
-        return
-    for line in plan.lines():
-        typer.echo(line)
 
 
 def budget(text: str) -> dict[str, Any]:
