@@ -111,8 +111,8 @@ def new_profile(
     target = output or Path(f"{name}.yaml")
     copy_profile(like, name, target, force=force)
     validate = f"{target}: correct its figures, then: vlatool profiles validate {target}"
-    place = "put it into a directory named in VLATOOL_PROFILES to find it by name"
-    answer(as_json, {"written": [str(target)]}, [validate, place])
+    advice = "put it into a directory named in VLATOOL_PROFILES to find it by name"
+    answer(as_json, {"written": [str(target)]}, [validate, advice])
 
 
 @app.command("calibrate")
