@@ -29,11 +29,7 @@ EAGER_OPTIONS = ("--help", "--version")
 
 
 class Output:
-    """What a command line that asks for JSON leaves on standard output.
-
-    Args:
-        printed: Buffer for the text of ``--help`` and ``--version``; None for a command.
-    """
+    """What ``--json`` leaves on standard output; ``printed`` takes the text of ``--help`` or ``--version``."""
 
     def __init__(self, printed: io.StringIO | None = None) -> None:
         self._printed = printed

@@ -192,11 +192,7 @@ def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str
 
 
 def budget(text: str) -> dict[str, Any]:
-    """Read ``1%``, ``0.01``, ``METRIC=VALUE`` (with a unit or without), or ``0.002m``.
-
-    Raises:
-        UsageError: for anything else.
-    """
+    """Read ``1%``, ``0.01``, ``METRIC=VALUE`` (with a unit or without), or ``0.002m``; raises UsageError otherwise."""
     named = re.fullmatch(r"\s*([A-Za-z_][\w.]*)\s*=\s*([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*(%?)\s*", text)
     if named:
         return {"metric": named[1], "max_metric": float(named[2]) / (100 if named[3] else 1)}
@@ -207,11 +203,7 @@ def budget(text: str) -> dict[str, Any]:
 
 
 def share(text: str, option: str = "--max-drop") -> float:
-    """Read ``1%`` or ``0.01`` as a share.
-
-    Raises:
-        UsageError: for anything else, or outside 0-100 %.
-    """
+    """Read ``1%`` or ``0.01`` as a share; raises UsageError for anything else, or outside 0-100 %."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*", text)
     value = float(match[1]) / (100 if match[2] else 1) if match else -1.0
     if not 0 <= value <= 1:

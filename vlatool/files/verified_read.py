@@ -81,11 +81,7 @@ def hash_handle(handle: int) -> str:
 
 @contextlib.contextmanager
 def open_inside(root: Path, name: str) -> Iterator[int]:
-    """Open a regular file of a bundle as ``open_regular`` does.
-
-    Raises:
-        BundleError: when it is missing or not a regular file, or its path has a link.
-    """
+    """Open a regular file of a bundle as ``open_regular`` does; raises BundleError where that raises OSError."""
     try:
         with open_regular(root, name) as handle:
             yield handle

@@ -76,11 +76,7 @@ class Point:
 
 
 def read_points(path: Path) -> list[Point]:
-    """Read a file of published latencies.
-
-    Raises:
-        DataError: when it cannot be read, lacks a column, or a value is not a number; names the line.
-    """
+    """Read a file of published latencies; raises DataError, with the line, when it is unreadable or malformed."""
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             reader = csv.DictReader(stream)

@@ -125,11 +125,7 @@ def measure(
 
 
 def open_policy(path: str, job: LatencyJob) -> Contestant:
-    """Open a bundle through the runtime, or a torch source in eager torch.
-
-    Raises:
-        BundleError: when there is nothing to run.
-    """
+    """Open a bundle in the runtime, or a torch source in eager torch; raises BundleError when it is neither."""
     bundle = Bundle.open(Path(path))
     manifest = bundle.manifest
     if manifest.graphs:

@@ -95,11 +95,7 @@ class Plan:
 
 
 def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
-    """Build and check every stage; nothing has run when this returns.
-
-    Raises:
-        VlatoolError: for the first thing that cannot work.
-    """
+    """Build and check every stage; nothing has run when this returns; raises VlatoolError for the first that fails."""
     stage = source_stage(source)
     stage.check(None, profile)
     export = () if stage.has_graphs else transforms(recipe.export)

@@ -82,11 +82,7 @@ class Study:
             )
 
     def agree_on(self, quantized: Mapping[str, StageList]) -> dict[str, StageList]:
-        """Return how all who share the study quantize: what the first of them found.
-
-        Raises:
-            DataError: when the study holds something else.
-        """
+        """Return how all who share the study quantize, as the first of them found; raises DataError for other data."""
         with storage_errors(self._url):
             if QUANTIZED_KEY not in self._study.user_attrs:
                 self._study.set_user_attr(QUANTIZED_KEY, [[name, list(stages)] for name, stages in quantized.items()])
@@ -163,11 +159,7 @@ class Study:
         self._study.tell(number, state=self._optuna.trial.TrialState.FAIL, skip_if_finished=True)
 
     def tell(self, number: int, tried: Tried) -> None:
-        """Keep what a trial found; one that could not be made is kept with the reason.
-
-        Raises:
-            UsageError: when the study cannot be written any more.
-        """
+        """Keep what a trial found, or why it could not be made; raises UsageError when the study cannot be written."""
         if tried.note or not (math.isfinite(tried.speedup) and math.isfinite(tried.drop)):
             note = tried.note[:LONGEST] or "its accuracy could not be measured"
             tried = Tried(tried.shape, training_s=tried.training_s, note=note)

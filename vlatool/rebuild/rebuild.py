@@ -124,11 +124,7 @@ class _FileSearch:
 
 
 def build_record(bundle: Bundle) -> tuple[Entry, ...]:
-    """Return the entries of a bundle's build record, checked.
-
-    Raises:
-        BundleError: when there is none (made by an older vlatool), or an entry is invalid.
-    """
+    """Return the checked build record; raises BundleError when there is none (older vlatool), or it is invalid."""
     entries = history(bundle)
     if not entries:
         version = bundle.manifest.made_by.get("vlatool", "an unknown version")

@@ -59,11 +59,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Payload:
-    """All that is pushed for one run.
-
-    Args:
-        bundles: directory of each bundle on the target, in order.
-    """
+    """All that is pushed for one run; ``bundles`` are the directories on the target, in order."""
 
     items: tuple[Item, ...]
     bundles: tuple[str, ...]

@@ -31,11 +31,7 @@ class Session(Protocol):
 
 
 class Program:
-    """Runs the steps of a program over open sessions.
-
-    Args:
-        seed: Seed of the noise; fresh entropy when None.
-    """
+    """Runs the steps of a program over open sessions; the noise has fresh entropy when ``seed`` is None."""
 
     def __init__(self, steps: Iterable[ProgramStep], sessions: Mapping[str, Session], seed: int | None = None) -> None:
         self.steps = tuple(steps)

@@ -28,11 +28,7 @@ LEAVE = "leave --shard out: every process then holds all weights"
 
 
 class Shards:
-    """What a process holds of each weight: all of it here.
-
-    Args:
-        parameters: name -> weight, as the modules have it.
-    """
+    """What a process holds of each weight (name -> weight, as the modules have it): all of it here."""
 
     def __init__(self, parameters: Mapping[str, nn.Parameter]) -> None:
         self.held: dict[str, Tensor] = dict(parameters)

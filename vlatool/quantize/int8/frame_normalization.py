@@ -149,11 +149,7 @@ class _NormalizationFolder(OnnxGraph):
         self.graph.node.remove(node)
 
     def _add_border(self, chain: list[Any], pads: list[int], border: Array, convolution: Any) -> None:
-        """Add a border of pixels to a frame, instead of the padding of the convolution.
-
-        Args:
-            border: A pixel, (C,).
-        """
+        """Add a border of the pixel ``border``, (C,), to a frame, instead of the padding of the convolution."""
         axes = np.arange(4)  # axis of the frame for each axis of the convolution's input
         for node in (node for node in chain if node.op_type == "Transpose"):
             axes = axes[self.attributes(node).get("perm", [3, 2, 1, 0])]

@@ -35,9 +35,5 @@ class ReferenceSession(OrtCpuSession):
 
     @staticmethod
     def arithmetic() -> str:
-        """Return whether integer products of the reference are exact on this machine, or saturate.
-
-        Raises:
-            MissingExtra: when onnxruntime is not installed.
-        """
+        """Return whether the reference's integer products are exact here; raises MissingExtra without onnxruntime."""
         return arithmetic.ort_exactness(require("onnxruntime", "ort"), written=True)
