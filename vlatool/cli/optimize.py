@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,18 +15,20 @@ from vlatool.cli import _complete
 from vlatool.cli._console import crew, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
 from vlatool.cli._document import answer, document, put, report_document
 from vlatool.cli._options import Force, Workers
-from vlatool.cli._plan import plan_document
 from vlatool.cli._proposal import propose
 from vlatool.cli._torchrun import launch_for
 from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
+from vlatool.files.printable import mask_passwords
 from vlatool.machine.host import isa
 from vlatool.report import REPORT
 from vlatool.runtime.engine import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
+    from vlatool.optimize.plan import Plan
     from vlatool.optimize.recipe import Pruning, Recipe
+    from vlatool.stage.base import Stage
 
 TRAINS = "distill.policy"
 
@@ -214,3 +217,30 @@ def share(text: str, option: str = "--max-drop") -> float:
             f"write it as {option} 1%",
         )
     return value
+
+
+def plan_document(plan: Plan) -> dict[str, Any]:
+    """Return what ``plan.lines()`` says, as values that JSON can say."""
+    effort, loop, pruning = plan.recipe.effort, plan.closed_loop, plan.recipe.pruning
+    plain = {
+        "source": {"policy": str(plan.source.policy) if plan.source.policy else None, **_stage(plan.source)},
+        "export": _stages(plan.export),
+        "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
+        "search": plan.recipe.search,
+        "pruning": {**pruning.model_dump(mode="json"), "study": mask_passwords(pruning.study)},
+        "benchmark": {"iterations": effort.iterations, "threads": effort.threads},
+        "evaluate": {"recorded": True, "episodes": loop.episodes if loop else 0},
+        "limits": plan.recipe.limits.model_dump(mode="json", exclude_none=True),
+        "profile": plan.profile.name if plan.profile else None,
+        "computes": plan.board_set.plan() or None,
+        "cache": str(plan.cache),
+    }
+    return {"plan": plain}
+
+
+def _stages(stages: Iterable[Stage]) -> list[dict[str, Any]]:
+    return [_stage(stage) for stage in stages]
+
+
+def _stage(stage: Stage) -> dict[str, Any]:
+    return {"stage": stage.name(), "options": stage.options()}
