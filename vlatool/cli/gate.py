@@ -95,7 +95,9 @@ def run(
         show(report, as_json=as_json, out=output, force=force, raw=raw, unfinished=[work])
     finally:  # after the directory of reports: the file may be in it
         if junit is not None:
-            _write_junit(report, junit)
+            from vlatool.render import render
+
+            write_own_file(junit, render(report, "junit"), force=True, comment="<!-- {} -->")
 
 
 @app.command("init")
@@ -168,12 +170,6 @@ def _check_junit(junit: Path, inputs: Iterable[str | Path | None]) -> None:
     refuse_inputs(junit, inputs)
     if os.path.lexists(junit):
         refuse_file(junit, force=True)
-
-
-def _write_junit(report: Report, path: Path) -> None:
-    from vlatool.render import render
-
-    write_own_file(path, render(report, "junit"), force=True, comment="<!-- {} -->")
 
 
 def _tell_github(report: Report) -> None:

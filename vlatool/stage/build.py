@@ -22,8 +22,7 @@ def stage_class(name: str) -> type[Stage]:
     known = [f"{folder}.{method}" for folder in stage_kinds() for method in registry.names(folder)]
     if name.replace("-", "_") not in known:
         raise RecipeError(f"Unknown stage '{name}'; {suggest(name, known)}.", fix_for(name, known))
-    stage: type[Stage] = registry.load(kind, entry)
-    return stage
+    return registry.load(kind, entry)
 
 
 def stage_kinds() -> tuple[str, ...]:

@@ -144,8 +144,7 @@ class Parts(Shards):
             return whole
         mesh, value = self._cut[name].device_mesh, self._cut[name]
         rows = -(-len(value) // mesh.size())
-        part: Tensor = whole[mesh.get_local_rank() * rows :][:rows]
-        return part
+        return whole[mesh.get_local_rank() * rows :][:rows]
 
     def whole(self, name: str, part: Tensor) -> Tensor:
         """Return all rows."""
