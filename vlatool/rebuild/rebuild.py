@@ -131,7 +131,7 @@ def build_record(bundle: Bundle) -> tuple[Entry, ...]:
         version = bundle.manifest.made_by.get("vlatool", "an unknown version")
         raise BundleError(
             f"{bundle.path} has no build record; vlatool {version} did not write one yet, or no stage made it.",
-            "make the bundle again, with the command that made it",
+            UNUSABLE,
         )
     for number, entry in enumerate(entries):
         where, stage = f"Entry {number} of the build record of {bundle.path}", entry.get("stage")
