@@ -66,9 +66,7 @@ _kept: list[Path] = []
 def document(value: Any, text: str = "") -> None:
     """Hand over a command's result: what JSON can say, in dataclasses too; NaN becomes null.
 
-    Args:
-        value: The result.
-        text: How it is written, when not as ``json_text`` does.
+    It is written as ``text`` when there is one, else as ``json_text`` does.
     """
     if _now:
         _now[-1].take(value, text)
@@ -94,8 +92,6 @@ def report_document(report: Report, *, raw: bool, file: Path | None) -> dict[str
     """Return a report for standard output: without its raw samples, unless they are asked for.
 
     Args:
-        report: What a command found out.
-        raw: Whether raw samples are wanted.
         file: The report that keeps them, None when none is written.
     """
     plain: dict[str, Any] = asdict(report)

@@ -62,7 +62,6 @@ def cold_start(
     """Probe a bundle in a fresh process, which may take ``timeout`` seconds.
 
     Args:
-        bundle, engine, threads: bundle to load, with which engine and threads.
         observations: file of observations (``save_drawn``) to infer on after the golden one.
 
     Raises:

@@ -31,8 +31,7 @@ def findings(measured: Benchmark, job: LatencyJob, duration_is_sustained: bool =
     """Return what bears on the measurement, the worst first.
 
     Args:
-        measured: what ``agent.measure`` returned.
-        job: what it was asked to do.
+        measured: what ``agent.measure`` returned for the job.
         duration_is_sustained: whether the run was meant to heat the board up: then throttling is its result.
     """
     seen = [
