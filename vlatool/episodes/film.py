@@ -42,7 +42,7 @@ class Filmed(World):
         self._roll = Roll(folder)
 
     def reset(self, seed: int) -> tuple[Mapping[str, Any], Any]:
-        """Begin an episode as ``World.reset`` does, and take a picture; raises DataError when there is none to take."""
+        """Begin an episode as ``World.reset`` does, and take its first picture; raises DataError without one."""
         observation, info = super().reset(seed)
         with self._limited("render()"):
             self._roll.take(self._camera, observation)

@@ -69,7 +69,7 @@ class Product:
 
 
 def measure_reach(engine: str, dtype: str, threads: int | None) -> float:
-    """Return the 10^9 multiply-accumulates an engine does in a second in a dtype; raises GraphError as ``Product``."""
+    """Return how many 10^9 multiply-accumulates an engine does in a second in a dtype; raises as ``Product``."""
     opened = Product(engine, dtype, threads)
     opened.run()
     seconds = []

@@ -123,7 +123,7 @@ class Engine:
 
     @classmethod
     def version(cls) -> str:
-        """Return the library's release without its build, or empty; raises MissingExtra when it is not installed."""
+        """Return the library's release without its build, or empty where unknown; raises MissingExtra without it."""
         return str(getattr(cls.library(), "__version__", "")).partition("-")[0]
 
     @classmethod

@@ -31,7 +31,7 @@ def stage_kinds() -> tuple[str, ...]:
 
 
 def build_stage(name: str, options: Mapping[str, Any]) -> Stage:
-    """Build a stage from recipe name and options; raises RecipeError with each that is unknown or impossible."""
+    """Build a stage from recipe name and options; raises RecipeError naming each unknown or impossible one."""
     return stage_from(stage_class(name), options, f"stage {name}")
 
 
