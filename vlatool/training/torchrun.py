@@ -126,11 +126,7 @@ def write_token(folder: Path) -> dict[str, Any]:
 
 
 def check_shared(job: Mapping[str, Any]) -> None:
-    """Refuse to train where the first process's folder is not visible, or versions differ.
-
-    Raises:
-        RecipeError: saying so.
-    """
+    """Refuse, with RecipeError, to train where the first process's folder is not visible, or versions differ."""
     if "token" not in job:
         return
     who, seen = f"Process {job['rank'] + 1} of {job['size']} on {platform.node()}", Path(job["place"], RENDEZVOUS)
@@ -177,11 +173,7 @@ class Follower:
             self._send_call(LEAVE_CALL, {})
 
     def call(self, function: str, job: Mapping[str, Any], _tell: Any) -> None:
-        """Call a function in the process, and wait until it returns.
-
-        Raises:
-            VlatoolError: what it raised; SourceError when the process is gone.
-        """
+        """Call a function in the process, and wait; raises what it raises, or SourceError when the process is gone."""
         self._wait(f"answer/{self._send_call(function, job)}")
 
     def end(self) -> None:
