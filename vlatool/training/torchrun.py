@@ -33,7 +33,9 @@ AGENT = "TORCHELASTIC_USE_AGENT_STORE"
 RENDEZVOUS = "meeting"
 """File in the folder of the training through which processes of one machine find each other; under torchrun it holds
 what shows that a process sees that folder."""
-PRELOAD = ("torch", "vlatool.training.rank_process")
+OPTIMIZER = "torch._dynamo"
+"""What the first optimizer of a process imports, for a second of its time."""
+PRELOAD = ("torch", OPTIMIZER, "vlatool.training.rank_process")
 LEAVE_CALL = "leave"
 """Call after which a process discards the training."""
 START_S, LEFT_S, POLL_S = 300.0, 5.0, 0.05
