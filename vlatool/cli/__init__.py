@@ -154,7 +154,7 @@ def main(arguments: list[str] | None = None) -> None:
     if for_good:
         start_early(words)
     with output(words, for_good=for_good) as document:
-        code = _run(words, document, for_good=for_good)
+        code = _run_command(words, document, for_good=for_good)
     unprinted = take_print_failure()
     forget_kept(printed=unprinted is None)
     if unprinted:
@@ -164,7 +164,7 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code)
 
 
-def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
+def _run_command(words: list[str], document: Output | None, *, for_good: bool) -> Any:
     """Run a command line; return what the process ends with."""
     try:
         with plain_warnings(), trust.forget_named():
