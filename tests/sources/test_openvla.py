@@ -3,6 +3,7 @@
 ``tests/validation/foreign/openvla_checkpoints.py`` compares whole policies with timm and transformers.
 """
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from _openvla import (
     CONFIG,
     LANGUAGE,
     PICTURES,
+    SIDE,
     VISION,
     VOCABULARY,
     edited,
@@ -117,6 +119,20 @@ def test_a_policy_directory_to_keep_has_links_to_the_weights(tmp_path: Path) -> 
     assert read_description(kept).spec.control_hz == 5
 
 
+def test_a_directory_of_gigabytes_is_described_without_an_export(tmp_path: Path, capsys) -> None:
+    folder, nbytes = write(tmp_path / "c", parts()), 1 << 33
+    header = json.dumps({"unused": {"dtype": "F32", "shape": [nbytes // 4], "data_offsets": [0, nbytes]}}).encode()
+    with (folder / "more.safetensors").open("wb") as stream:
+        stream.write(len(header).to_bytes(8, "little") + header)
+        stream.truncate(8 + len(header) + nbytes)  # a hole takes no place on the disk
+    with pytest.raises(SystemExit, match="0"):
+        main(["inspect", str(folder)])
+    printed = capsys.readouterr().out
+    assert "weights stay in the shards" in printed
+    assert "vlatool quantize weight-only" in printed
+    assert "instruction: text" in printed
+
+
 @pytest.mark.parametrize("key", ["a", "b"])
 def test_statistics_are_chosen_by_their_key(tmp_path: Path, key: str, monkeypatch: pytest.MonkeyPatch) -> None:
     files, action = parts(), CONFIG["norm_stats"]["bridge_orig"]
@@ -199,12 +215,35 @@ BROKEN = {
         both(*(edited(LANGUAGE, f"{LAYER}{name}", to=None) for name in LAYER_TENSORS), edited(INDEX, to=None)),
         "num_hidden_layers 2; the tensors have 1",
     ),
+    "a hole between layers": (
+        both(*(edited(LANGUAGE, f"{LAYER.replace('1', '0')}{name}", to=None) for name in LAYER_TENSORS),
+             edited(INDEX, to=None)),
+        "layers.0.self_attn.q_proj.weight'",
+    ),
+    "no bias of the projector": (
+        both(edited(VISION, "projector.fc2.bias", to=None), edited(INDEX, to=None)), "'projector.fc2.bias'"
+    ),
+    "a norm of another width": (
+        edited(LANGUAGE, "language_model.model.norm.weight", to=np.ones(9, np.float32)), r"model.norm.weight' .*\[9\]"
+    ),
+    "a head of another vocabulary": (
+        edited(LANGUAGE, "language_model.lm_head.weight", to=np.zeros((9, 8), np.float32)), r"lm_head.* \[9, 8\]"
+    ),
+    "no norm in a block": (
+        both(edited(VISION, "vision_backbone.featurizer.blocks.0.norm2.bias", to=None), edited(INDEX, to=None)),
+        "blocks.0.norm2.bias'",
+    ),
+    "a negative picture": (edited("config.json", "image_sizes", to=[-SIDE, -SIDE]), "pictures of -4 pixels"),
+    "a strategy of lists": (
+        edited("preprocessor_config.json", "image_resize_strategy", to=["x"]), "image_resize_strategy"
+    ),
+    "a number of many digits": (edited(*STATS, "q01", to=[10**400, 0, 0]), "'q01' of the action"),
     "a missing tensor": (
         both(edited(LANGUAGE, f"{LAYER}mlp.up_proj.weight", to=None), edited(INDEX, to=None)),
         "layers.1.mlp.up_proj.weight'",
     ),
     "another shape": (
-        edited(LANGUAGE, f"{LAYER}mlp.up_proj.weight", to=np.zeros((9, 8), np.float32)), "up_proj.weight' of the shape"
+        edited(LANGUAGE, f"{LAYER}mlp.up_proj.weight", to=np.zeros((9, 8), np.float32)), r"up_proj.weight' .*\[9, 8\]"
     ),
     "no head": (
         both(edited(LANGUAGE, "language_model.lm_head.weight", to=None), edited(INDEX, to=None)), "lm_head.weight'"

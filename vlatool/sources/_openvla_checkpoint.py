@@ -7,7 +7,6 @@ a published structure, and its sizes are those of the tensors.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -41,6 +40,7 @@ HEADS = {"tiny": 3, "small": 6, "base": 12, "large": 16, "so400m": 16, "huge": 1
 """Size in the name of a vision transformer of timm -> heads, the one thing that its tensors do not say."""
 RESIZE = {"resize-naive": "fill", "resize-crop": "cover"}
 """``image_resize_strategy`` -> how a frame is fitted; what else it may be pads frames of any aspect to squares."""
+FUSED = "vision_backbone.fused_featurizer"
 FILTERS = ("bicubic", "bilinear")
 Tensors = Mapping[str, StoredTensor]
 
@@ -56,6 +56,7 @@ class Checkpoint:
         tokenizer: content of ``tokenizer.json``, which pads with the id that the network expects.
         statistics: ``q01`` and ``q99`` of each element of the action; -1 and 1 where it is not normalised.
         dataset: key of the statistics.
+        tensors: what its shards hold.
     """
 
     folder: Path
@@ -67,6 +68,7 @@ class Checkpoint:
     tokenizer: str
     statistics: dict[str, list[float]]
     dataset: str
+    tensors: Tensors
 
 
 def read_checkpoint(folder: Path, unnorm_key: str, prompt_tokens: int) -> Checkpoint:
@@ -83,7 +85,7 @@ def read_checkpoint(folder: Path, unnorm_key: str, prompt_tokens: int) -> Checkp
     _check_kind(folder, config)
     dataset, statistics = _statistics(folder, config, unnorm_key)
     tensors = _tensors(folder)
-    pictures = _pictures(folder, config)
+    pictures = _pictures(folder, config, tensors)
     towers = {
         name: _tower(folder, f"vision_backbone.{name}.", tensors, about) for name, about in pictures["towers"].items()
     }
@@ -99,8 +101,9 @@ def read_checkpoint(folder: Path, unnorm_key: str, prompt_tokens: int) -> Checkp
     prompt = _prompt(folder, config)
     tokenizer = _tokenizer(folder, prompt, arguments["decoding"], config)
     return Checkpoint(
-        folder, arguments, pictures["size"], pictures["fit"], pictures["filter"], prompt, tokenizer, statistics, dataset
-    )
+        folder, arguments, pictures["size"], pictures["fit"], pictures["filter"], prompt, tokenizer, statistics,
+        dataset, tensors,
+    )  # fmt: skip
 
 
 def _mapping(folder: Path, name: str) -> dict[str, Any]:
@@ -173,6 +176,25 @@ def _tensors(folder: Path) -> Tensors:
     return tensors
 
 
+def check_tensors(checkpoint: Checkpoint, wanted: Mapping[str, tuple[int, ...]]) -> None:
+    """Check that the shards hold what the network of the checkpoint's arguments has.
+
+    Args:
+        wanted: name -> shape of each parameter.
+
+    Raises:
+        SourceError: naming the first tensor that is missing or has another shape.
+    """
+    for name, shape in wanted.items():
+        got = _shape(checkpoint.folder, checkpoint.tensors, name, len(shape))
+        if got != shape:
+            raise SourceError(
+                f"'{name}' in {checkpoint.tensors[name].file.name} of {checkpoint.folder} has the shape {list(got)}; "
+                f"beside the other tensors it must have {list(shape)}.",
+                SAVE,
+            )
+
+
 def _shape(folder: Path, tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:
     """Return the shape of a tensor, which must be there."""
     if name not in tensors:
@@ -191,34 +213,18 @@ def _nearest(name: str, tensors: Tensors) -> str:
 
 
 def _layers(folder: Path, tensors: Tensors, prefix: str) -> int:
-    """Return how many layers there are below a prefix: numbered from 0, with the same tensors in each.
-
-    Raises:
-        SourceError: naming the layer that lacks a tensor, or has one of another shape.
-    """
-    layers: dict[int, dict[str, tuple[int, ...]]] = {}
-    for name, tensor in tensors.items():
-        if found := re.fullmatch(re.escape(prefix) + r"(\d{1,4})\.(.+)", name):
-            layers.setdefault(int(found[1]), {})[found[2]] = tensor.shape
-    if not layers:
+    """Return how many layers there are below a prefix, by the highest number; each is checked later."""
+    pattern = re.compile(re.escape(prefix) + r"(\d{1,4})\.")
+    numbers = [int(found[1]) for name in tensors if (found := pattern.match(name))]
+    if not numbers:
         raise SourceError(f"No shard of {folder} holds layers '{prefix}0...'; {_nearest(prefix, tensors)}.", SAVE)
-    first = layers.get(0, {})
-    for number in range(max(layers) + 1):
-        layer = layers.get(number, {})
-        wrong = next((name for name in (first or layer) | layer if layer.get(name) != first.get(name)), None)
-        if wrong is not None or not layer:
-            got, want = (short_repr(each.get(wrong or "")) for each in (layer, first))
-            raise SourceError(
-                f"The shards of {folder} hold '{prefix}{number}.{wrong or '...'}' of the shape {got}; layer 0: {want}.",
-                SAVE,
-            )
-    return len(layers)
+    return max(numbers) + 1
 
 
-def _pictures(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+def _pictures(folder: Path, config: Mapping[str, Any], tensors: Tensors) -> dict[str, Any]:
     """Return the size of the picture, how a frame becomes it, and what each tower is told, by its name."""
     about = _mapping(folder, "preprocessor_config.json")
-    count = 2 if config.get("use_fused_vision_backbone") else 1
+    count = 2 if config.get("use_fused_vision_backbone", f"{FUSED}.pos_embed" in tensors) else 1
 
     def of_each(name: str, default: Any = None) -> list[Any]:
         file, values = ("config.json", config) if name in config else ("preprocessor_config.json", about)
@@ -230,7 +236,7 @@ def _pictures(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
         return row[:count]
 
     strategy = about.get("image_resize_strategy", config.get("image_resize_strategy"))
-    if strategy not in RESIZE:
+    if not isinstance(strategy, str) or strategy not in RESIZE:
         raise SourceError(
             f"{folder} fits frames by {short_repr(strategy)} (image_resize_strategy); known: {', '.join(RESIZE)}.",
             f"{BY_HAND}; the frame can be fitted before it is given to the policy",
@@ -269,8 +275,9 @@ def _tower(folder: Path, prefix: str, tensors: Tensors, about: Mapping[str, Any]
     hidden, _ = _shape(folder, tensors, f"{prefix}blocks.0.mlp.fc1.weight", 2)
     has_class = f"{prefix}cls_token" in tensors
     registers = _shape(folder, tensors, f"{prefix}reg_token", 3)[1] if f"{prefix}reg_token" in tensors else 0
-    size, grid = about["size"], about["size"] // patch if isinstance(about["size"], int) else 0
-    if positions not in (grid**2, grid**2 + has_class) or width % heads:
+    size = about["size"]
+    grid = size // patch if isinstance(size, int) and size > 0 else 0
+    if not grid or positions not in (grid**2, grid**2 + has_class) or width % heads:
         raise SourceError(
             f"The tower '{prefix.rstrip('.')}' of {folder} ({timm}) has {positions} positions and the width {width}; "
             f"pictures of {size} pixels in patches of {patch} have {grid**2}, {heads} heads divide the width.",
@@ -298,7 +305,7 @@ def _three(folder: Path, name: str, values: Any) -> list[float]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 < value < 1e300
 
 
 def _projector(folder: Path, tensors: Tensors, features: int, width: int) -> list[int]:

@@ -11,11 +11,13 @@ from typing import Any
 import yaml
 
 from vlatool.bundle.spec import UNKNOWN
+from vlatool.errors import require
 from vlatool.files.blob_store import mark_cache
 from vlatool.files.directory_writer import write_directory
+from vlatool.files.printable import one_line
 from vlatool.machine.host import UNNORM_KEY, cache_directory
-from vlatool.module.description import FILE
-from vlatool.sources._openvla_checkpoint import INSTRUCTION, SHARDS, Checkpoint, read_checkpoint
+from vlatool.module.description import FILE, MAX_LABEL_CHARACTERS
+from vlatool.sources._openvla_checkpoint import INSTRUCTION, SHARDS, Checkpoint, check_tensors, read_checkpoint
 from vlatool.weights.shards import INDEX, fingerprint, shard_files
 
 FACTORY = "vlatool.sources._openvla_network:make"
@@ -36,12 +38,26 @@ def converted_checkpoint(folder: Path) -> Path:
     cache = cache_directory()
     out = cache / "converted" / f"openvla-{hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]}"
     if not (out / FILE).is_file():
+        check_tensors(checkpoint, _network_shapes(checkpoint))
         mark_cache(cache)
         with write_directory(out, damaged=True) as draft:
             for file in (*shards, *folder.glob(f"*{INDEX}")):
                 (draft / file.name).symlink_to(file.resolve())
             _write(draft, described, checkpoint)
     return out
+
+
+def _network_shapes(checkpoint: Checkpoint) -> dict[str, tuple[int, ...]]:
+    """Return name -> shape of each weight of the network, which is built without memory for it."""
+    torch = require("torch", "build")
+    from vlatool.sources._openvla_network import make
+
+    with torch.device("meta"):
+        graphs = make(**checkpoint.arguments)
+    shapes = {name: tuple(value.shape) for graph in graphs.values() for name, value in graph.state_dict().items()}
+    if checkpoint.arguments["language"]["tied"]:
+        del shapes["language_model.lm_head.weight"]
+    return shapes
 
 
 def _write(out: Path, described: dict[str, Any], checkpoint: Checkpoint) -> None:
@@ -54,10 +70,10 @@ def _write(out: Path, described: dict[str, Any], checkpoint: Checkpoint) -> None
 def _description(checkpoint: Checkpoint) -> dict[str, Any]:
     """Return the content of policy.yaml; units, modes and rate, which a checkpoint does not say, are left out."""
     decoding = checkpoint.arguments["decoding"]
-    name = checkpoint.folder.resolve().name or "openvla"
+    name = one_line(checkpoint.folder.resolve().name, MAX_LABEL_CHARACTERS) or "openvla"
     return {
         "schema": 1,
-        "name": name[:100],
+        "name": name,
         "description": f"OpenVLA, greedy; actions in the statistics of {checkpoint.dataset}. The checkpoint says "
         "neither units nor modes nor the control rate.",
         "source": FACTORY,
