@@ -158,6 +158,13 @@ def test_statistics_of_a_fine_tuning_replace_those_of_the_base(tmp_path: Path) -
     assert "libero" in described.description
 
 
+def test_a_recording_beside_a_checkpoint_is_carried(tmp_path: Path) -> None:
+    folder, data = write(tmp_path / "c", parts()), tmp_path / "calibration.npz"
+    np.savez(data, image=FRAME[None].repeat(2, 0), instruction=np.array(["lift", "move"]))
+    described = OpenVla.of(str(folder)).model_copy(update={"calibration": data}).describe()
+    assert described.calibration == data
+
+
 def test_one_token_is_the_whole_action_without_a_decoding_step(tmp_path: Path) -> None:
     files = parts()
     files["config.json"]["norm_stats"] = {"a": {"action": {"q01": [0], "q99": [1]}}}

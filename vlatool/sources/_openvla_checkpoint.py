@@ -40,7 +40,7 @@ HEADS = {"tiny": 3, "small": 6, "base": 12, "large": 16, "so400m": 16, "huge": 1
 """Size in the name of a vision transformer of timm -> heads, the one thing that its tensors do not say."""
 RESIZE = {"resize-naive": "fill", "resize-crop": "cover"}
 """``image_resize_strategy`` -> how a frame is fitted; what else it may be pads frames of any aspect to squares."""
-FUSED = "vision_backbone.fused_featurizer"
+FUSED_TOWER = "vision_backbone.fused_featurizer"
 FILTERS = ("bicubic", "bilinear")
 Tensors = Mapping[str, StoredTensor]
 
@@ -224,7 +224,7 @@ def _layers(folder: Path, tensors: Tensors, prefix: str) -> int:
 def _pictures(folder: Path, config: Mapping[str, Any], tensors: Tensors) -> dict[str, Any]:
     """Return the size of the picture, how a frame becomes it, and what each tower is told, by its name."""
     about = _mapping(folder, "preprocessor_config.json")
-    count = 2 if config.get("use_fused_vision_backbone", f"{FUSED}.pos_embed" in tensors) else 1
+    count = 2 if config.get("use_fused_vision_backbone", f"{FUSED_TOWER}.pos_embed" in tensors) else 1
 
     def of_each(name: str, default: Any = None) -> list[Any]:
         file, values = ("config.json", config) if name in config else ("preprocessor_config.json", about)

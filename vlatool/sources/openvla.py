@@ -51,7 +51,7 @@ class OpenVla(TorchModule):
         Raises:
             SourceError: when the checkpoint is incomplete, damaged, or of an unknown kind.
         """
-        return read_description(self.converted_directory())
+        return self.with_given(read_description(self.converted_directory()))
 
     def converted_directory(self) -> Path:
         """Return the policy directory with links to the weights, made when it is not in the cache.
