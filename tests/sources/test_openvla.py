@@ -47,7 +47,7 @@ FRAME = np.random.default_rng(2).integers(0, 256, (9, 12, 3), dtype=np.uint8)
 def _place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv(UNNORM_KEY, raising=False)
+    monkeypatch.setenv(UNNORM_KEY, "")  # so that what the command line sets is taken back
     yield
     assert not (tmp_path / "pwned").exists()
 
@@ -148,6 +148,22 @@ def test_statistics_are_chosen_by_their_key(tmp_path: Path, key: str, monkeypatc
     width = described.spec.action.width
     middle = {"a": [1, 2], "b": [0, 0.25, 0]}[key]
     np.testing.assert_allclose(normaliser.inverse(np.zeros((1, width), np.float32)), [middle])
+
+
+@pytest.mark.parametrize(("key", "code", "words"), [
+    ("b", 0, "actions in the statistics of b"), ("c", 3, "has no statistics 'c'; it has: a, b"),
+    (None, 3, "of 2 datasets"),
+])  # fmt: skip
+def test_the_command_line_chooses_the_statistics(
+    tmp_path: Path, key: str | None, code: int, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files, action = parts(), CONFIG["norm_stats"]["bridge_orig"]
+    files["config.json"]["norm_stats"] = {"a": action, "b": action}
+    command = ["new", str(tmp_path / "kept"), "--from", str(write(tmp_path / "c", files))]
+    with pytest.raises(SystemExit) as caught:
+        main([*command, *(["--unnorm-key", key] if key else [])])
+    assert caught.value.code == code
+    assert words in " ".join("".join(capsys.readouterr()).split())
 
 
 def test_statistics_of_a_fine_tuning_replace_those_of_the_base(tmp_path: Path) -> None:
