@@ -22,7 +22,7 @@ PLACES = ("", "vlatool", "tests", "docs")
 """Folders that a path on a page may start from, beside the page's own."""
 GROUPS = {"control", "engines", "profiles", "commands", "sections", "videos", "claims", "measures"}
 """Entry point groups that are not packages of vlatool."""
-EVERYWHERE = ("--help", "--trust", "--python")
+EVERYWHERE = ("--help", "--trust", "--python", "--unnorm-key")
 """Options that every command takes, whether its help lists them or not."""
 STILTED = (
     r"\bmend(s|ed|ing)?\b",

@@ -19,7 +19,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from vlatool import errors, measures, registry, report
-from vlatool.bundle import image, manifest, spec
+from vlatool.bundle import image, manifest, prompt, spec
 from vlatool.cli._schemas import COMMANDS, definitions
 from vlatool.gate import config
 from vlatool.hardware.profile import load_profile, profile_names
@@ -35,8 +35,10 @@ def main() -> None:
     pages = {
         "stages.md": stages_page(),
         "command-line.md": command_line_page(),
-        "manifest.md": fields_page("manifest.json", [manifest.Manifest, spec.PolicySpec, spec.TensorSpec, image.Image,
-                                                     image.ImageStep, manifest.ProgramStep, manifest.Graph]),
+        "manifest.md": fields_page("manifest.json", [
+            manifest.Manifest, spec.PolicySpec, spec.TensorSpec, image.Image, image.ImageStep, prompt.Prompt,
+            manifest.ProgramStep, manifest.Graph,
+        ]),
         "report.md": report_page(),
         "measures.md": measures_page(),
         "errors.md": errors_page(),

@@ -31,6 +31,29 @@ def test_only_what_differs_from_the_defaults_is_written():
     assert PolicySpec.from_dict(SPECS[0]).to_dict() == SPECS[0]
 
 
+def test_a_prompt_is_part_of_a_text_input_and_comes_back():
+    prompt = {"template": "In: {}?", "lower": True, "last": 29871}
+    text = TensorSpec.from_dict({**TEXT, "prompt": prompt})
+    assert text.to_dict()["prompt"] == prompt
+    assert TensorSpec.from_dict(text.to_dict()) == text
+    assert (text.schema, TensorSpec.from_dict(TEXT).schema) == (2, 1)
+
+
+@pytest.mark.parametrize(("prompt", "words"), [
+    ({"template": "In"}, "it has {} once"), ({"template": "{} {}"}, "it has {} once"), ({"lower": 1}, "has lower 1"),
+    ({"last": -1}, "last id of a prompt"), ({"last": 2.5}, "last id of a prompt"), ("In: {}", "must be a mapping"),
+    ({"templat": "{}"}, "did you mean 'template'"), ({"template": None}, "template of a prompt must be text"),
+])  # fmt: skip
+def test_an_impossible_prompt_is_refused(prompt: object, words: str):
+    with pytest.raises(SpecError, match=words):
+        TensorSpec.from_dict({**TEXT, "prompt": prompt})
+
+
+def test_only_a_text_has_a_prompt():
+    with pytest.raises(SpecError, match="belongs to kind: text"):
+        TensorSpec.from_dict({"name": "state", "shape": [1, 3], "prompt": {"template": "{}"}})
+
+
 def test_a_text_input_sees_ids_of_its_width():
     text = TensorSpec.from_dict(TEXT)
     assert (text.dtype, text.shape) == ("int64", (1, 5))

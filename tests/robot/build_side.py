@@ -19,7 +19,7 @@ from pathlib import Path
 
 import vlatool
 
-WANT_TORCH = ("vlatool.samples._", "vlatool.sources._lerobot_child")
+WANT_TORCH = ("vlatool.samples._", "vlatool.sources._lerobot_child", "vlatool.sources._openvla_network")
 """Modules that are networks, which subclass torch's own, and the script that the Python of LeRobot runs."""
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vlatool.bundle.prompt import Prompt
 from vlatool.errors import DataError, SpecError
 from vlatool.runtime.tokenizer import Tokenizer
 
@@ -45,6 +46,30 @@ def test_words_become_padded_ids(tmp_path: Path):
     ids = tokenizer(tmp_path, WORDS)("Go  to BALL")
     assert ids.dtype == np.int64
     np.testing.assert_array_equal(ids, [[2, 3, 4, 0]])
+
+
+@pytest.mark.parametrize(("prompt", "ids"), [
+    (Prompt("go to {}"), [2, 3, 4, 0, 0]), (Prompt("go to {}", last=9), [2, 3, 4, 9, 0]),
+    (Prompt("{} to", last=3), [4, 3, 0, 0, 0]), (Prompt(last=0), [4, 0, 0, 0, 0]),
+])  # fmt: skip
+def test_a_prompt_is_written_around_a_text_and_ends_as_it_says(tmp_path: Path, prompt: Prompt, ids: list[int]):
+    file = tmp_path / "tokenizer.json"
+    file.write_text(json.dumps(WORDS))
+    assert Tokenizer(file, 5, "instruction", prompt=prompt)("ball").tolist() == [ids]
+
+
+def test_a_prompt_that_is_too_long_is_refused_not_cut(tmp_path: Path):
+    file = tmp_path / "tokenizer.json"
+    file.write_text(json.dumps(WORDS))
+    tokenize = Tokenizer(file, 4, "instruction", prompt=Prompt("go to {}", last=9))
+    assert tokenize("ball").tolist() == [[2, 3, 4, 9]]
+    with pytest.raises(DataError, match="a prompt of 5 tokens; the policy takes 4"):
+        tokenize("ball ball")
+
+
+def test_a_prompt_case_and_braces_of_the_instruction_are_its_own():
+    assert Prompt("In: {}?", lower=True).write("Open {} It") == "In: open {} it?"
+    assert Prompt("In: {}?").write("Open") == "In: Open?"
 
 
 def test_empty_text_is_padding(tmp_path: Path):

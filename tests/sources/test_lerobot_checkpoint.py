@@ -159,6 +159,40 @@ def quantiles(files: dict[str, Any]) -> None:
     files["policy_preprocessor.json"]["steps"][3]["config"]["norm_map"]["STATE"] = "QUANTILES"
 
 
+def pi0(files: dict[str, Any], relative: object = False) -> None:
+    """Make the files those of pi0 as LeRobot 0.6.1 saves them: an instruction, and steps that do nothing."""
+    files["config.json"]["type"] = "pi0"
+    names = ("pi0_new_line_processor", "tokenizer_processor")
+    steps, behind = (files[f"policy_{name}processor.json"]["steps"] for name in ("pre", "post"))
+    steps[2:2] = [{"registry_name": name, "config": {}} for name in names]
+    for kind, listed in (("relative", steps), ("absolute", behind)):
+        listed.append({"registry_name": f"{kind}_actions_processor", "config": {"enabled": relative}})
+
+
+def test_pi0_has_an_instruction_and_steps_that_are_not_enabled(tmp_path: Path) -> None:
+    files = parts()
+    pi0(files)
+    checkpoint = read_checkpoint(write(tmp_path / "c", files))
+    assert (checkpoint.family, checkpoint.inputs["observation.state"].mode) == ("pi0", "MEAN_STD")
+
+
+@pytest.mark.parametrize("relative", [True, None, 0, "no"])
+def test_relative_actions_are_refused_unless_they_are_plainly_off(tmp_path: Path, relative: object) -> None:
+    files = parts()
+    pi0(files, relative)
+    with pytest.raises(SourceError, match="'relative_actions_processor'"):
+        read_checkpoint(write(tmp_path / "c", files))
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_an_instruction_that_is_not_processed_is_refused(tmp_path: Path, number: int) -> None:
+    files = parts()
+    pi0(files)
+    gone = files["policy_preprocessor.json"]["steps"].pop(number)["registry_name"]
+    with pytest.raises(SourceError, match=f"has no step '{gone}'"):
+        read_checkpoint(write(tmp_path / "c", files))
+
+
 INPUTS = ("config.json", "input_features")
 STEPS = ("policy_preprocessor.json", "steps")
 STATES = "policy_preprocessor_step_3_normalizer_processor.safetensors"

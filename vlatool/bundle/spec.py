@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from vlatool.bundle.image import Image
+from vlatool.bundle.prompt import Prompt
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values, to_json
@@ -58,6 +59,7 @@ class TensorSpec:
             never moved in training then has statistics, too. 0 refuses it.
         history: number of moments that the second axis of an input holds, oldest first, from 2; 0 for an input of one
             moment. The robot gives one moment at each control step, and the runtime keeps the last ones.
+        prompt: what is written around the text of an input before it becomes ids (``kind: text``); nothing when None.
     """
 
     name: str
@@ -75,6 +77,7 @@ class TensorSpec:
     image: Image | None = None
     epsilon: float = 0.0
     history: int = 0
+    prompt: Prompt | None = None
 
     def __post_init__(self) -> None:
         self._check_words()
@@ -153,6 +156,10 @@ class TensorSpec:
             )
         if self.image is not None:
             self._check_image(self.image)
+        if self.prompt is not None and (not isinstance(self.prompt, Prompt) or self.kind != "text"):
+            raise SpecError(
+                f"'{self.name}' has a prompt and is {self.kind}; what is written around a text belongs to kind: text."
+            )
 
     def _check_image(self, image: Image) -> None:
         if not isinstance(image, Image):
@@ -222,7 +229,8 @@ class TensorSpec:
     @property
     def schema(self) -> int:
         """The first version of the manifest that has all that this tensor says."""
-        return 2 if self.image or self.epsilon or self.history or self.normalisation == "quantile10" else 1
+        later = self.image or self.epsilon or self.history or self.prompt or self.normalisation == "quantile10"
+        return 2 if later else 1
 
     @property
     def frame(self) -> str:
@@ -251,6 +259,8 @@ class TensorSpec:
             raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {short_repr(values.get('shape'))}.")
         if values.get("image") is not None:
             values["image"] = Image.from_dict(values["image"])
+        if values.get("prompt") is not None:
+            values["prompt"] = Prompt.from_dict(values["prompt"])
         if values.get("kind") == "discrete":
             values.setdefault("labels", _indices(values["shape"]))
         return cls(**values)

@@ -19,11 +19,11 @@ from vlatool.cli._document import Output, forget_kept, output, take_print_failur
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPT_CODE, Failure, failure
 from vlatool.errors import refuse_two_distributions
 from vlatool.files.printable import printable
-from vlatool.machine.host import LEROBOT_PYTHON
+from vlatool.machine.host import LEROBOT_PYTHON, UNNORM_KEY
 from vlatool.machine.version import VERSION
 from vlatool.user_code import children, trust
 
-ROOT_OPTIONS = ("--trust", "--python")
+ROOT_OPTIONS = ("--trust", "--python", "--unnorm-key")
 app = typer.Typer(
     name="vlatool",
     cls=Commands,
@@ -48,6 +48,12 @@ def _other_python(path: Path | None) -> Path | None:
     if path is not None:
         os.environ[LEROBOT_PYTHON] = str(path)
     return path
+
+
+def _unnorm_key(key: str | None) -> str | None:
+    if key is not None:
+        os.environ[UNNORM_KEY] = key
+    return key
 
 
 def _version(asked: bool) -> None:
@@ -75,6 +81,14 @@ def _root(
             "--python",
             callback=_other_python,
             help="Python that has the library of a checkpoint, such as LeRobot's; also $VLATOOL_LEROBOT_PYTHON",
+        ),
+    ] = None,
+    unnorm_key: Annotated[
+        str | None,
+        typer.Option(
+            "--unnorm-key",
+            callback=_unnorm_key,
+            help="dataset whose statistics a checkpoint of several acts in; also $VLATOOL_UNNORM_KEY",
         ),
     ] = None,
 ) -> None:

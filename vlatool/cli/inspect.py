@@ -22,6 +22,7 @@ from vlatool.errors import BundleError, GraphError, SpecError, UsageError
 from vlatool.files.printable import printable
 from vlatool.files.verified_read import open_inside
 from vlatool.module.source import is_bundle
+from vlatool.module.stage import describe_modules
 from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded_files
 from vlatool.runtime.identity import policy_identity
@@ -82,7 +83,14 @@ def inspect(
         document(opened.manifest.to_dict(), manifest_bytes(opened.manifest).decode())
     else:
         shown = show_frame(opened, frame, output, force=force) if frame else []
-        for line in [*describe(opened), *shown, *([] if tried is None else [_probed(tried)]), *_influences(moves)]:
+        shards = () if opened.manifest.graphs or is_bundle(bundle) else describe_modules(opened)
+        for line in [
+            *describe(opened),
+            *shards,
+            *shown,
+            *([] if tried is None else [_probed(tried)]),
+            *_influences(moves),
+        ]:
             typer.echo(printable(line))
     if tried is not None and tried["refused"]:
         raise GraphError(*tried["refused"])
@@ -113,14 +121,19 @@ def _influences(moves: Mapping[str, Any] | None) -> list[str]:
 
 
 def _opened(named: Path) -> Bundle:
-    """Open a bundle, or that of a policy, exported with the default options."""
+    """Open a bundle, or that of a policy, exported with the default options unless it is larger than memory may be."""
     from vlatool.cli._run import open_with_graphs
     from vlatool.module.source import claimed_source
+    from vlatool.sources import has_large_shards, source_bundle
+    from vlatool.stage.run import cache_directory
 
-    if is_bundle(named) or claimed_source(named) is None:
+    if is_bundle(named) or (source := claimed_source(named)) is None:
         return Bundle.open(named)
     with progress() as context:
-        opened = open_with_graphs(str(named), context)
+        if has_large_shards(source):
+            opened = source_bundle(source.trust_code(), cache_directory(), context).bundle
+        else:
+            opened = open_with_graphs(str(named), context)
     propose(str(named), opened.manifest, None)
     return opened
 

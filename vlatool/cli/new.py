@@ -84,7 +84,8 @@ def _copy(converted: Path, policy: Path, control_hz: float | None) -> tuple[str,
     from vlatool.module.description import FILE, read_description
 
     with write_directory(policy) as draft:
-        shutil.copytree(converted, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*", "__pycache__"))
+        left_out = shutil.ignore_patterns(".*", "__pycache__")
+        shutil.copytree(converted, draft, symlinks=True, dirs_exist_ok=True, ignore=left_out)  # weights stay in place
         text = (draft / FILE).read_text(encoding="utf-8")
         if control_hz is not None:
             text = text.replace(f"control_hz: {UNKNOWN}", f"control_hz: {control_hz:g}")

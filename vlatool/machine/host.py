@@ -39,6 +39,8 @@ VNNI = ("amx_int8", "avx512_vnni", "avx_vnni_int8", "avx_vnni")
 """Features with which int8 products are exact, and faster than float32."""
 LEROBOT_PYTHON = "VLATOOL_LEROBOT_PYTHON"
 """Variable that names the Python that has LeRobot, in which checkpoints of it are traced; ``--python`` sets it."""
+UNNORM_KEY = "VLATOOL_UNNORM_KEY"
+"""Variable that says which statistics of a checkpoint of several datasets its actions are in; ``--unnorm-key``."""
 MAX_CPU_ISA = "ONEDNN_MAX_CPU_ISA"
 """The variable that confines oneDNN, and so OpenVINO, to an instruction set; read once, when it is loaded."""
 OLDER_MAX_CPU_ISA = "DNNL_MAX_CPU_ISA"

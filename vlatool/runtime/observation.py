@@ -184,7 +184,7 @@ def _shape(value: Any) -> tuple[int, ...]:
 
 def _text_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
     content = tokenizer_content(assets, tensor.tokenizer, tensor.name)
-    tokenizer = Tokenizer(asset_path(assets, tensor.tokenizer), tensor.max_tokens, tensor.name, content)
+    tokenizer = Tokenizer(asset_path(assets, tensor.tokenizer), tensor.max_tokens, tensor.name, content, tensor.prompt)
 
     def encode(value: Any) -> Array:
         if isinstance(value, str):

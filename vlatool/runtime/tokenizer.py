@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.prompt import Prompt
 from vlatool.errors import DataError, SpecError, VlatoolError, require
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit
@@ -32,6 +33,7 @@ class Tokenizer:
         max_tokens: Width that ids are padded or cut to.
         name: The input's name, for messages.
         content: What the file holds; it is read from ``path`` when None.
+        prompt: What is written around a text; nothing when None.
 
     Raises:
         SpecError: when the file is missing or is neither of the two, or may lengthen a text beyond limits.
@@ -39,7 +41,10 @@ class Tokenizer:
 
     remembered = 64
 
-    def __init__(self, path: Path, max_tokens: int, name: str, content: bytes | None = None) -> None:
+    def __init__(
+        self, path: Path, max_tokens: int, name: str, content: bytes | None = None, prompt: Prompt | None = None
+    ) -> None:
+        self.prompt = prompt
         self.max_tokens = max_tokens
         self.name = name
         self._growth = 1
@@ -60,7 +65,11 @@ class Tokenizer:
             )
 
     def __call__(self, text: str) -> NDArray[np.int64]:
-        """Return the ids of ``text``, int64, shape (1, max_tokens)."""
+        """Return the ids of ``text``, int64, shape (1, max_tokens).
+
+        Raises:
+            DataError: when the library cannot read it, or its prompt is too long: cut, it would ask for nothing.
+        """
         known = self._cache.get(text)
         if known is None:
             if len(self._cache) >= self.remembered:
@@ -69,6 +78,7 @@ class Tokenizer:
         return known
 
     def _padded(self, text: str) -> NDArray[np.int64]:
+        text = text if self.prompt is None else self.prompt.write(text)
         check_limit(
             "text_characters",
             len(text) * self._growth,
@@ -76,6 +86,13 @@ class Tokenizer:
             DataError,
         )
         ids = self._encode(text)
+        if self.prompt is not None:
+            ids = self.prompt.end(ids)
+        if len(ids) > self.max_tokens and self.prompt is not None:
+            raise DataError(
+                f"The {self.name} makes a prompt of {len(ids)} tokens; the policy takes {self.max_tokens}.",
+                "say it in fewer words",
+            )
         if len(ids) > self.max_tokens:
             warnings.warn(
                 f"the {self.name} has {len(ids)} tokens; the last {len(ids) - self.max_tokens} are cut",

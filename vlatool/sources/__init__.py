@@ -6,10 +6,20 @@ from pathlib import Path
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.module.source import Source, is_bundle, source_of_policy
+from vlatool.module.stage import MAX_RUN_BYTES
 from vlatool.stage.base import Context, Result
 from vlatool.stage.run import cached_transform
+from vlatool.weights.shards import shard_files
 
-__all__ = ["Source", "brings_calibration", "is_bundle", "open_source", "source_bundle", "source_stage"]
+__all__ = [
+    "Source",
+    "brings_calibration",
+    "has_large_shards",
+    "is_bundle",
+    "open_source",
+    "source_bundle",
+    "source_stage",
+]
 
 
 def open_source(typed: str) -> Bundle | Source:
@@ -37,6 +47,15 @@ def source_bundle(source: Bundle | Source, cache: Path, context: Context) -> Res
         return Result(source)
     source.check(None, None)
     return cached_transform(source, None, cache, context)
+
+
+def has_large_shards(source: Source) -> bool:
+    """Return whether a policy's weights stay in shards of so many bytes that it is not run as a whole."""
+    described = source.describe()
+    if described is None or not described.weights:
+        return False
+    files = shard_files(described.folder, described.weights)
+    return sum(file.stat().st_size for file in files) >= MAX_RUN_BYTES
 
 
 def brings_calibration(source: Source) -> bool:

@@ -15,11 +15,16 @@ from vlatool.errors import SourceError, require, suggest
 from vlatool.files.json import read_json
 from vlatool.files.printable import truncate
 
-FAMILIES = ("act", "diffusion", "smolvla")
+FAMILIES = ("act", "diffusion", "pi0", "smolvla")
 """Types of policies that ``_lerobot_child`` traces."""
 HARMLESS = ("to_batch_processor", "device_processor")
-TEXT_STEPS = ("smolvla_new_line_processor", "tokenizer_processor")
-"""Steps of SmolVLA's instruction; ``_lerobot_child`` writes the tokenizer that does both."""
+TEXT_STEPS = {
+    "smolvla": ("smolvla_new_line_processor", "tokenizer_processor"),
+    "pi0": ("pi0_new_line_processor", "tokenizer_processor"),
+}
+"""Family -> steps of its instruction; ``_lerobot_child`` writes the tokenizer that does both."""
+RELATIVE = ("relative_actions_processor", "absolute_actions_processor")
+"""Steps that do nothing unless they are ``enabled``; what they do then is not known."""
 RENAME, NORMALIZER, UNNORMALIZER = "rename_observations_processor", "normalizer_processor", "unnormalizer_processor"
 MODES = {
     "IDENTITY": (), "MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"),
@@ -92,8 +97,13 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     steps = _steps(
         folder,
         "policy_preprocessor.json",
-        (*HARMLESS, *(TEXT_STEPS if family == "smolvla" else ()), RENAME, NORMALIZER),
+        (*HARMLESS, *TEXT_STEPS.get(str(family), ()), RENAME, NORMALIZER),
     )
+    for name in TEXT_STEPS.get(str(family), ()):
+        if name not in steps:
+            raise SourceError(
+                f"{folder / 'policy_preprocessor.json'} has no step '{name}', as {family} has it.", COMPLETE
+            )
     behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER))
     mapping = config.get("normalization_mapping")
     trained_with = mapping if isinstance(mapping, dict) else {}
@@ -170,6 +180,10 @@ def _steps(folder: Path, name: str, known: tuple[str, ...]) -> dict[str, dict[st
                 "own: docs/guides/lerobot-policy.md",
             )
         registered = str(step["registry_name"])
+        found = step.get("config")
+        settings: dict[str, Any] = found if isinstance(found, dict) else {}
+        if registered in RELATIVE and settings.get("enabled") is False:
+            continue
         if registered not in known:
             raise SourceError(
                 f"{folder / name} has the step '{truncate(registered, 80)}'; {suggest(registered, known)}.",
@@ -177,8 +191,7 @@ def _steps(folder: Path, name: str, known: tuple[str, ...]) -> dict[str, dict[st
             )
         if registered in steps:
             raise SourceError(f"{folder / name} has the step '{registered}' twice.", COMPLETE)
-        settings = step.get("config")
-        steps[registered] = {**(settings if isinstance(settings, dict) else {}), "state_file": step.get("state_file")}
+        steps[registered] = {**settings, "state_file": step.get("state_file")}
     return steps
 
 

@@ -24,8 +24,8 @@ TOLERANCE = 1e-4
 TRIALS = 3
 EMPTY = "observation.images.empty_camera_"
 """Cameras that a policy of several fills with a constant."""
-TEXT = "task"
-"""How LeRobot calls the instruction."""
+STATE, TEXT = "observation.state", "task"
+"""How LeRobot calls joints and instruction."""
 
 
 def identifier(key):
@@ -215,22 +215,57 @@ class Prefix(nn.Module):
         return torch.stack(keys), torch.stack(values), pads
 
 
+class PiPrefix(nn.Module):
+    """Pictures and instruction of pi0 to the keys and values of every layer, and which positions are there."""
+
+    def __init__(self, policy, observation, pad):
+        super().__init__()
+        self.model, self.observation, self.pad, self.policy = policy.model, observation, pad, [policy]
+
+    def forward(self, *values):
+        from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
+
+        *frames, ids = values
+        see = self.observation.pictures
+        batch = {key: see[identifier(key)](frame) for key, frame in zip(self.observation.cameras, frames, strict=True)}
+        pictures, present = self.policy[0]._preprocess_images(batch)
+        embedded, pads, attends = self.model.embed_prefix(pictures, present, ids, ids != self.pad)
+        _, cache = self.model.paligemma_with_expert.forward(
+            attention_mask=prepare_attention_masks_4d(make_att_2d_masks(pads, attends)),
+            position_ids=torch.cumsum(pads, dim=1) - 1, past_key_values=None, inputs_embeds=[embedded, None],
+            use_cache=True,
+        )  # fmt: skip
+        keys, values = ([getattr(layer, name) for layer in cache.layers] for name in ("keys", "values"))
+        return torch.stack(keys), torch.stack(values), pads
+
+
 class Flow(nn.Module):
-    """One Euler step of flow matching: x (1, chunk, padded width) at a time (1,) to the next x, and its actions."""
+    """One Euler step of flow matching: x (1, chunk, padded width) at a time (1,) to the next x, and its actions.
+
+    The state (1, S), normalised, is an input of pi0's step; SmolVLA's prefix has it.
+    """
 
     def __init__(self, policy):
         super().__init__()
-        self.model, self.width = policy.model, policy.config.action_feature.shape[0]
+        self.model, self.width, self.policy = policy.model, policy.config.action_feature.shape[0], [policy]
 
-    def forward(self, x, time, interval, keys, values, pads):
+    def forward(self, x, time, interval, keys, values, pads, state=None):
         from transformers import DynamicCache
+
+        more = {} if state is None else {"state": self.policy[0].prepare_state({STATE: state})}
 
         cache = DynamicCache()
         for layer in range(keys.shape[0]):
             cache.update(keys[layer], values[layer], layer)
-        velocity = self.model.denoise_step(x_t=x, prefix_pad_masks=pads, past_key_values=cache, timestep=time)
+        velocity = self.model.denoise_step(x_t=x, prefix_pad_masks=pads, past_key_values=cache, timestep=time, **more)
         x = x + interval * velocity
         return x, x[:, :, : self.width]
+
+
+def tokenizer_name(policy):
+    """Return the tokenizer that the checkpoint's own processor names."""
+    steps = json.loads(Path(policy.config.pretrained_path, "policy_preprocessor.json").read_text())["steps"]
+    return next(step["config"]["tokenizer_name"] for step in steps if step["registry_name"] == "tokenizer_processor")
 
 
 def write_tokenizer(name, out):
@@ -253,24 +288,44 @@ def smolvla(policy, observation, values, out):
     config = policy.config
     if config.adapt_to_pi_aloha or config.n_obs_steps != 1:
         raise SystemExit("adapt_to_pi_aloha and more than one observation step are not supported")
-    pad = write_tokenizer(config.vlm_model_name, out)
+    prefix = Prefix(policy, observation, write_tokenizer(config.vlm_model_name, out))
+    return flow(policy, prefix, dict(zip(observation.keys, values, strict=True)), config.num_steps)
+
+
+def pi0(policy, observation, values, out):
+    """Return the graphs of pi0 with an example of their inputs, and the program; its state goes into every step."""
+    config, model = policy.config, policy.model.paligemma_with_expert
+    if config.n_obs_steps != 1:
+        raise SystemExit("more than one observation step is not supported")
+    for part in (model.paligemma.model.language_model, model.gemma_expert.model):
+        part.config._attn_implementation = "eager"  # as its own inference has it
+    prefix = PiPrefix(policy, observation, write_tokenizer(tokenizer_name(policy), out))
+    named = dict(zip(observation.keys, values, strict=True))
+    return flow(policy, prefix, {key: named[key] for key in observation.cameras}, config.num_inference_steps, named)
+
+
+def flow(policy, prefix, seen, steps, named=None):
+    """Return the graphs of a policy of flow matching over a prefix that is computed once, and the program.
+
+    ``seen`` are the inputs of the prefix beside the instruction; ``named`` holds the state where the step takes it.
+    """
+    config, pad = policy.config, prefix.pad
     ids = torch.full([1, config.tokenizer_max_length], pad)
     ids[0, :3] = torch.tensor([id for id in range(5) if id != pad][:3])
-    names = [*map(identifier, observation.keys), TEXT]
-    prefix, step = Prefix(policy, observation, pad), Flow(policy)
+    names, values, step = [*map(identifier, seen), TEXT], [*seen.values()], Flow(policy)
     with torch.no_grad():
         keys, cached, pads = prefix(*values, ids)
-    shape, steps = [1, config.chunk_size, config.max_action_dim], config.num_steps
+    shape = [1, config.chunk_size, config.max_action_dim]
     schedule = {"time": [1 - number / steps for number in range(steps)], "interval": [-1 / steps] * steps}
     examples = {"x": torch.zeros(shape), "time": torch.ones(1), "interval": torch.ones(1)}
-    examples |= {"keys": keys, "values": cached, "pads": pads}
+    examples |= {"keys": keys, "values": cached, "pads": pads, **({"state": named[STATE]} if named else {})}
     program = [
         {
-            "graph": "prefix", "feeds": dict(zip(names, [*observation.keys, TEXT], strict=True)),
+            "graph": "prefix", "feeds": dict(zip(names, [*seen, TEXT], strict=True)),
             "gives": {name: name for name in ("keys", "values", "pads")},
         },
         {
-            "graph": "step", "feeds": {name: name for name in examples},
+            "graph": "step", "feeds": {name: STATE if name == "state" else name for name in examples},
             "gives": {"next_x": "next_x", "action": "action"}, "repeat": steps, "carry": {"next_x": "x"},
             "schedule": schedule, "noise": {"x": {"shape": shape, "distribution": "normal"}},
         },
@@ -282,7 +337,7 @@ def smolvla(policy, observation, values, out):
     return graphs, program, config.chunk_size
 
 
-FAMILIES = {"act": act, "diffusion": diffusion, "smolvla": smolvla}
+FAMILIES = {"act": act, "diffusion": diffusion, "pi0": pi0, "smolvla": smolvla}
 
 
 def play(graphs, program, values, keys, generator):
@@ -311,6 +366,10 @@ def own_inference(policy, observation, values, drawn, graph_pad):
     if policy.config.type == "smolvla":
         ids = values[-1][:, values[-1][0] != graph_pad]
         batch |= {"observation.language.tokens": ids, "observation.language.attention_mask": torch.ones_like(ids) > 0}
+        return policy.predict_action_chunk(batch, noise=drawn["x"])
+    if policy.config.type == "pi0":
+        batch |= {"observation.language.tokens": values[-1]}
+        batch |= {"observation.language.attention_mask": values[-1] != graph_pad}
         return policy.predict_action_chunk(batch, noise=drawn["x"])
     return policy.predict_action_chunk(batch)
 
@@ -362,10 +421,12 @@ def main(request):
     config.device = "cpu"
     if hasattr(config, "pretrained_backbone_weights"):
         config.pretrained_backbone_weights = None  # the checkpoint has all weights; nothing is downloaded
-    backbone = str(getattr(config, "vlm_model_name", ""))
-    if backbone and (checkpoint.parent / backbone).is_dir():
-        os.chdir(checkpoint.parent)  # the checkpoint may name its backbone relative to where it lies
+    for name, value in {"dtype": "float32", "compile_model": False, "gradient_checkpointing": False}.items():
+        if hasattr(config, name):
+            setattr(config, name, value)  # pi0 may be stored in bfloat16, which the graphs widen
+    os.chdir(checkpoint.parent)  # the checkpoint may name its backbone and tokenizer relative to where it lies
     policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config, local_files_only=True).eval()
+    policy.config.pretrained_path = checkpoint
     observation = Observation(config, request)
     generator = torch.Generator().manual_seed(0)
     keys = observation.keys

@@ -1,6 +1,6 @@
 """Make a LeRobot checkpoint with random weights, and record what its policy does; run in the Python that has LeRobot.
 
-    python _lerobot_checkpoints.py act|diffusion-ddim|diffusion-ddpm|smolvla FOLDER [--small] [--steps 50]
+    python _lerobot_checkpoints.py act|diffusion-ddim|diffusion-ddpm|smolvla|pi0 FOLDER [--small] [--steps 50]
 
 Writes ``FOLDER/checkpoint`` and ``FOLDER/episode.npz``: the observations of an episode (N, ...), the actions (N, A) of
 ``select_action`` with LeRobot's own processors around it, and the noise that each inference drew.
@@ -17,7 +17,7 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 
-JOINTS = 14
+JOINTS, TEXT_KINDS = 14, ("smolvla", "pi0")
 TEXTS = ("red cup", "green bowl", "cup into the bowl\n")
 
 
@@ -65,6 +65,33 @@ def smolvla(folder):
     return SmolVLAPolicy(config())
 
 
+def pi0(folder, small):
+    """Return a pi0, with a tokenizer beside the checkpoint in the place of PaliGemma's."""
+    from lerobot.policies.pi0 import processor_pi0
+    from lerobot.policies.pi0.configuration_pi0 import PI0Config
+    from lerobot.policies.pi0.modeling_pi0 import PI0Policy
+    from tokenizers import Tokenizer, models, pre_tokenizers, processors
+    from transformers import PreTrainedTokenizerFast
+
+    os.chdir(folder)
+    names = ["<pad>", "<bos>", "<unk>", "\n", *["pick", "up", "the", "red", "green", "cup", "bowl", "into"]]
+    words = Tokenizer(models.WordLevel({word: index for index, word in enumerate(names)}, unk_token="<unk>"))
+    words.pre_tokenizer = pre_tokenizers.Split(" ", "removed")
+    words.post_processor = processors.TemplateProcessing(single="<bos> $A", special_tokens=[("<bos>", 1)])
+    tokenizer = PreTrainedTokenizerFast(tokenizer_object=words, pad_token="<pad>", unk_token="<unk>")
+    tokenizer.save_pretrained("tokenizer")
+    step = processor_pi0.TokenizerProcessorStep
+    processor_pi0.TokenizerProcessorStep = lambda **more: step(**{**more, "tokenizer_name": "tokenizer"})
+    sizes = {"chunk_size": 10, "n_action_steps": 5, "num_inference_steps": 5, "image_resolution": (56, 56)}
+    config = PI0Config(**features(48, 64, ["front", "wrist"]), **(sizes if small else {"n_action_steps": 10}))
+    policy = PI0Policy(config)
+    with torch.no_grad():
+        for name, parameter in policy.named_parameters():
+            if "norm" in name and parameter.ndim == 1:
+                parameter.add_(torch.randn_like(parameter) * 0.1)
+    return policy
+
+
 def statistics(config):
     """Return statistics as a dataset has them; one joint never moved."""
     generator = torch.Generator().manual_seed(1)
@@ -98,7 +125,7 @@ def main(kind, folder, small, steps):
     """Write the checkpoint and the episode."""
     torch.manual_seed(0)
     folder.mkdir(parents=True, exist_ok=True)
-    make = {"act": lambda: act(small), "smolvla": lambda: smolvla(folder)}
+    make = {"act": lambda: act(small), "smolvla": lambda: smolvla(folder), "pi0": lambda: pi0(folder, small)}
     policy = make.get(kind, lambda: diffusion(kind.rpartition("-")[2].upper(), small))().eval()
     config, stats = policy.config, statistics(policy.config)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
@@ -112,7 +139,7 @@ def main(kind, folder, small, steps):
 
     real = torch.randn
     replaced = [mock.patch.object(torch, "randn", lambda *args, **more: noise(more.get("size", args)))]
-    if kind == "smolvla":
+    if kind in TEXT_KINDS:
         policy.model.sample_noise = noise
     elif kind != "act":
         scheduler = sys.modules[type(policy.diffusion.noise_scheduler).__module__]
@@ -126,7 +153,7 @@ def main(kind, folder, small, steps):
                 key: value.permute(2, 0, 1).float() / 255 if key in config.image_features else value
                 for key, value in raw.items()
             }
-            if kind == "smolvla":
+            if kind in TEXT_KINDS:
                 fed["task"] = raw["task"] = f"pick up the {TEXTS[len(seen) % len(TEXTS)]}"
             start = len(drawn)
             with mock.patch.object(torch, "randn", real):
@@ -151,7 +178,7 @@ def _with(replaced, policy, batch):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kind", choices=("act", "diffusion-ddim", "diffusion-ddpm", "smolvla"))
+    parser.add_argument("kind", choices=("act", "diffusion-ddim", "diffusion-ddpm", *TEXT_KINDS))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--small", action="store_true")
     parser.add_argument("--steps", type=int, default=50)

@@ -21,9 +21,10 @@ import numpy as np
 
 import vlatool
 
-KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla")
+KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla", "pi0")
 LIMIT = 1e-4
 MAKE = Path(__file__).with_name("_lerobot_checkpoints.py")
+SMALL = Path(__file__).with_name("_small_pi0.py")
 
 
 def errors(bundle: Path, recorded: Path) -> list[float]:
@@ -49,6 +50,14 @@ def errors(bundle: Path, recorded: Path) -> list[float]:
     return found
 
 
+def small_pi0(python: str, place: Path) -> str:
+    """Return a program that runs a script as a Python does, with pi0 in a small size."""
+    program = place / "small-pi0"
+    program.write_text(f'#!/bin/sh\nexec "{python}" "{SMALL}" "$@"\n')
+    program.chmod(0o755)
+    return str(program)
+
+
 def _value(recorded: Any) -> Any:
     return str(recorded) if recorded.dtype.kind == "U" else recorded
 
@@ -67,8 +76,9 @@ def main(arguments: list[str]) -> int:
         for kind in asked.kinds:
             folder = Path(place) / kind
             sizes = ["--steps", str(asked.steps), *(["--small"] if asked.small else [])]
-            subprocess.run([asked.python, MAKE, kind, folder, *sizes], check=True, capture_output=True)
-            command = ["export", "onnx", folder / "checkpoint", "-o", folder / "bundle", "--python", asked.python]
+            python = small_pi0(asked.python, Path(place)) if (kind, asked.small) == ("pi0", True) else asked.python
+            subprocess.run([python, MAKE, kind, folder, *sizes], check=True, capture_output=True)
+            command = ["export", "onnx", folder / "checkpoint", "-o", folder / "bundle", "--python", python]
             subprocess.run([sys.executable, "-m", "vlatool", *command], check=True, capture_output=True)
             found = errors(folder / "bundle", folder / "episode.npz")
             worst = max(worst, *found)
