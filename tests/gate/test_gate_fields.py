@@ -112,6 +112,7 @@ COMPARED: dict[str, tuple[Change, str]] = {
         "frame 'bgr' in the candidate, '' in the baseline",
     ),
     "TensorSpec.history": (tensor("inputs", 0, history=8), "history 8 in the candidate, 0 in the baseline"),
+    "TensorSpec.parts": (tensor("outputs", 0, parts={"arm": (0, 2)}), "parts {'arm': \\(0, 2\\)} in the candidate"),
     "PolicySpec.inputs": (
         lambda before: spec(inputs=(*before.spec.inputs, TensorSpec("gripper", (1, 1))))(before),
         "input gripper: it is in the candidate alone",

@@ -159,6 +159,55 @@ def quantiles(files: dict[str, Any]) -> None:
     files["policy_preprocessor.json"]["steps"][3]["config"]["norm_map"]["STATE"] = "QUANTILES"
 
 
+def relative(
+    place: int = 3, behind: int = 1, absolute: Any = True, width: int = 2, **config: Any
+) -> Callable[[dict[str, Any]], None]:
+    """Return an edit after which actions are relative to the state."""
+
+    def edit(files: dict[str, Any]) -> None:
+        settings = {"enabled": True, "exclude_joints": [], "action_names": None, **config}
+        step = {"registry_name": "relative_actions_processor", "config": settings}
+        files["policy_preprocessor.json"]["steps"].insert(place, step)
+        if absolute is not None:
+            step = {"registry_name": "absolute_actions_processor", "config": {"enabled": absolute}}
+            files["policy_postprocessor.json"]["steps"].insert(behind, step)
+        if width != 2:
+            files["config.json"]["output_features"]["action"] = {"type": "ACTION", "shape": [width]}
+            name = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
+            files[name] |= {"action.min": [-1] * width, "action.max": [1] * width}
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("config", "parts_of", "labels"),
+    [
+        ({}, [[0, 2]], ()),
+        ({"exclude_joints": ["Grip"]}, [[0, 2]], ()),
+        (
+            {"exclude_joints": ["Grip"], "action_names": ["arm.pos", "gripper.pos"]},
+            [[0, 1]],
+            ("arm.pos", "gripper.pos"),
+        ),
+        ({"exclude_joints": ["arm"], "action_names": ["arm.pos"]}, [[1, 2]], ()),
+        ({"exclude_joints": [""], "action_names": ["a", "b", "c"]}, [[0, 2]], ()),
+        ({"exclude_joints": ["a"], "action_names": ["a1", "a2"]}, [], ("a1", "a2")),
+        ({"enabled": False, "absolute": False, "action_names": ["a", "b"]}, [], ("a", "b")),
+        ({"action_names": ["a", "a"]}, [[0, 2]], ()),
+    ],
+)
+def test_relative_actions_are_a_step_of_the_spec(
+    tmp_path: Path, config: dict[str, Any], parts_of: list[Any], labels: tuple[str, ...]
+) -> None:
+    files = parts()
+    relative(**config)(files)
+    action = read_checkpoint(write(tmp_path / "c", files)).action
+    assert action.labels == labels
+    assert [step["parts"] for step in action.convert] == ([parts_of] if parts_of else [])
+    assert directory._tensor(action).get("mode") == ("absolute" if parts_of else None)
+    TensorSpec.from_dict({"name": "action", "shape": [1, 4, 2], **directory._tensor(action)})
+
+
 INPUTS = ("config.json", "input_features")
 STEPS = ("policy_preprocessor.json", "steps")
 STATES = "policy_preprocessor_step_3_normalizer_processor.safetensors"
@@ -193,7 +242,15 @@ BROKEN = {
     "no steps to execute": (edited("config.json", "n_action_steps", to=-2), "n_action_steps"),
     "code": (edited(*STEPS, 1, to={"class": "subprocess.Popen", "config": {"args": "touch pwned"}}), "that is code"),
     "a step of text": (edited(*STEPS, 1, to="to_batch_processor"), "that is code"),
-    "unknown step": (edited(*STEPS, 1, "registry_name", to="relative_actions_processor"), "relative_actions_processor"),
+    "unknown step": (edited(*STEPS, 1, "registry_name", to="evo1_pad_state_processor"), "evo1_pad_state_processor"),
+    "relative alone": (relative(absolute=None), "actions would stay relative"),
+    "absolute alone": (relative(enabled=False), "although none were made relative"),
+    "relative to normalised states": (relative(place=4), "wrong side of the statistics"),
+    "absolute before its statistics": (relative(behind=0), "wrong side of the statistics"),
+    "relative to too few": (relative(width=4), "4 elements that are relative to 3"),
+    "enabled by text": (relative(enabled="true"), "enabled 'true'"),
+    "joints of numbers": (relative(exclude_joints=[1]), "exclude_joints"),
+    "one joint of text": (relative(action_names="gripper"), "action_names"),
     "unknown mode": (edited(*STEPS, 3, "config", "norm_map", "STATE", to="ZCA"), "ZCA"),
     "missing statistic": (edited(STATES, "observation.state.std", to=None), "would pass .* unchanged, silently"),
     "other key": (edited(STATES, "observation.state.mean", to=None), "has no 'observation.state.mean'"),

@@ -15,7 +15,7 @@ from vlatool.gate.config import Gate
 from vlatool.graph.files import read
 from vlatool.graph.random_ops import random_operators
 
-MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite", "frame", "history")
+MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite", "frame", "history", "parts")
 """Fields that a robot relies on; files of statistics and tokenizers may differ."""
 RATE = {"control_hz": "control_hz", "chunk": "chunk", "executed": "executed_actions"}
 """Name of a rate in messages -> field or property of the spec."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vlatool.errors import SourceError, require, suggest
 from vlatool.files.json import read_json
 from vlatool.files.printable import truncate
+from vlatool.sources._lerobot_conversions import ABSOLUTE, RELATIVE, STATE, Steps, joint_names, relative_parts
 
 FAMILIES = ("act", "diffusion", "smolvla")
 """Types of policies that ``_lerobot_child`` traces."""
@@ -43,6 +44,8 @@ class Feature:
         mode: how LeRobot normalises it, of ``MODES``.
         statistics: what the mode takes, float64 of the feature's elements; (3,) for pictures.
         epsilon: what LeRobot adds to a standard deviation on the way in, not on the way out, and puts for a range of 0.
+        convert: steps of the spec between the values of the robot and those of the network.
+        labels: names of its elements, where the checkpoint says them.
     """
 
     key: str
@@ -51,6 +54,8 @@ class Feature:
     mode: str
     statistics: Statistics
     epsilon: float
+    convert: tuple[dict[str, Any], ...] = ()
+    labels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -92,9 +97,9 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     steps = _steps(
         folder,
         "policy_preprocessor.json",
-        (*HARMLESS, *(TEXT_STEPS if family == "smolvla" else ()), RENAME, NORMALIZER),
+        (*HARMLESS, *(TEXT_STEPS if family == "smolvla" else ()), RENAME, RELATIVE, NORMALIZER),
     )
-    behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER))
+    behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER, ABSOLUTE))
     mapping = config.get("normalization_mapping")
     trained_with = mapping if isinstance(mapping, dict) else {}
     robot_key = _robot_keys(folder, steps.get(RENAME, {}).get("rename_map", {}))
@@ -109,10 +114,21 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     if list(outputs) != ["action"]:
         raise SourceError(f"{folder} has the outputs {sorted(outputs)}; wanted: action.", COMPLETE)
     action = _feature(folder, ("action", "action"), outputs["action"], behind.get(UNNORMALIZER, {}), trained_with)
+    action = _converted(folder, action, inputs.get(STATE), (steps, behind))
     execute = config.get("n_action_steps", 1)
     if not isinstance(execute, int) or execute < 1:
         raise SourceError(f"config.json of {folder} has n_action_steps {truncate(repr(execute), 40)}.", COMPLETE)
     return Checkpoint(folder, str(family), inputs, action, execute)
+
+
+def _converted(folder: Path, action: Feature, state: Feature | None, steps: tuple[Steps, Steps]) -> Feature:
+    """Return the action with what lies between it and the robot, and the names of its elements."""
+    width = action.shape[-1]
+    labels = tuple(joint_names(folder, steps[0], width))
+    parts = relative_parts(folder, steps, (state.shape[-1] if state else 0, width))
+    if not parts or state is None:
+        return replace(action, labels=labels)
+    return replace(action, labels=labels, convert=({"op": "relative", "to": state.key, "parts": parts},))
 
 
 def _robot_keys(folder: Path, renames: Any) -> dict[str, str]:

@@ -225,7 +225,7 @@ def _equal(policy: Policy, samples: Sequence[Sample], change: Change, tolerance:
     for sample in chosen:
         try:
             values = policy.program.run({name: value.copy() for name, value in change(sample).items()}, sample.noise)
-            chunk = policy.decode(values[policy.spec.action.name])
+            chunk = policy.decode(values[policy.spec.action.name], sample.encoded)
         except VlatoolError:
             return False
         if (

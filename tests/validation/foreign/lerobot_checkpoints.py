@@ -21,7 +21,7 @@ import numpy as np
 
 import vlatool
 
-KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla")
+KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla", "act-relative", "diffusion-ddim-relative")
 LIMIT = 1e-4
 MAKE = Path(__file__).with_name("_lerobot_checkpoints.py")
 
