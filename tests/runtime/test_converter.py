@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import pytest
 from _written import written
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.errors import DataError, GraphError, SpecError
 from vlatool.runtime import Policy, load
 from vlatool.runtime.converter import action_converter
 from vlatool.runtime.observation import EncodedObservation
 
-ECHO = "g (float[1,{width}] s, float[1,{length},{width}] x) => (float[1,{length},{width}] y) {{ y = Add(x, s) }}"
 CHUNK = "g (float[1,3] s, float[1,2,3] x) => (float[1,2,3] y, float[1,3] z) { y = Identity(x)  z = Identity(s) }"
 NAMES = {"labels": ["one", "two", "grip"]}
 
@@ -68,7 +69,7 @@ BY_MEAN = {"normalisation": "mean_std", "statistics": "stats.json#"}
 
 
 def normalised(tmp_path: Path, **action: Any) -> PolicySpec:
-    (tmp_path / "stats.json").write_text(__import__("json").dumps(STATISTICS))
+    (tmp_path / "stats.json").write_text(json.dumps(STATISTICS))
     state = tensor("s", 1, 3, normalisation="mean_std", statistics="stats.json#s")
     return PolicySpec((state,), (tensor("y", 1, 2, 3, **action),), 10, chunk=2)
 
@@ -112,3 +113,134 @@ def test_the_newest_moment_of_a_history_counts(tmp_path: Path) -> None:
     np.testing.assert_array_equal(chunk, X - [STATE, STATE + 1] + STATE + 1)
     whole = np.stack([STATE, STATE + 5])
     np.testing.assert_array_equal(policy.infer({"s": whole, "x": X}).chunk, X - whole + STATE + 5)
+
+
+def both_ways(tmp_path: Path, width: int, *convert: dict[str, Any], robot: int = 0, **more: Any) -> tuple[Any, Any]:
+    """Return the functions to the network and to the robot of an action of so many elements in the network."""
+    spec = PolicySpec((tensor("s", 1, 3),), (tensor("y", 1, width, convert=list(convert), **more),), 10)
+    converter = action_converter(spec, tmp_path)
+    return converter.to_network, converter.to_robot
+
+
+@pytest.mark.parametrize(
+    ("step", "robot", "network"),
+    [
+        ({"op": "scale", "factor": [1, -1, 1]}, [1, 2, 3], [1, -2, 3]),
+        ({"op": "scale", "parts": [2, 0], "factor": [2, 10], "offset": 1}, [1, 2, 3], [11, 2, 7]),
+        ({"op": "scale", "factor": 57.29578, "parts": [[0, 2]]}, [np.pi, 1, 1], [180, 57.29578, 1]),
+        ({"op": "range", "parts": [2], "robot": [0, 0.08], "network": [-1, 1]}, [5, 5, 0.06], [5, 5, 0.5]),
+        ({"op": "range", "parts": [2], "robot": [0, 1], "network": [1, -1]}, [5, 5, 0.25], [5, 5, 0.5]),
+        ({"op": "clip", "low": [0, 0, 0], "high": 4}, [1, 2, 3], [1, 2, 3]),
+    ],
+)
+def test_a_step_goes_both_ways(tmp_path: Path, step: dict[str, Any], robot: Any, network: Any) -> None:
+    to_network, to_robot = both_ways(tmp_path, 3, step)
+    given = np.array([robot], np.float32)
+    np.testing.assert_allclose(to_network(given), [network], rtol=1e-6)
+    np.testing.assert_allclose(to_robot(np.array([network], np.float32)), [robot], rtol=1e-6)
+    np.testing.assert_array_equal(given, np.array([robot], np.float32))
+    assert to_network(given).dtype == np.float32
+
+
+def test_actions_are_clipped(tmp_path: Path) -> None:
+    _, to_robot = both_ways(tmp_path, 3, {"op": "clip", "low": [-1, -2, -3], "high": [1, 2, 3]})
+    np.testing.assert_array_equal(to_robot(np.array([[9, -9, 2]], np.float32)), [[1, -2, 2]])
+    _, to_robot = both_ways(tmp_path, 3, {"op": "clip", "parts": [1], "high": 0})
+    np.testing.assert_array_equal(to_robot(np.array([[9, 9, -2]], np.float32)), [[9, 0, -2]])
+
+
+def openvla(grip: Any) -> Any:
+    """OpenVLA's gripper on LIBERO: 0 to 1 (open), binarised to -1 or 1, and its sign turned (-1 is open)."""
+    return -np.sign(2 * (grip - 0) / (1 - 0) - 1)
+
+
+def test_the_gripper_of_openvla_on_libero(tmp_path: Path) -> None:
+    steps = [
+        {"op": "scale", "parts": "grip", "factor": -1},
+        {"op": "binarise", "parts": "grip", "equal": 0},
+        {"op": "range", "parts": "grip", "robot": [-1, 1], "network": [0, 1]},
+    ]
+    to_network, to_robot = both_ways(tmp_path, 3, *steps, labels=["x", "y", "grip"])
+    grips = np.array([0, 0.2, 0.5, 0.500001, 0.9, 1], np.float32)
+    found = to_robot(np.stack([grips + 5, grips - 5, grips], axis=1))
+    np.testing.assert_array_equal(found[:, 2], openvla(grips))
+    np.testing.assert_array_equal(found[:, 0], grips + 5)
+    with pytest.raises(SpecError, match="binarise, has no way back"):
+        to_network(found)
+
+
+@pytest.mark.parametrize(
+    ("step", "expected"),
+    [
+        ({"threshold": 0.5, "above": -1, "below": 1}, [1, 1, 1, -1]),  # vla_jepa_binarize_gripper of LeRobot
+        ({"threshold": 0.5, "above": 1, "below": 0, "equal": 1}, [0, 0, 1, 1]),  # its vla_jepa_pre_snap_gripper
+        ({"threshold": 0.5}, [-1, -1, -1, 1]),  # that of X-VLA on LIBERO
+        ({}, [-1, 1, 1, 1]),
+    ],
+)
+def test_a_threshold(tmp_path: Path, step: dict[str, Any], expected: list[float]) -> None:
+    _, to_robot = both_ways(tmp_path, 1, {"op": "binarise", **step})
+    found = to_robot(np.array([[0], [0.3], [0.5], [0.7]], np.float32))
+    np.testing.assert_array_equal(found[:, 0], expected)
+
+
+def test_a_threshold_of_normalised_values(tmp_path: Path) -> None:
+    (tmp_path / "stats.json").write_text('{"y": {"mean": [10], "std": [2]}}')
+    steps = [{"op": "normalisation"}, {"op": "binarise", "threshold": 0.25, "below": 0}]
+    _, to_robot = both_ways(tmp_path, 1, *steps, normalisation="mean_std", statistics="stats.json#y")
+    np.testing.assert_array_equal(to_robot(np.array([[0.2], [0.3]], np.float32)), [[10], [12]])
+
+
+def test_the_linkage_of_aloha(tmp_path: Path) -> None:
+    to_network, to_robot = both_ways(tmp_path, 1, {"op": "linkage", "arm_length": 0.036, "horn_radius": 0.022})
+    positions = np.linspace(0.01844, 0.058, 50, dtype=np.float32)[:, None]
+    angles = to_network(positions)
+    inside = (0.022**2 + positions**2 - 0.036**2) / (2 * 0.022 * positions)
+    np.testing.assert_allclose(angles, np.arcsin(np.clip(inside, -1, 1)), rtol=1e-5)
+    np.testing.assert_allclose(to_robot(angles), positions, rtol=1e-4)
+    assert np.isfinite(to_network(np.array([[0.0], [-0.1], [1e-30], [9]], np.float32))).all()
+
+
+def test_two_arms_with_rotations_of_other_forms(tmp_path: Path) -> None:
+    from scipy.spatial.transform import Rotation
+
+    parts = {"left": [3, 6], "right": [10, 13]}
+    steps = [
+        {"op": "rotation", "parts": ["right", "left"], "robot": "axis_angle", "network": "6d_columns"},
+        {"op": "scale", "parts": [9, 19], "factor": [2, 4]},
+    ]
+    to_network, to_robot = both_ways(tmp_path, 20, *steps, parts=parts)
+    turns = Rotation.random(8, rng=1)
+    left, right = turns[:4].as_rotvec(), turns[4:].as_rotvec()
+    ones = np.ones((4, 1))
+    robot = np.concatenate([ones * [1, 2, 3], left, 4 * ones, ones * [5, 6, 7], right, 8 * ones], axis=1)
+    columns = [each.as_matrix()[:, :, :2].swapaxes(1, 2).reshape(-1, 6) for each in (turns[:4], turns[4:])]
+    network = np.concatenate([ones * [1, 2, 3], columns[0], 8 * ones, ones * [5, 6, 7], columns[1], 32 * ones], axis=1)
+    np.testing.assert_allclose(to_network(robot.astype(np.float32)), network, atol=1e-6)
+    np.testing.assert_allclose(to_robot(network.astype(np.float32)), robot, atol=3e-6)
+    np.testing.assert_allclose(to_robot(to_network(robot)), robot, atol=1e-12)
+
+
+def test_a_state_is_converted_before_it_is_normalised_and_labels_are_the_robots(tmp_path: Path) -> None:
+    text = "g (float[1,3] s, float[1,2,3] x) => (float[1,2,3] y, float[1,3] z) { y = Identity(x)  z = Identity(s) }"
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "assets/stats.json").write_text('{"s": {"mean": [1, 1, 1], "std": [2, 2, 2]}}')
+    turn = {"op": "rotation", "parts": "q", "robot": "quaternion_wxyz", "network": "axis_angle"}
+    by_mean = {"normalisation": "mean_std", "statistics": "stats.json#s"}
+    inputs = (tensor("s", 1, 3, convert=[turn], parts={"q": [0, 4]}, **by_mean), tensor("x", 1, 2, 3))
+    policy = load(written(tmp_path, text, inputs, (tensor("y", 1, 2, 3), tensor("z", 1, 3)), chunk=2).path)
+    for sign in (1, -1):
+        seen = policy.infer({"s": sign * np.array([0, 0, 1, 0]), "x": X}).outputs["z"]
+        np.testing.assert_allclose(np.abs(seen * 2 + 1), [[0, np.pi, 0]], atol=1e-6)
+    for wrong, words in (([0, 0, 0, 0], "no rotation"), ([1, 0, 0], r"takes \[1, 4\]"), ([np.nan, 0, 0, 0], "1 NaN")):
+        with pytest.raises(DataError, match=words):
+            policy.infer({"s": np.array(wrong, np.float32), "x": X})
+
+
+def test_what_is_no_rotation_is_no_action(tmp_path: Path) -> None:
+    turn = {"op": "rotation", "parts": [[0, 3]], "robot": "axis_angle", "network": "6d_rows"}
+    text = "g (float[1,6] x) => (float[1,6] y) { y = Identity(x) }"
+    policy = load(written(tmp_path, text, (tensor("x", 1, 6),), (tensor("y", 1, 6, convert=[turn]),)).path)
+    assert policy.infer({"x": [1, 0, 0, 0, 1, 0]}).chunk.tolist() == [[0, 0, 0]]
+    with pytest.raises(GraphError, match="'y' is not finite"):
+        policy.infer({"x": np.zeros(6)})

@@ -102,6 +102,9 @@ DIFFERENT: dict[str, Edit] = {
     "epsilon": _with_tensor("inputs", 1, epsilon=1e-8),
     "parts": _with_tensor("outputs", 0, parts={"arm": (0, 2)}),
     "relative": _with_tensor("outputs", 0, mode="", convert=(Conversion("relative", (0,), "proprio"),)),
+    "a sign": _with_tensor("inputs", 1, convert=(Conversion("scale", (0,), factor=(-1.0,)),)),
+    "a bound": _with_tensor("outputs", 0, convert=(Conversion("clip", high=(1.0,)),)),
+    "another bound": _with_tensor("outputs", 0, convert=(Conversion("clip", high=(2.0,)),)),
     "relative to another element": _with_tensor(
         "outputs", 0, mode="", convert=(Conversion("relative", (0,), "proprio", (1,)),)
     ),

@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from vlatool.bundle.spec import TensorSpec
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError
 from vlatool.machine.host import LEROBOT_PYTHON
 from vlatool.registry import Claim
+from vlatool.runtime.converter import action_converter
+from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.sources import _lerobot_directory as directory
 from vlatool.sources._lerobot_checkpoint import read_checkpoint
@@ -159,6 +161,57 @@ def quantiles(files: dict[str, Any]) -> None:
     files["policy_preprocessor.json"]["steps"][3]["config"]["norm_map"]["STATE"] = "QUANTILES"
 
 
+def aloha_state(value: np.ndarray) -> np.ndarray:
+    """SmolVLA's ``_pi_aloha_decode_state`` of LeRobot 0.6.1, in float32."""
+    value = value * 1
+    value[..., [1, 2, 8, 9]] *= -1
+    for at in (6, 13):
+        metres = value[..., at] * np.float32(0.058 - 0.01844) + np.float32(0.01844)
+        sines = (0.022**2 + metres**2 - 0.036**2) / (2 * 0.022 * metres)
+        value[..., at] = (np.arcsin(np.clip(sines, -1, 1)) - np.float32(0.4)) / np.float32(1.1)
+    return value
+
+
+def aloha_action(value: np.ndarray) -> np.ndarray:
+    """Its ``_pi_aloha_encode_actions``."""
+    value = value * 1
+    value[..., [1, 2, 8, 9]] *= -1
+    for at in (6, 13):
+        value[..., at] = (value[..., at] * np.float32(1.1) + np.float32(0.4 + 0.6213)) / np.float32(1.491 + 0.6213)
+    return value
+
+
+@pytest.mark.parametrize("mode", ["IDENTITY", "MEAN_STD"])
+def test_what_smolvla_does_for_aloha_is_data(tmp_path: Path, mode: str) -> None:
+    files, wide = parts(), {"shape": [14]}
+    norms = {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode}
+    config = {**CONFIG, "type": "smolvla", "adapt_to_pi_aloha": True, "normalization_mapping": norms}
+    config["input_features"] = {"observation.state": {**STATE, **wide}}
+    config["output_features"] = {"action": {**ACTION, **wide}}
+    files["config.json"] = config
+    mean, std = np.linspace(-1, 1, 14), np.linspace(0.5, 2, 14)
+    for name, step in (("policy_preprocessor", -1), ("policy_postprocessor", 0)):
+        settings = files[f"{name}.json"]["steps"][step]["config"]
+        settings.update(norm_map=norms, features={**config["input_features"], **config["output_features"]})
+    for file in [name for name in files if name.startswith("policy_") and name.endswith(".safetensors")]:
+        files[file] = {f"{key}.{row}": value for key in ("observation.state", "action")
+                       for row, value in (("mean", mean), ("std", std))}  # fmt: skip
+    relative(exclude_joints=["x"])(files)
+    checkpoint = read_checkpoint(write(tmp_path / "c", files))
+    state, action = checkpoint.inputs["observation.state"], checkpoint.action
+    rows = {each.key: directory._rows(each) for each in (state, action)}
+    (tmp_path / "statistics.json").write_text(json.dumps(rows))
+    said = [{"name": each.key, "shape": [1, 14], **directory._tensor(each)} for each in (state, action)]
+    spec = PolicySpec.from_dict({"inputs": said[:1], "outputs": said[1:], "control_hz": 30})
+    random = np.random.default_rng(0)
+    seen, given = (random.uniform(0, 1, (1, 14)).astype(np.float32) for _ in range(2))
+    offset, scale = (np.float32(mean), np.float32(std)) if mode == "MEAN_STD" else (np.float32(0), np.float32(1))
+    encoded = ObservationEncoder(spec, tmp_path)({state.key: seen})
+    np.testing.assert_allclose(encoded[state.key], aloha_state((seen - offset) / scale), atol=2e-5, rtol=1e-4)
+    chunk = action_converter(spec, tmp_path).to_robot(given, seen[0])
+    np.testing.assert_allclose(chunk, aloha_action(given) * scale + offset + seen, rtol=1e-5, atol=1e-6)
+
+
 def relative(
     place: int = 3, behind: int = 1, absolute: Any = True, width: int = 2, **config: Any
 ) -> Callable[[dict[str, Any]], None]:
@@ -249,6 +302,10 @@ BROKEN = {
     "absolute before its statistics": (relative(behind=0), "wrong side of the statistics"),
     "relative to too few": (relative(width=4), "4 elements that are relative to 3"),
     "enabled by text": (relative(enabled="true"), "enabled 'true'"),
+    "ALOHA of three joints": (
+        lambda files: files["config.json"].update(type="smolvla", adapt_to_pi_aloha=True), "the 14 joints of ALOHA"),
+    "ALOHA by text": (
+        lambda files: files["config.json"].update(type="smolvla", adapt_to_pi_aloha="no"), "adapt_to_pi_aloha 'no'"),
     "joints of numbers": (relative(exclude_joints=[1]), "exclude_joints"),
     "one joint of text": (relative(action_names="gripper"), "action_names"),
     "unknown mode": (edited(*STEPS, 3, "config", "norm_map", "STATE", to="ZCA"), "ZCA"),

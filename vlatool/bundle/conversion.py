@@ -6,20 +6,40 @@ An input passes its list from first to last, the action from last to first.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 from vlatool.errors import SpecError, suggest
 from vlatool.files.messages import to_json
-from vlatool.files.validate import integer, known_keys, mapping, sequence, short_repr, text
+from vlatool.files.validate import finite_number, integer, known_keys, mapping, sequence, short_repr, text
 
 OPERATIONS: dict[str, tuple[str, ...]] = {
     "relative": ("parts", "to", "state", "successive"),
+    "rotation": ("parts", "robot", "network", "hemisphere"),
+    "scale": ("parts", "factor", "offset"),
+    "range": ("parts", "robot", "network"),
+    "clip": ("parts", "low", "high"),
+    "binarise": ("parts", "threshold", "below", "above", "equal"),
+    "linkage": ("parts", "arm_length", "horn_radius"),
     "normalisation": (),
 }
 """What is done to a vector -> the keys that say how."""
 OUTPUTS_ALONE = ("relative",)
+PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
+"""Two columns or rows of a matrix; the first and second one (``xy``) where a form does not say which."""
+_SIDES = tuple(f"6d_{side}{how}" for side in ("columns", "rows") for how in ("", "_interleaved"))
+_EULER = tuple("".join(axes) for axes in itertools.product("xyz", repeat=3) if axes[0] != axes[1] != axes[2])
+ROTATIONS = {
+    "axis_angle": 3, "quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9,
+    **{f"{form}{pair}": 6 for form in _SIDES for pair in ("", *(f"_{pair}" for pair in PAIRS))},
+    **{f"euler_{order}": 3 for axes in _EULER for order in (axes, axes.upper())},
+}  # fmt: skip
+"""Form of a rotation -> elements. Angles are in rad. ``euler_xyz`` turns about fixed axes, ``euler_XYZ`` about those
+that turn along (as SciPy calls them); a matrix is written row by row. ``6d_columns`` is the first column and then the
+second, ``6d_rows`` the first row and then the second, ``_interleaved`` their elements by turns; ``6d_rows_yz`` others.
+"""
+HEMISPHERES = ("positive", "negative", "keep")
 MAX_CONVERSIONS = 32
 Span = tuple[int, int]
 Selector = str | int | tuple[int, ...]
@@ -32,6 +52,13 @@ class Conversion:
 
     Args:
         op: ``relative``: the network gives differences from what an input holds at the time of inference.
+            ``rotation``: the same rotation in another form, of ``ROTATIONS``.
+            ``scale``: the network has robot x factor + offset: signs, units, zeros of joints.
+            ``range``: ``robot`` and ``network`` are the same two places of one scale, in any order.
+            ``clip``: not below ``low`` and not above ``high``, on both ways.
+            ``binarise``: ``above`` for what is above the threshold, ``below`` for what is not; it has no way back.
+            ``linkage``: the robot has the position of a gripper's fingers in m, the network the angle of the horn that
+            moves them by an arm, in rad: angle = arcsin((r^2 + x^2 - l^2) / (2 r x)), as on ALOHA (Interbotix).
             ``normalisation`` stands where the statistics of the tensor are applied: after the last step if it is left
             out; steps behind it are done to normalised values.
         parts: what the step is done to: names of parts or labels, places of elements, or [start, stop] (stop is not
@@ -41,6 +68,20 @@ class Conversion:
         state: of ``relative``: the parts of that input, one for each of ``parts``; the same ones when left out.
         successive: of ``relative``: whether each action is a difference from the one before it in the chunk, and the
             first from the state; otherwise all are differences from the state.
+        robot: of ``rotation``: the form that the robot gives or gets; of ``range``: two numbers.
+        network: of ``rotation``: the form that the network takes or gives; of ``range``: what they are there.
+        hemisphere: of ``rotation``: sign of w of quaternions that result, and of those that axis and angle result
+            from: ``positive`` (angles up to pi), ``negative`` (beyond) or ``keep``.
+        factor: of ``scale``: not 0; one number, or one for each element of the parts, in their order.
+        offset: of ``scale``: in the same way.
+        low: of ``clip``: in the same way, none for no bound.
+        high: of ``clip``: in the same way.
+        threshold: of ``binarise``.
+        below: of ``binarise``.
+        above: of ``binarise``.
+        equal: of ``binarise``: what becomes of the threshold itself; ``below`` when left out.
+        arm_length: of ``linkage``: l in m.
+        horn_radius: of ``linkage``: r in m.
     """
 
     op: str
@@ -48,6 +89,19 @@ class Conversion:
     to: str = ""
     state: tuple[Selector, ...] = ()
     successive: bool = False
+    robot: str | tuple[float, ...] = ""
+    network: str | tuple[float, ...] = ""
+    hemisphere: str = "positive"
+    factor: tuple[float, ...] = (1.0,)
+    offset: tuple[float, ...] = (0.0,)
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    threshold: float = 0.0
+    below: float = -1.0
+    above: float = 1.0
+    equal: float | None = None
+    arm_length: float = 0.0
+    horn_radius: float = 0.0
 
     def __post_init__(self) -> None:
         _one_of(self.op, OPERATIONS, "A step of 'convert' has the op")
@@ -76,10 +130,86 @@ class Conversion:
                 "name one part in 'state' for each of 'parts'",
             )
 
+    def _check_rotation(self) -> None:
+        for side in ("robot", "network"):
+            _one_of(getattr(self, side), ROTATIONS, f"{self.where} has on the side of the {side} the form")
+        _one_of(self.hemisphere, HEMISPHERES, f"{self.where} has the hemisphere")
+        if not self.parts:
+            raise SpecError(f"{self.where} needs 'parts': the rotations in the vector.")
+
+    def _check_scale(self) -> None:
+        self._keep_numbers("factor", "offset")
+        if not self.factor or not self.offset or not all(self.factor):
+            got = f"the factor {short_repr(self.factor)} and the offset {short_repr(self.offset)}"
+            raise SpecError(f"{self.where} has {got}; wanted: numbers, and no factor of 0, which has no way back.")
+
+    def _check_range(self) -> None:
+        self._keep_numbers("robot", "network")
+        for side in ("robot", "network"):
+            values = getattr(self, side)
+            if len(values) != 2 or values[0] == values[1]:
+                raise SpecError(f"{self.where} has {side} {short_repr(values)}; wanted: two numbers that differ.")
+
+    def _check_clip(self) -> None:
+        self._keep_numbers("low", "high")
+        bounds = [(low, high) for low in self.low for high in self.high] if 1 in (len(self.low), len(self.high)) else (
+            zip(self.low, self.high, strict=False))  # fmt: skip
+        if not (self.low or self.high) or any(low > high for low, high in bounds):
+            got = f"low {short_repr(self.low)} and high {short_repr(self.high)}"
+            raise SpecError(f"{self.where} has {got}; wanted: one of them at least, the lower one as 'low'.")
+
+    def _check_binarise(self) -> None:
+        for name in ("threshold", "below", "above"):
+            object.__setattr__(
+                self, name, finite_number(getattr(self, name), f"{self.where} has {name}, which", SpecError)
+            )
+        if self.equal is not None:
+            object.__setattr__(self, "equal", finite_number(self.equal, f"{self.where} has equal, which", SpecError))
+
+    def _check_linkage(self) -> None:
+        for name in ("arm_length", "horn_radius"):
+            if finite_number(getattr(self, name), f"{self.where} has {name}, which", SpecError) <= 0:
+                raise SpecError(f"{self.where} needs {name} in m, above 0; got {short_repr(getattr(self, name))}.")
+
+    def _keep_numbers(self, *names: str) -> None:
+        """Make tuples of numbers of fields; one number that stands alone is accepted, too."""
+        for name in names:
+            value = getattr(self, name)
+            listed = value if isinstance(value, list | tuple) else (value,)
+            numbers = tuple(finite_number(each, f"{self.where} has {name}, of which one", SpecError) for each in listed)
+            object.__setattr__(self, name, numbers)
+
     @property
     def growth(self) -> int:
         """Elements that each part has more on the side of the network than on that of the robot."""
-        return 0
+        if self.op != "rotation":
+            return 0
+        return ROTATIONS[str(self.network)] - ROTATIONS[str(self.robot)]
+
+    def check_spans(self, spans: Iterable[Span]) -> None:
+        """Check the places of the parts on the side of the robot.
+
+        Raises:
+            SpecError: for parts that overlap, or are not as wide as a rotation.
+        """
+        ordered = sorted(spans)
+        for (_, stop), (start, _) in itertools.pairwise(ordered):
+            if start < stop:
+                raise SpecError(f"{self.where} has parts that overlap; each element may be converted once.")
+        for start, stop in ordered if self.op == "rotation" else ():
+            if stop - start != ROTATIONS[str(self.robot)]:
+                raise SpecError(
+                    f"{self.where} is done to {stop - start} elements, [{start}, {stop}); {self.robot} has "
+                    f"{ROTATIONS[str(self.robot)]}.",
+                    "name the part of the robot's vector that is the rotation alone",
+                )
+        elements = sum(stop - start for start, stop in ordered)
+        for name in ("factor", "offset", "low", "high"):
+            if len(getattr(self, name)) not in (0, 1, elements):
+                raise SpecError(
+                    f"{self.where} has {len(getattr(self, name))} numbers as {name}, for {elements} elements.",
+                    "give one number, or one for each element of 'parts', in their order",
+                )
 
     @classmethod
     def from_dict(cls, data: Any) -> Conversion:
@@ -195,10 +325,7 @@ def layouts_of(robot: Layout, conversions: tuple[Conversion, ...]) -> list[Layou
     """
     layouts = [robot]
     for conversion in conversions:
-        spans = sorted(layouts[-1].spans(conversion.parts, conversion.where))
-        for (_, stop), (start, _) in itertools.pairwise(spans):
-            if start < stop:
-                raise SpecError(f"{conversion.where} has parts that overlap; each element may be converted once.")
+        conversion.check_spans(layouts[-1].spans(conversion.parts, conversion.where))
         layouts.append(layouts[-1].after(conversion))
     return layouts
 

@@ -144,10 +144,13 @@ class TensorSpec:
                 text(axis, f"An axis of '{self.name}'", SpecError, empty=False)
         check_limit("elements", self.elements, f"'{self.name}'", SpecError)
         width = self.robot_width
+        if self.convert and self.width and width < 1:
+            raise SpecError(f"'{self.name}' has {self.width} elements; its rotations alone have more in the network.")
+        where = "" if width == self.width else ", as the robot has it"
         for name in ("labels", "unit"):
             value = getattr(self, name)
             if isinstance(value, tuple) and value and len(value) != width:
-                raise SpecError(f"'{self.name}' has {len(value)} {name} for a last axis of {width}.")
+                raise SpecError(f"'{self.name}' has {len(value)} {name} for a last axis of {width}{where}.")
 
     def _check_conversions(self) -> None:
         if not self.convert and not self.parts:

@@ -13,11 +13,14 @@ from vlatool.bundle.conversion import Conversion, Layout, Span
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SpecError
 from vlatool.runtime.assets import Assets
+from vlatool.runtime.rotation import converted
 from vlatool.runtime.statistics import load_normaliser
 
 Array = NDArray[Any]
 Change = Callable[[Array, "Array | None"], Array]
 """Vectors (..., A), and the state (S,) that an action is relative to -> vectors."""
+Elements = Callable[[Array], Array]
+"""The elements of a step's parts, (..., K) -> what they become."""
 
 
 class _Step(NamedTuple):
@@ -31,13 +34,19 @@ class Converter:
     Args:
         tensor: an input, or the action.
         states: of the action: places in it and in the state, for each step ``relative`` in the order of ``convert``.
+        outward: whether it is the action, which goes from the network to the robot.
 
     Raises:
         SpecError: when statistics are missing or do not fit.
     """
 
     def __init__(
-        self, tensor: TensorSpec, assets: Assets, states: Sequence[tuple[tuple[Span, Span], ...]] = ()
+        self,
+        tensor: TensorSpec,
+        assets: Assets,
+        states: Sequence[tuple[tuple[Span, Span], ...]] = (),
+        *,
+        outward: bool = False,
     ) -> None:
         self.normaliser = load_normaliser(tensor, assets)
         self._steps: list[_Step] = []
@@ -48,7 +57,7 @@ class Converter:
             elif conversion.op == "relative":
                 self._steps.append(_relative(conversion, next(remaining)))
             else:
-                self._steps.append(_step(conversion, layout))
+                self._steps.append(_step(conversion, layout, outward))
         if not marked and self.normaliser is not None:
             self._steps.append(self._normalisation())
 
@@ -85,7 +94,7 @@ def action_converter(spec: PolicySpec, assets: Assets) -> Converter:
         SpecError: when statistics are missing or do not fit.
     """
     states = [spec.state_spans(step) for step in spec.action.convert if step.op == "relative"]
-    return Converter(spec.action, assets, states)
+    return Converter(spec.action, assets, states, outward=True)
 
 
 def newest_moment(values: Any, width: int) -> Array:
@@ -94,13 +103,110 @@ def newest_moment(values: Any, width: int) -> Array:
     return newest
 
 
-def _step(conversion: Conversion, layout: Layout) -> _Step:
+def _step(conversion: Conversion, layout: Layout, outward: bool) -> _Step:
     """Return the functions of a step.
 
     Args:
         layout: on the side of the robot.
     """
-    raise SpecError(f"{conversion.where} is not known to this vlatool.", "upgrade vlatool")
+    spans = layout.spans(conversion.parts, conversion.where)
+    if conversion.op == "rotation":
+        return _rotation(conversion, sorted(spans))
+    places = _places(spans)
+    make: Callable[[Conversion], tuple[Elements, Elements]] = {
+        "scale": _scale, "range": _range, "clip": _clip, "linkage": _linkage,
+        "binarise": partial(_binarise, outward=outward),
+    }[conversion.op]  # fmt: skip
+    return _Step(*(partial(_of_places, places=places, change=change) for change in make(conversion)))
+
+
+def _of_places(values: Array, _: Array | None, places: Any, change: Elements) -> Array:
+    out = values.copy()
+    out[..., places] = change(out[..., places])
+    return out
+
+
+def _scale(conversion: Conversion) -> tuple[Elements, Elements]:
+    factor, offset = np.array(conversion.factor), np.array(conversion.offset)
+
+    def numbers(values: Array) -> tuple[Array, Array]:
+        return factor.astype(values.dtype), offset.astype(values.dtype)
+
+    def forward(values: Array) -> Array:
+        by, more = numbers(values)
+        return np.asarray(values * by + more)
+
+    def back(values: Array) -> Array:
+        by, more = numbers(values)
+        return np.asarray((values - more) / by)
+
+    return forward, back
+
+
+def _range(conversion: Conversion) -> tuple[Elements, Elements]:
+    """One scale on another: by way of 0 to 1, as LeRobot and openpi compute it."""
+
+    def moved(values: Array, before: Sequence[float], after: Sequence[float]) -> Array:
+        shares = (values - before[0]) / (before[1] - before[0])
+        return np.asarray(shares * (after[1] - after[0]) + after[0])
+
+    robot, network = (tuple(float(each) for each in side) for side in (conversion.robot, conversion.network))
+    return partial(moved, before=robot, after=network), partial(moved, before=network, after=robot)
+
+
+def _clip(conversion: Conversion) -> tuple[Elements, Elements]:
+    low, high = np.array(conversion.low or -np.inf), np.array(conversion.high or np.inf)
+
+    def clipped(values: Array) -> Array:
+        return np.clip(values, low.astype(values.dtype), high.astype(values.dtype))
+
+    return clipped, clipped
+
+
+def _binarise(conversion: Conversion, outward: bool) -> tuple[Elements, Elements]:
+    equal = conversion.below if conversion.equal is None else conversion.equal
+
+    def decided(values: Array) -> Array:
+        below = np.where(values == conversion.threshold, equal, conversion.below)
+        return np.where(values > conversion.threshold, conversion.above, below).astype(values.dtype)
+
+    def refused(values: Array) -> Array:
+        raise SpecError(
+            f"{conversion.where} has no way back: what a value was before it, nobody knows.",
+            "train on what the network gives (distill), or leave the step out, and let the controller do it",
+        )
+
+    return (refused, decided) if outward else (decided, refused)
+
+
+def _linkage(conversion: Conversion) -> tuple[Elements, Elements]:
+    arm, horn = conversion.arm_length, conversion.horn_radius
+
+    def angles(positions: Array) -> Array:
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            sines = (horn**2 + positions**2 - arm**2) / (2 * horn * positions)
+        return np.asarray(np.arcsin(np.clip(sines, -1.0, 1.0)))
+
+    def positions(angles: Array) -> Array:
+        roots = np.sqrt(np.maximum(arm**2 - (horn * np.cos(angles)) ** 2, 0))
+        return np.asarray(horn * np.sin(angles) + roots)
+
+    return angles, positions
+
+
+def _rotation(conversion: Conversion, spans: Sequence[Span]) -> _Step:
+    there = [(start + index * conversion.growth, stop + (index + 1) * conversion.growth)
+             for index, (start, stop) in enumerate(spans)]  # fmt: skip
+
+    def turned(values: Array, _: Array | None, places: Sequence[Span], forms: tuple[str, str]) -> Array:
+        parts, done = [], 0
+        for start, stop in places:
+            parts += [values[..., done:start], converted(values[..., start:stop], *forms, conversion.hemisphere)]
+            done = stop
+        return np.concatenate([*parts, values[..., done:]], axis=-1)
+
+    forms = str(conversion.robot), str(conversion.network)
+    return _Step(partial(turned, places=spans, forms=forms), partial(turned, places=there, forms=forms[::-1]))
 
 
 def _places(spans: Sequence[Span]) -> Any:

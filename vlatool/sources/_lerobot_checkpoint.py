@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from vlatool.errors import SourceError, require, suggest
 from vlatool.files.json import read_json
 from vlatool.files.printable import truncate
-from vlatool.sources._lerobot_conversions import ABSOLUTE, RELATIVE, STATE, Steps, joint_names, relative_parts
+from vlatool.sources._lerobot_conversions import (
+    ABSOLUTE,
+    RELATIVE,
+    STATE,
+    Steps,
+    aloha_steps,
+    joint_names,
+    relative_parts,
+)
 
 FAMILIES = ("act", "diffusion", "smolvla")
 """Types of policies that ``_lerobot_child`` traces."""
@@ -27,6 +35,7 @@ MODES = {
     "QUANTILE10": ("q10", "q90"),
 }  # fmt: skip
 """Normalisation of LeRobot (``processor/normalize_processor.py`` of 0.6) -> the statistics that it takes."""
+NORMALISATION = {"op": "normalisation"}
 EMPTY_CAMERA = "observation.images.empty_camera_"
 """Cameras that the policy fills with a constant itself."""
 COMPLETE = "save the policy again with save_pretrained, its processors, too: config.json, model.safetensors and both "
@@ -115,6 +124,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise SourceError(f"{folder} has the outputs {sorted(outputs)}; wanted: action.", COMPLETE)
     action = _feature(folder, ("action", "action"), outputs["action"], behind.get(UNNORMALIZER, {}), trained_with)
     action = _converted(folder, action, inputs.get(STATE), (steps, behind))
+    if family == "smolvla":
+        inputs, action = _adapted(folder, config, inputs, action)
     execute = config.get("n_action_steps", 1)
     if not isinstance(execute, int) or execute < 1:
         raise SourceError(f"config.json of {folder} has n_action_steps {truncate(repr(execute), 40)}.", COMPLETE)
@@ -129,6 +140,21 @@ def _converted(folder: Path, action: Feature, state: Feature | None, steps: tupl
     if not parts or state is None:
         return replace(action, labels=labels)
     return replace(action, labels=labels, convert=({"op": "relative", "to": state.key, "parts": parts},))
+
+
+def _adapted(
+    folder: Path, config: Mapping[str, Any], inputs: dict[str, Feature], action: Feature
+) -> tuple[dict[str, Feature], Feature]:
+    """Return the features with what the policy itself does to the state and the action of ALOHA."""
+    state = inputs.get(STATE)
+    of_state, of_action = aloha_steps(folder, config, (state.shape[-1] if state else 0, action.shape[-1]))
+    if state is None or not of_state:
+        return inputs, action
+    adapted = [
+        replace(feature, convert=(*feature.convert, *([] if feature.mode == "IDENTITY" else [NORMALISATION]), *more))
+        for feature, more in ((state, of_state), (action, of_action))
+    ]
+    return {**inputs, STATE: adapted[0]}, adapted[1]
 
 
 def _robot_keys(folder: Path, renames: Any) -> dict[str, str]:

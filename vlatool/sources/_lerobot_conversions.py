@@ -13,6 +13,20 @@ from vlatool.files.printable import truncate
 RELATIVE, ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 STATE = "observation.state"
 Steps = Mapping[str, Mapping[str, Any]]
+ALOHA = "adapt_to_pi_aloha"
+FLIPPED, GRIPPERS = [1, 2, 8, 9], [6, 13]
+"""Joints of ALOHA whose sign the pi models have the other way, and its grippers."""
+FLIP = {"op": "scale", "parts": FLIPPED, "factor": -1}
+GRIPPER_OF_STATE = [
+    {"op": "range", "parts": GRIPPERS, "robot": [0, 1], "network": [0.01844, 0.058]},
+    {"op": "linkage", "parts": GRIPPERS, "arm_length": 0.036, "horn_radius": 0.022},
+    {"op": "range", "parts": GRIPPERS, "robot": [0.4, 1.5], "network": [0, 1]},
+]
+"""Finger position (share, then m) -> angle of the horn (rad, then share), as ``modeling_smolvla.py`` has it."""
+GRIPPER_OF_ACTION = [
+    {"op": "range", "parts": GRIPPERS, "robot": [0, 1], "network": [-0.6213, 1.491]},
+    {"op": "range", "parts": GRIPPERS, "robot": [0.4, 1.5], "network": [0, 1]},
+]
 SAVE_BOTH = "save the processors of the policy again, as LeRobot makes them: relative_actions_processor before "
 SAVE_BOTH += "normalizer_processor, absolute_actions_processor after unnormalizer_processor, both enabled or both not"
 
@@ -53,6 +67,25 @@ def relative_parts(folder: Path, steps: tuple[Steps, Steps], widths: tuple[int, 
             f"{folder} has actions of {widths[1]} elements that are relative to {widths[0]} of '{STATE}'.", SAVE_BOTH
         )
     return _runs(_mask(folder, before[RELATIVE], widths[1]))
+
+
+def aloha_steps(folder: Path, config: Mapping[str, Any], widths: tuple[int, int]) -> tuple[list[Any], list[Any]]:
+    """Return what SmolVLA does to states and actions of ALOHA, behind the statistics, as LeRobot does it.
+
+    Args:
+        widths: elements of the state, 0 where there is none, and of the action.
+
+    Raises:
+        SourceError: where the policy has not the 14 joints of ALOHA.
+    """
+    adapts = config.get(ALOHA, False)
+    if not isinstance(adapts, bool) or (adapts and min(widths) <= max(GRIPPERS)):
+        raise SourceError(
+            f"config.json of {folder} has {ALOHA} {truncate(repr(adapts), 40)} and {widths[0]} elements of the state, "
+            f"{widths[1]} of the action; it is for the 14 joints of ALOHA.",
+            f"write {ALOHA}: false where the robot is another one",
+        )
+    return ([FLIP, *GRIPPER_OF_STATE], [FLIP, *GRIPPER_OF_ACTION]) if adapts else ([], [])
 
 
 def joint_names(folder: Path, steps: Steps, width: int) -> list[str]:

@@ -205,7 +205,7 @@ def _tensor(feature: Feature) -> dict[str, Any]:
         return {"dtype": "uint8", "unit": "rgb"}
     said = {"labels": list(feature.labels), "convert": list(feature.convert)}
     more = {name: value for name, value in said.items() if value}
-    if feature.convert:
+    if any(step["op"] == "relative" for step in feature.convert):
         more["mode"] = "absolute"  # what is relative in the network is a target once the state is added
     if feature.mode == "IDENTITY":
         return {"dtype": "float32", **more}
