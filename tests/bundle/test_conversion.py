@@ -72,6 +72,11 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "a place for no statistics": ({}, {"convert": [{"op": "normalisation"}]}, "allowed: one, with a normalisation"),
     "converted integers": ({}, {"dtype": "int64", "convert": [RELATIVE]}, "finite floats alone"),
     "a converted sensor that may fail": ({"finite": False, "convert": [{"op": "normalisation"}]}, {}, "finite floats"),
+    "a pose of no form": ({}, {"convert": [{**RELATIVE, "pose": "rpy"}]}, "has the pose 'rpy'"),
+    "a pose of two elements": ({}, {"convert": [{**RELATIVE, "parts": ["a"], "pose": "matrix"}], "labels": [*"abcd"]},
+                               "pose of 1 elements, .* matrix has 9, and 3 more"),
+    "a frame of the world": ({}, {"convert": [{**RELATIVE, "pose": "axis_angle", "frame": "world"}]}, "frame 'world'"),
+    "a frame of no pose": ({}, {"convert": [{**RELATIVE, "frame": "base"}]}, "has the pose ''"),
     "a rotation of the whole": ({"convert": [{"op": "rotation", "robot": "matrix", "network": "matrix"}]}, {},
                                 "needs 'parts'"),
     "a rotation of another width": (

@@ -15,7 +15,7 @@ from vlatool.files.messages import to_json
 from vlatool.files.validate import finite_number, integer, known_keys, mapping, sequence, short_repr, text
 
 OPERATIONS: dict[str, tuple[str, ...]] = {
-    "relative": ("parts", "to", "state", "successive"),
+    "relative": ("parts", "to", "state", "successive", "pose", "frame"),
     "rotation": ("parts", "robot", "network", "hemisphere"),
     "scale": ("parts", "factor", "offset"),
     "range": ("parts", "robot", "network"),
@@ -39,6 +39,7 @@ ROTATIONS = {
 that turn along (as SciPy calls them); a matrix is written row by row. ``6d_columns`` is the first column and then the
 second, ``6d_rows`` the first row and then the second, ``_interleaved`` their elements by turns; ``6d_rows_yz`` others.
 """
+FRAMES = ("tool", "base")
 HEMISPHERES = ("positive", "negative", "keep")
 MAX_CONVERSIONS = 32
 Span = tuple[int, int]
@@ -68,6 +69,10 @@ class Conversion:
         state: of ``relative``: the parts of that input, one for each of ``parts``; the same ones when left out.
         successive: of ``relative``: whether each action is a difference from the one before it in the chunk, and the
             first from the state; otherwise all are differences from the state.
+        pose: of ``relative``: form of a rotation: each part is such a rotation, or three elements of a position and
+            then the rotation, and is composed with that of the state instead of being added.
+        frame: of ``relative`` with a pose: ``tool``: differences are in the frame of the state (state x difference, as
+            GR00T has it), ``base``: in the frame of the base (difference x state, positions are added).
         robot: of ``rotation``: the form that the robot gives or gets; of ``range``: two numbers.
         network: of ``rotation``: the form that the network takes or gives; of ``range``: what they are there.
         hemisphere: of ``rotation``: sign of w of quaternions that result, and of those that axis and angle result
@@ -89,6 +94,8 @@ class Conversion:
     to: str = ""
     state: tuple[Selector, ...] = ()
     successive: bool = False
+    pose: str = ""
+    frame: str = "tool"
     robot: str | tuple[float, ...] = ""
     network: str | tuple[float, ...] = ""
     hemisphere: str = "positive"
@@ -124,6 +131,9 @@ class Conversion:
         text(self.to, f"{self.where} needs 'to', the name of an input; it", SpecError, empty=False)
         if not isinstance(self.successive, bool):
             raise SpecError(f"{self.where} has successive {short_repr(self.successive)}; it must be true or false.")
+        if self.pose or self.frame != "tool":
+            _one_of(self.pose, ROTATIONS, f"{self.where} has the pose")
+        _one_of(self.frame, FRAMES, f"{self.where} has the frame")
         if self.state and len(self.state) != len(self.parts):
             raise SpecError(
                 f"{self.where} has {len(self.parts)} parts and {len(self.state)} parts of the state.",
@@ -202,6 +212,12 @@ class Conversion:
                     f"{self.where} is done to {stop - start} elements, [{start}, {stop}); {self.robot} has "
                     f"{ROTATIONS[str(self.robot)]}.",
                     "name the part of the robot's vector that is the rotation alone",
+                )
+        for start, stop in ordered if self.pose else ():
+            if stop - start - ROTATIONS[self.pose] not in (0, 3):
+                raise SpecError(
+                    f"{self.where} has a pose of {stop - start} elements, [{start}, {stop}); {self.pose} has "
+                    f"{ROTATIONS[self.pose]}, and 3 more with a position."
                 )
         elements = sum(stop - start for start, stop in ordered)
         for name in ("factor", "offset", "low", "high"):

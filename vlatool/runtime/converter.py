@@ -13,6 +13,7 @@ from vlatool.bundle.conversion import Conversion, Layout, Span
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SpecError
 from vlatool.runtime.assets import Assets
+from vlatool.runtime.pose import absolute_poses, relative_poses
 from vlatool.runtime.rotation import converted
 from vlatool.runtime.statistics import load_normaliser
 
@@ -112,12 +113,12 @@ def _step(conversion: Conversion, layout: Layout, outward: bool) -> _Step:
     spans = layout.spans(conversion.parts, conversion.where)
     if conversion.op == "rotation":
         return _rotation(conversion, sorted(spans))
-    places = _places(spans)
-    make: Callable[[Conversion], tuple[Elements, Elements]] = {
+    makers: dict[str, Callable[[Conversion], tuple[Elements, Elements]]] = {
         "scale": _scale, "range": _range, "clip": _clip, "linkage": _linkage,
         "binarise": partial(_binarise, outward=outward),
-    }[conversion.op]  # fmt: skip
-    return _Step(*(partial(_of_places, places=places, change=change) for change in make(conversion)))
+    }  # fmt: skip
+    places, changes = _places(spans), makers[conversion.op](conversion)
+    return _Step(*(partial(_of_places, places=places, change=change) for change in changes))
 
 
 def _of_places(values: Array, _: Array | None, places: Any, change: Elements) -> Array:
@@ -218,6 +219,8 @@ def _places(spans: Sequence[Span]) -> Any:
 
 def _relative(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) -> _Step:
     """Differences from a state: ``absolute = relative + state``, as LeRobot and openpi have them."""
+    if conversion.pose:
+        return _relative_poses(conversion, spans)
     mine, theirs = _places([pair[0] for pair in spans]), _places([pair[1] for pair in spans])
 
     def moved(values: Array, state: Array | None, sign: int) -> Array:
@@ -235,3 +238,18 @@ def _relative(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) -> _St
         return out
 
     return _Step(partial(moved, sign=-1), partial(moved, sign=1))
+
+
+def _relative_poses(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) -> _Step:
+    def moved(values: Array, state: Array | None, change: Callable[..., Array]) -> Array:
+        if state is None:
+            raise ValueError("an action that is relative to a state is converted without one")
+        out = values.copy()
+        for mine, theirs in spans:
+            part, start = out[..., slice(*mine)], state[slice(*theirs)]
+            out[..., slice(*mine)] = change(
+                part, start, conversion.pose, conversion.frame, successive=conversion.successive
+            )
+        return out
+
+    return _Step(partial(moved, change=relative_poses), partial(moved, change=absolute_poses))

@@ -41,6 +41,29 @@ def converted(values: Array, before: str, after: str, hemisphere: str = "positiv
         return _writer(after)(quaternions).astype(values.dtype)
 
 
+def to_quaternions(values: Array, form: str) -> Array:
+    """Return unit quaternions (..., 4), float64, of rotations in a form."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return _reader(form)(np.asarray(values, np.float64))
+
+
+def product(one: Array, two: Array) -> Array:
+    """Return the Hamilton product of quaternions (..., 4): the rotation ``two``, then ``one``."""
+    a, b, w, v = one[..., :3], two[..., :3], one[..., 3:], two[..., 3:]
+    return np.concatenate([w * b + v * a + np.cross(a, b), w * v - (a * b).sum(axis=-1, keepdims=True)], axis=-1)
+
+
+def inverse(quaternions: Array) -> Array:
+    """Return the inverse of unit quaternions."""
+    return quaternions * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def turned(vectors: Array, quaternions: Array) -> Array:
+    """Return vectors (..., 3) turned by unit quaternions."""
+    xyz, w = quaternions[..., :3], quaternions[..., 3:]
+    return np.asarray(vectors + 2 * np.cross(xyz, np.cross(xyz, vectors) + w * vectors))
+
+
 def _reader(form: str) -> Callable[[Array], Array]:
     kind, _, rest = form.partition("_")
     if kind == "euler":
@@ -168,13 +191,7 @@ def _from_euler(angles: Array, order: str) -> Array:
         turn[..., 3] = np.cos(angles[..., index] / 2)
         turns.append(turn)
     first, second, third = turns if order.isupper() else reversed(turns)
-    return _product(_product(first, second), third)
-
-
-def _product(one: Array, two: Array) -> Array:
-    """Hamilton product of quaternions: the rotation ``two``, then ``one``."""
-    a, b, w, v = one[..., :3], two[..., :3], one[..., 3:], two[..., 3:]
-    return np.concatenate([w * b + v * a + np.cross(a, b), w * v - (a * b).sum(axis=-1, keepdims=True)], axis=-1)
+    return product(product(first, second), third)
 
 
 def _to_euler(quaternions: Array, order: str) -> Array:
