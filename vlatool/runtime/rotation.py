@@ -44,7 +44,8 @@ def converted(values: Array, before: str, after: str, hemisphere: str = "positiv
 def to_quaternions(values: Array, form: str) -> Array:
     """Return unit quaternions (..., 4), float64, of rotations in a form."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _reader(form)(np.asarray(values, np.float64))
+        quaternions: Array = _reader(form)(np.asarray(values, np.float64))
+    return quaternions
 
 
 def product(one: Array, two: Array) -> Array:
@@ -55,7 +56,7 @@ def product(one: Array, two: Array) -> Array:
 
 def inverse(quaternions: Array) -> Array:
     """Return the inverse of unit quaternions."""
-    return quaternions * np.array([-1.0, -1.0, -1.0, 1.0])
+    return np.asarray(quaternions * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
 def turned(vectors: Array, quaternions: Array) -> Array:
