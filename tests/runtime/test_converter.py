@@ -14,7 +14,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError, GraphError, SpecError
 from vlatool.runtime import Policy, load
 from vlatool.runtime.converter import action_converter
-from vlatool.runtime.observation import EncodedObservation
+from vlatool.runtime.observation import EncodedObservation, ObservationEncoder
 
 CHUNK = "g (float[1,3] s, float[1,2,3] x) => (float[1,2,3] y, float[1,3] z) { y = Identity(x)  z = Identity(s) }"
 NAMES = {"labels": ["one", "two", "grip"]}
@@ -244,3 +244,26 @@ def test_what_is_no_rotation_is_no_action(tmp_path: Path) -> None:
     assert policy.infer({"x": [1, 0, 0, 0, 1, 0]}).chunk.tolist() == [[0, 0, 0]]
     with pytest.raises(GraphError, match="'y' is not finite"):
         policy.infer({"x": np.zeros(6)})
+
+
+def test_moments_of_a_history_are_converted_one_by_one(tmp_path: Path) -> None:
+    text = "g (float[1,2,3] s, float[1,2,3] x) => (float[1,2,3] y) { y = Identity(s) }"
+    turn = {"op": "rotation", "parts": [[0, 4]], "robot": "quaternion_wxyz", "network": "axis_angle"}
+    inputs = (tensor("s", 1, 2, 3, history=2, convert=[turn]), tensor("x", 1, 2, 3))
+    policy = load(written(tmp_path, text, inputs, (tensor("y", 1, 2, 3),), chunk=2).path)
+    first, second = np.array([1, 0, 0, 0]), np.array([0, 0, 5, 0])
+    policy.observe({"s": first, "x": X})
+    np.testing.assert_allclose(policy.infer({"s": second, "x": X}).chunk, [[0, 0, 0], [0, np.pi, 0]], atol=1e-6)
+    whole = np.stack([second, first]).astype(np.float32)
+    np.testing.assert_allclose(policy.infer({"s": whole, "x": X}).chunk, [[0, np.pi, 0], [0, 0, 0]], atol=1e-6)
+
+
+def test_a_half_precision_state_is_converted_in_single_precision(tmp_path: Path) -> None:
+    degrees = {"op": "scale", "factor": 1 / 1000, "offset": -65.5}
+    half = tensor("s", 1, 3, dtype="float16", convert=[degrees])
+    encode = ObservationEncoder(PolicySpec((half,), (tensor("y", 1, 1),), 10), tmp_path)
+    seen = encode({"s": [65504, 65510, 70000]})["s"]
+    assert seen.dtype == np.float16
+    np.testing.assert_allclose(seen, [[0.004, 0.01, 4.5]], rtol=1e-2)
+    with pytest.raises(DataError, match="too large for float16"):
+        encode({"s": [0, 0, 1e9]})
