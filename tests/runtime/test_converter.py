@@ -232,7 +232,11 @@ def test_a_state_is_converted_before_it_is_normalised_and_labels_are_the_robots(
     for sign in (1, -1):
         seen = policy.infer({"s": sign * np.array([0, 0, 1, 0]), "x": X}).outputs["z"]
         np.testing.assert_allclose(np.abs(seen * 2 + 1), [[0, np.pi, 0]], atol=1e-6)
-    for wrong, words in (([0, 0, 0, 0], "no rotation"), ([1, 0, 0], r"takes \[1, 4\]"), ([np.nan, 0, 0, 0], "1 NaN")):
+    for wrong, words in (
+        ([0, 0, 0, 0], "not a rotation"),
+        ([1, 0, 0], r"takes \[1, 4\]"),
+        ([np.nan, 0, 0, 0], "1 NaN"),
+    ):
         with pytest.raises(DataError, match=words):
             policy.infer({"s": np.array(wrong, np.float32), "x": X})
 

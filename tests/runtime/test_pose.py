@@ -12,7 +12,7 @@ from vlatool.bundle.conversion import ROTATIONS
 from vlatool.bundle.spec import PolicySpec
 from vlatool.runtime.converter import action_converter
 from vlatool.runtime.pose import absolute_poses, relative_poses
-from vlatool.runtime.rotation import converted
+from vlatool.runtime.rotation import convert_rotation
 
 RANDOM = np.random.default_rng(0)
 FORMS = ("axis_angle", "quaternion_wxyz", "6d_rows", "matrix", "euler_ZYX")
@@ -27,7 +27,7 @@ def transforms(count: int) -> Any:
 
 
 def values(made: Any, form: str) -> Any:
-    rotations = converted(made[..., :3, :3].reshape(*made.shape[:-2], 9), "matrix", form)
+    rotations = convert_rotation(made[..., :3, :3].reshape(*made.shape[:-2], 9), "matrix", form)
     return np.concatenate([made[..., :3, 3], rotations], axis=-1)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vlatool.bundle.conversion import ROTATIONS
-from vlatool.runtime.rotation import converted
+from vlatool.runtime.rotation import convert_rotation
 
 COUNT = 10_000
 LIMITS = {np.float64: 1e-12, np.float32: 3e-6}
@@ -70,12 +70,12 @@ def limits(form: str, dtype: type) -> np.ndarray:
 @pytest.mark.parametrize("form", ROTATIONS)
 def test_every_form_is_scipys_there_and_back(form: str, dtype: type) -> None:
     given = written(ALL, form).astype(dtype)
-    quaternions = converted(given, form, "quaternion_xyzw")
+    quaternions = convert_rotation(given, form, "quaternion_xyzw")
     assert quaternions.dtype == dtype
     assert (apart(quaternions) < limits(form, dtype)).all()
-    back = converted(ALL.as_quat().astype(dtype), "quaternion_xyzw", form)
+    back = convert_rotation(ALL.as_quat().astype(dtype), "quaternion_xyzw", form)
     assert back.shape == (len(ALL), ROTATIONS[form])
-    again = converted(back.astype(np.float64), form, "quaternion_xyzw")
+    again = convert_rotation(back.astype(np.float64), form, "quaternion_xyzw")
     assert (apart(again) < limits(form, dtype)).all()
     if dtype is np.float64 and form != "axis_angle":  # whose sign is either, at an angle of pi
         usual = slice(COUNT)
@@ -85,18 +85,18 @@ def test_every_form_is_scipys_there_and_back(form: str, dtype: type) -> None:
 @pytest.mark.parametrize(("one", "two"), [*itertools.permutations(["axis_angle", "euler_ZYX", "6d_rows", "matrix"], 2)])
 def test_forms_become_each_other(one: str, two: str) -> None:
     some = ALL[:200]
-    np.testing.assert_allclose(converted(written(some, one), one, two), written(some, two), atol=1e-9)
+    np.testing.assert_allclose(convert_rotation(written(some, one), one, two), written(some, two), atol=1e-9)
 
 
 def test_both_signs_of_a_quaternion_are_one_rotation_and_the_result_has_the_hemisphere_that_is_named() -> None:
     quaternions = ALL[:1000].as_quat()
     for form in ("axis_angle", "matrix", "euler_xyz", "6d_columns", "quaternion_wxyz"):
-        one, other = (converted(sign * quaternions, "quaternion_xyzw", form) for sign in (1, -1))
+        one, other = (convert_rotation(sign * quaternions, "quaternion_xyzw", form) for sign in (1, -1))
         np.testing.assert_allclose(one, other, atol=1e-12)
     for sign, name in ((1, "positive"), (-1, "negative")):
-        found = converted(quaternions, "quaternion_xyzw", "quaternion_xyzw", name)
+        found = convert_rotation(quaternions, "quaternion_xyzw", "quaternion_xyzw", name)
         assert (sign * found[:, 3] >= 0).all()
-    kept = converted(-quaternions * 3, "quaternion_xyzw", "quaternion_wxyz", "keep")
+    kept = convert_rotation(-quaternions * 3, "quaternion_xyzw", "quaternion_wxyz", "keep")
     np.testing.assert_allclose(kept, -quaternions[:, [3, 0, 1, 2]], atol=1e-12)
 
 
@@ -108,28 +108,28 @@ def robosuite(quaternion: np.ndarray) -> np.ndarray:
 
 def test_the_angles_of_libero_go_beyond_pi() -> None:
     quaternions = np.concatenate([ALL[:500].as_quat(), -ALL[:500].as_quat(), [[0, 0, 0, 1], [0, 0, 0, -1]]])
-    found = converted(quaternions, "quaternion_xyzw", "axis_angle", "keep")
+    found = convert_rotation(quaternions, "quaternion_xyzw", "axis_angle", "keep")
     np.testing.assert_allclose(found, [robosuite(each) for each in quaternions], atol=1e-7)
     assert float(np.linalg.norm(found, axis=1).max()) > np.pi
-    again = converted(found, "axis_angle", "quaternion_xyzw", "keep")
+    again = convert_rotation(found, "axis_angle", "quaternion_xyzw", "keep")
     np.testing.assert_allclose(again[:-1], quaternions[:-1], atol=1e-12)
 
 
 @pytest.mark.parametrize(("form", "scale"), [("quaternion_xyzw", 1e-30), ("6d_rows", 1e30), ("matrix", 0.01)])
 def test_the_scale_of_what_a_network_gives_does_not_count(form: str, scale: float) -> None:
     given = written(ALL[:100], form)
-    np.testing.assert_allclose(converted(given * scale, form, "matrix"), written(ALL[:100], "matrix"), atol=1e-9)
+    np.testing.assert_allclose(convert_rotation(given * scale, form, "matrix"), written(ALL[:100], "matrix"), atol=1e-9)
 
 
 def test_a_matrix_that_is_none_becomes_the_nearest_rotation() -> None:
     given = ALL[:300].as_matrix() + np.random.default_rng(1).normal(0, 0.3, (300, 3, 3))
-    found = converted(given.reshape(-1, 9), "matrix", "matrix").reshape(-1, 3, 3)
+    found = convert_rotation(given.reshape(-1, 9), "matrix", "matrix").reshape(-1, 3, 3)
     errors = np.linalg.norm(found - given, axis=(1, 2))
     others = np.linalg.norm(Rotation.random(300, rng=3).as_matrix() - given, axis=(1, 2))
     assert (errors <= others + 1e-12).all()
     np.testing.assert_allclose(found @ found.swapaxes(1, 2), np.broadcast_to(np.eye(3), found.shape), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(found), 1, atol=1e-12)
-    mirrored = converted(-ALL[:50].as_matrix().reshape(-1, 9), "matrix", "matrix").reshape(-1, 3, 3)
+    mirrored = convert_rotation(-ALL[:50].as_matrix().reshape(-1, 9), "matrix", "matrix").reshape(-1, 3, 3)
     np.testing.assert_allclose(np.linalg.det(mirrored), 1, atol=1e-12)
 
 
@@ -138,8 +138,8 @@ def test_a_matrix_that_is_none_becomes_the_nearest_rotation() -> None:
 def test_what_is_no_rotation_is_not_a_number(form: str, value: float) -> None:
     given = np.full((2, ROTATIONS[form]), value, np.float32)
     given[1] = written(ALL[:1], form)[0]
-    assert np.isnan(converted(given, form, "axis_angle")[0]).all()
+    assert np.isnan(convert_rotation(given, form, "axis_angle")[0]).all()
 
 
 def test_parallel_columns_are_no_rotation() -> None:
-    assert np.isnan(converted(np.ones((1, 6)), "6d_columns", "matrix")).all()
+    assert np.isnan(convert_rotation(np.ones((1, 6)), "6d_columns", "matrix")).all()

@@ -42,6 +42,8 @@ second, ``6d_rows`` the first row and then the second, ``_interleaved`` their el
 FRAMES = ("tool", "base")
 HEMISPHERES = ("positive", "negative", "keep")
 MAX_CONVERSIONS = 32
+LARGEST = 1e30
+"""Largest number of a step, and the inverse of the smallest factor: float32 holds no more than 3e38."""
 Span = tuple[int, int]
 Selector = str | int | tuple[int, ...]
 """A name of a part or label, the place of an element, or [start, stop)."""
@@ -149,7 +151,7 @@ class Conversion:
 
     def _check_scale(self) -> None:
         self._keep_numbers("factor", "offset")
-        if not self.factor or not self.offset or not all(self.factor):
+        if not self.factor or not self.offset or min(map(abs, self.factor)) < 1 / LARGEST:
             got = f"the factor {short_repr(self.factor)} and the offset {short_repr(self.offset)}"
             raise SpecError(f"{self.where} has {got}; wanted: numbers, and no factor of 0, which has no way back.")
 
@@ -157,7 +159,7 @@ class Conversion:
         self._keep_numbers("robot", "network")
         for side in ("robot", "network"):
             values = getattr(self, side)
-            if len(values) != 2 or values[0] == values[1]:
+            if len(values) != 2 or abs(values[0] - values[1]) < 1 / LARGEST:
                 raise SpecError(f"{self.where} has {side} {short_repr(values)}; wanted: two numbers that differ.")
 
     def _check_clip(self) -> None:
@@ -170,15 +172,13 @@ class Conversion:
 
     def _check_binarise(self) -> None:
         for name in ("threshold", "below", "above"):
-            object.__setattr__(
-                self, name, finite_number(getattr(self, name), f"{self.where} has {name}, which", SpecError)
-            )
+            object.__setattr__(self, name, _number(getattr(self, name), f"{self.where} has {name}, which"))
         if self.equal is not None:
-            object.__setattr__(self, "equal", finite_number(self.equal, f"{self.where} has equal, which", SpecError))
+            object.__setattr__(self, "equal", _number(self.equal, f"{self.where} has equal, which"))
 
     def _check_linkage(self) -> None:
         for name in ("arm_length", "horn_radius"):
-            if finite_number(getattr(self, name), f"{self.where} has {name}, which", SpecError) <= 0:
+            if _number(getattr(self, name), f"{self.where} has {name}, which") <= 0:
                 raise SpecError(f"{self.where} needs {name} in m, above 0; got {short_repr(getattr(self, name))}.")
 
     def _keep_numbers(self, *names: str) -> None:
@@ -186,7 +186,7 @@ class Conversion:
         for name in names:
             value = getattr(self, name)
             listed = value if isinstance(value, list | tuple) else (value,)
-            numbers = tuple(finite_number(each, f"{self.where} has {name}, of which one", SpecError) for each in listed)
+            numbers = tuple(_number(each, f"{self.where} has {name}, of which one") for each in listed)
             object.__setattr__(self, name, numbers)
 
     @property
@@ -326,10 +326,10 @@ def parts_from(data: Any, where: str) -> dict[str, Span]:
     found = {}
     for name, places in mapping(data, f"The parts of {where}", SpecError).items():
         text(name, f"The name of a part of {where}", SpecError, empty=False)
-        place = _selector(places, f"The part '{name}' of {where}")
-        if isinstance(place, str):
-            raise SpecError(f"The part '{name}' of {where} is {short_repr(place)}; wanted: [START, STOP], or a number.")
-        found[name] = (place[0], place[1]) if isinstance(place, tuple) else (place, place + 1)
+        span = _selector(places, f"The part '{name}' of {where}")
+        if isinstance(span, str):
+            raise SpecError(f"The part '{name}' of {where} is {short_repr(span)}; wanted: [START, STOP], or a number.")
+        found[name] = (span[0], span[1]) if isinstance(span, tuple) else (span, span + 1)
     return found
 
 
@@ -361,6 +361,14 @@ def _selector(value: Any, where: str) -> Selector:
         raise SpecError(f"{where} is {short_repr(value)}; wanted: a name, a number, or [START, STOP].")
     start = integer(value[0], where, SpecError)
     return start, integer(value[1], f"{where} ends where it", SpecError, start + 1)
+
+
+def _number(value: Any, where: str) -> float:
+    """Return a finite number with which float32 can be computed."""
+    number = finite_number(value, where, SpecError)
+    if abs(number) > LARGEST:
+        raise SpecError(f"{where} is {number:g}; allowed: -{LARGEST:g} to {LARGEST:g}.")
+    return number
 
 
 def _one_of(value: Any, allowed: Mapping[str, Any] | tuple[str, ...], where: str) -> None:

@@ -171,11 +171,16 @@ class TensorSpec:
         robot = self.layouts()[0]
         for name, (_, stop) in self.parts.items():
             robot.spans(((stop - 1),), f"The part '{name}' of '{self.name}'")
-        marks = [place for place, step in enumerate(self.convert) if step.op == "normalisation"]
+        marks = [index for index, step in enumerate(self.convert) if step.op == "normalisation"]
         if marks and (len(marks) > 1 or self.normalisation == "none"):
             raise SpecError(
                 f"'{self.name}' has {len(marks)} steps 'normalisation' in convert, and normalisation "
                 f"{self.normalisation}; allowed: one, with a normalisation."
+            )
+        if marks and any(step.op == "relative" for step in self.convert[marks[0] :]):
+            raise SpecError(
+                f"'{self.name}' is relative behind its normalisation; the state is in the units of the robot.",
+                "let the step 'relative' stand before it: statistics are then those of the differences",
             )
         if marks and any(step.growth for step in self.convert[marks[0] :]):
             raise SpecError(
@@ -410,12 +415,14 @@ class PolicySpec:
         """Return, for a step ``relative`` of the action, the places in the action and those in the state.
 
         Raises:
-            SpecError: when the state is no input, or has not as many elements as the action.
+            SpecError: when the state is not an input, or has not as many elements as the action.
         """
         state = next((tensor for tensor in self.inputs if tensor.name == step.to), None)
         if state is None:
             known = [tensor.name for tensor in self.inputs]
-            raise SpecError(f"{step.where} is relative to '{step.to}', which is no input; {suggest(step.to, known)}.")
+            raise SpecError(
+                f"{step.where} is relative to '{step.to}', which is not an input; {suggest(step.to, known)}."
+            )
         vector = len(state.shape) == (3 if state.history else 2)
         if state.kind != "tensor" or state.image or not state.dtype.startswith("float") or not vector:
             raise SpecError(

@@ -14,7 +14,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SpecError
 from vlatool.runtime.assets import Assets
 from vlatool.runtime.pose import absolute_poses, relative_poses
-from vlatool.runtime.rotation import converted
+from vlatool.runtime.rotation import convert_rotation
 from vlatool.runtime.statistics import load_normaliser
 
 Array = NDArray[Any]
@@ -137,47 +137,47 @@ def _scale(conversion: Conversion) -> tuple[Elements, Elements]:
         by, more = numbers(values)
         return np.asarray(values * by + more)
 
-    def back(values: Array) -> Array:
+    def backward(values: Array) -> Array:
         by, more = numbers(values)
         return np.asarray((values - more) / by)
 
-    return forward, back
+    return forward, backward
 
 
 def _range(conversion: Conversion) -> tuple[Elements, Elements]:
     """One scale on another: by way of 0 to 1, as LeRobot and openpi compute it."""
 
-    def moved(values: Array, before: Sequence[float], after: Sequence[float]) -> Array:
+    def rescale(values: Array, before: Sequence[float], after: Sequence[float]) -> Array:
         shares = (values - before[0]) / (before[1] - before[0])
         return np.asarray(shares * (after[1] - after[0]) + after[0])
 
     robot, network = (tuple(float(each) for each in side) for side in (conversion.robot, conversion.network))
-    return partial(moved, before=robot, after=network), partial(moved, before=network, after=robot)
+    return partial(rescale, before=robot, after=network), partial(rescale, before=network, after=robot)
 
 
 def _clip(conversion: Conversion) -> tuple[Elements, Elements]:
     low, high = np.array(conversion.low or -np.inf), np.array(conversion.high or np.inf)
 
-    def clipped(values: Array) -> Array:
+    def clip(values: Array) -> Array:
         return np.clip(values, low.astype(values.dtype), high.astype(values.dtype))
 
-    return clipped, clipped
+    return clip, clip
 
 
 def _binarise(conversion: Conversion, outward: bool) -> tuple[Elements, Elements]:
     equal = conversion.below if conversion.equal is None else conversion.equal
 
-    def decided(values: Array) -> Array:
+    def binarise(values: Array) -> Array:
         below = np.where(values == conversion.threshold, equal, conversion.below)
         return np.where(values > conversion.threshold, conversion.above, below).astype(values.dtype)
 
-    def refused(values: Array) -> Array:
+    def refuse(values: Array) -> Array:
         raise SpecError(
             f"{conversion.where} has no way back: what a value was before it, nobody knows.",
             "train on what the network gives (distill), or leave the step out, and let the controller do it",
         )
 
-    return (refused, decided) if outward else (decided, refused)
+    return (refuse, binarise) if outward else (binarise, refuse)
 
 
 def _linkage(conversion: Conversion) -> tuple[Elements, Elements]:
@@ -199,15 +199,17 @@ def _rotation(conversion: Conversion, spans: Sequence[Span]) -> _Step:
     there = [(start + index * conversion.growth, stop + (index + 1) * conversion.growth)
              for index, (start, stop) in enumerate(spans)]  # fmt: skip
 
-    def turned(values: Array, _: Array | None, places: Sequence[Span], forms: tuple[str, str]) -> Array:
+    def convert_parts(values: Array, _: Array | None, places: Sequence[Span], forms: tuple[str, str]) -> Array:
         parts, done = [], 0
         for start, stop in places:
-            parts += [values[..., done:start], converted(values[..., start:stop], *forms, conversion.hemisphere)]
+            parts += [values[..., done:start], convert_rotation(values[..., start:stop], *forms, conversion.hemisphere)]
             done = stop
         return np.concatenate([*parts, values[..., done:]], axis=-1)
 
     forms = str(conversion.robot), str(conversion.network)
-    return _Step(partial(turned, places=spans, forms=forms), partial(turned, places=there, forms=forms[::-1]))
+    return _Step(
+        partial(convert_parts, places=spans, forms=forms), partial(convert_parts, places=there, forms=forms[::-1])
+    )
 
 
 def _places(spans: Sequence[Span]) -> Any:
@@ -223,7 +225,7 @@ def _relative(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) -> _St
         return _relative_poses(conversion, spans)
     mine, theirs = _places([pair[0] for pair in spans]), _places([pair[1] for pair in spans])
 
-    def moved(values: Array, state: Array | None, sign: int) -> Array:
+    def shift(values: Array, state: Array | None, sign: int) -> Array:
         if state is None:
             raise ValueError("an action that is relative to a state is converted without one")
         out = values.copy()
@@ -237,11 +239,11 @@ def _relative(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) -> _St
             out[..., mine] = part - before
         return out
 
-    return _Step(partial(moved, sign=-1), partial(moved, sign=1))
+    return _Step(partial(shift, sign=-1), partial(shift, sign=1))
 
 
 def _relative_poses(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) -> _Step:
-    def moved(values: Array, state: Array | None, change: Callable[..., Array]) -> Array:
+    def compose(values: Array, state: Array | None, change: Callable[..., Array]) -> Array:
         if state is None:
             raise ValueError("an action that is relative to a state is converted without one")
         out = values.copy()
@@ -252,4 +254,4 @@ def _relative_poses(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) 
             )
         return out
 
-    return _Step(partial(moved, change=relative_poses), partial(moved, change=absolute_poses))
+    return _Step(partial(compose, change=relative_poses), partial(compose, change=absolute_poses))

@@ -54,7 +54,7 @@ class Decoder:
             return chunk, tuple([tensor.labels[index] for index in chunk.tolist()])
         return physical.reshape(-1, physical.shape[-1]), tensor.labels
 
-    def unconverted(self, raw: Array) -> Array:
+    def unnormalise(self, raw: Array) -> Array:
         """Return the chunk (T, A) with its statistics alone: what rounding moves a little, it moves a little here, too.
 
         A gripper that is open or closed, an angle that jumps by a turn: conversions are not continuous.

@@ -170,7 +170,7 @@ def _converting_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
         if not all_finite(converted):
             raise DataError(
                 f"The input '{tensor.name}' holds {_not_finite(converted)} once it is converted.",
-                "check where it comes from: a quaternion of zeros is no rotation",
+                "check where it comes from: a quaternion of zeros is not a rotation",
             )
         return converted.astype(tensor.dtype, copy=False)
 

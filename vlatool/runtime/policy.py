@@ -182,7 +182,7 @@ class BundlePolicy:
         """
         if not self.spec.action.convert:
             return action.chunk
-        return self._decode.unconverted(action.outputs[self._action])
+        return self._decode.unnormalise(action.outputs[self._action])
 
     def _check_overlap(self) -> None:
         """Refuse a call during an inference if waiting for it would not help."""

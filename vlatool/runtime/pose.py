@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.conversion import ROTATIONS
-from vlatool.runtime.rotation import converted, inverse, product, to_quaternions, turned
+from vlatool.runtime.rotation import convert_rotation, inverse, product, to_quaternions, turn
 
 Array = NDArray[Any]
 
@@ -62,7 +62,7 @@ def relative_poses(poses: Array, state: Array, form: str, frame: str, *, success
 
 
 def _turned(positions: Array, quaternions: Array) -> Array:
-    return turned(positions, quaternions) if positions.shape[-1] else positions
+    return turn(positions, quaternions) if positions.shape[-1] else positions
 
 
 def _pose(values: Array, form: str) -> Pose:
@@ -71,5 +71,5 @@ def _pose(values: Array, form: str) -> Pose:
 
 
 def _values(pose: Pose, form: str, dtype: Any) -> Array:
-    rotations = converted(pose.quaternions, "quaternion_xyzw", form)
+    rotations = convert_rotation(pose.quaternions, "quaternion_xyzw", form)
     return np.concatenate([pose.positions, rotations], axis=-1).astype(dtype)

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from vlatool.bundle.conversion import PAIRS
 
 Array = NDArray[Any]
-LOCKED = 1e-7
+LOCK_ANGLE = 1e-7
 """Angle in rad from gimbal lock below which the third Euler angle is 0, as SciPy has it."""
 NOISE = 1e-12
 """Length, as a share of what it is a rest of, below which a direction is rounding."""
 
 
-def converted(values: Array, before: str, after: str, hemisphere: str = "positive") -> Array:
+def convert_rotation(values: Array, before: str, after: str, hemisphere: str = "positive") -> Array:
     """Return rotations in another form.
 
     Args:
@@ -31,7 +31,7 @@ def converted(values: Array, before: str, after: str, hemisphere: str = "positiv
             (angles up to pi), ``negative`` (angles from pi to 2 pi) or ``keep``, the one of ``values``.
 
     Returns:
-        (..., V) of the same dtype; NaN for values that are no rotation, such as zeros for a quaternion.
+        (..., V) of the same dtype; NaN for values that are not a rotation, such as zeros for a quaternion.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         quaternions = _reader(before)(np.asarray(values, np.float64))
@@ -59,7 +59,7 @@ def inverse(quaternions: Array) -> Array:
     return np.asarray(quaternions * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
-def turned(vectors: Array, quaternions: Array) -> Array:
+def turn(vectors: Array, quaternions: Array) -> Array:
     """Return vectors (..., 3) turned by unit quaternions."""
     xyz, w = quaternions[..., :3], quaternions[..., 3:]
     return np.asarray(vectors + 2 * np.cross(xyz, np.cross(xyz, vectors) + w * vectors))
@@ -206,7 +206,7 @@ def _to_euler(quaternions: Array, order: str) -> Array:
     a, b, c, d = (w, qi, qj, qk * sign) if symmetric else (w - qj, qi + qk * sign, qj + w, qk * sign - qi)
     middle = 2 * np.arctan2(np.hypot(c, d), np.hypot(a, b))
     half_sum, half_difference = np.arctan2(b, a), np.arctan2(d, c)
-    low, high = np.abs(middle) <= LOCKED, np.abs(middle - np.pi) <= LOCKED
+    low, high = np.abs(middle) <= LOCK_ANGLE, np.abs(middle - np.pi) <= LOCK_ANGLE
     angles = np.empty((*quaternions.shape[:-1], 3))
     first, third = (0, 2) if extrinsic else (2, 0)
     angles[..., first], angles[..., third] = half_sum - half_difference, half_sum + half_difference

@@ -14,9 +14,9 @@ RELATIVE, ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 STATE = "observation.state"
 Steps = Mapping[str, Mapping[str, Any]]
 ALOHA = "adapt_to_pi_aloha"
-FLIPPED, GRIPPERS = [1, 2, 8, 9], [6, 13]
+FLIPPED_JOINTS, GRIPPERS = [1, 2, 8, 9], [6, 13]
 """Joints of ALOHA whose sign the pi models have the other way, and its grippers."""
-FLIP = {"op": "scale", "parts": FLIPPED, "factor": -1}
+FLIP = {"op": "scale", "parts": FLIPPED_JOINTS, "factor": -1}
 GRIPPER_OF_STATE = [
     {"op": "range", "parts": GRIPPERS, "robot": [0, 1], "network": [0.01844, 0.058]},
     {"op": "linkage", "parts": GRIPPERS, "arm_length": 0.036, "horn_radius": 0.022},
@@ -133,8 +133,8 @@ def _words(folder: Path, step: Mapping[str, Any], key: str) -> list[str]:
 
 def _runs(mask: Sequence[bool]) -> list[list[int]]:
     """Return [start, stop) of each run of elements that are chosen."""
-    runs, place = [], 0
+    runs, stop = [], 0
     for chosen, group in itertools.groupby(mask):
-        start, place = place, place + len(list(group))
-        runs += [[start, place]] if chosen else []
+        start, stop = stop, stop + len(list(group))
+        runs += [[start, stop]] if chosen else []
     return runs
