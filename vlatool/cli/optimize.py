@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,13 +13,13 @@ import typer
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import crew, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
-from vlatool.cli._document import document, put, report_document
+from vlatool.cli._document import answer, document, put, report_document
 from vlatool.cli._options import Force, MapNames, Workers
-from vlatool.cli._plan import plan_document
 from vlatool.cli._proposal import propose
 from vlatool.cli._torchrun import launch_for
 from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
+from vlatool.files.printable import mask_passwords
 from vlatool.machine.host import isa
 from vlatool.report import REPORT
 from vlatool.runtime.engine import DEFAULT_ENGINE
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
     from vlatool.optimize.plan import Plan
     from vlatool.optimize.recipe import Pruning, Recipe
+    from vlatool.stage.base import Stage
 
 TRAINS = "distill.policy"
 
@@ -145,7 +147,7 @@ def optimize(
         chosen = chosen.model_copy(update={"search": search})
     plan = make_plan(source, board, chosen, cache or cache_directory(), recordings, fresh=fresh)
     if dry_run:
-        _show_plan(plan, as_json)
+        answer(as_json, plan_document(plan), plan.lines())
         return
     with progress(*crew(workers)) as context:
         report = pipeline.optimize(plan, output, context, force=force)
@@ -206,20 +208,8 @@ def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str
     return pruning.model_copy(update={name: value for name, value in update.items() if value is not None})
 
 
-def _show_plan(plan: Plan, as_json: bool) -> None:
-    if as_json:
-        document(plan_document(plan))
-        return
-    for line in plan.lines():
-        typer.echo(line)
-
-
 def budget(text: str) -> dict[str, Any]:
-    """Read ``1%``, ``0.01``, ``METRIC=VALUE`` (with a unit or without), or ``0.002m``.
-
-    Raises:
-        UsageError: for anything else.
-    """
+    """Read ``1%``, ``0.01``, ``METRIC=VALUE`` (with a unit or without), or ``0.002m``; raises UsageError otherwise."""
     named = re.fullmatch(r"\s*([A-Za-z_][\w.]*)\s*=\s*([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*(%?)\s*", text)
     if named:
         return {"metric": named[1], "max_metric": float(named[2]) / (100 if named[3] else 1)}
@@ -230,11 +220,7 @@ def budget(text: str) -> dict[str, Any]:
 
 
 def share(text: str, option: str = "--max-drop") -> float:
-    """Read ``1%`` or ``0.01`` as a share.
-
-    Raises:
-        UsageError: for anything else, or outside 0-100 %.
-    """
+    """Read ``1%`` or ``0.01`` as a share; raises UsageError for anything else, or outside 0-100 %."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*", text)
     value = float(match[1]) / (100 if match[2] else 1) if match else -1.0
     if not 0 <= value <= 1:
@@ -245,3 +231,30 @@ def share(text: str, option: str = "--max-drop") -> float:
             f"write it as {option} 1%",
         )
     return value
+
+
+def plan_document(plan: Plan) -> dict[str, Any]:
+    """Return what ``plan.lines()`` says, as values that JSON can say."""
+    effort, loop, pruning = plan.recipe.effort, plan.closed_loop, plan.recipe.pruning
+    plain = {
+        "source": {"policy": str(plan.source.policy) if plan.source.policy else None, **_stage(plan.source)},
+        "export": _stages(plan.export),
+        "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
+        "search": plan.recipe.search,
+        "pruning": {**pruning.model_dump(mode="json"), "study": mask_passwords(pruning.study)},
+        "benchmark": {"iterations": effort.iterations, "threads": effort.threads},
+        "evaluate": {"recorded": True, "episodes": loop.episodes if loop else 0},
+        "limits": plan.recipe.limits.model_dump(mode="json", exclude_none=True),
+        "profile": plan.profile.name if plan.profile else None,
+        "computes": plan.board_set.plan() or None,
+        "cache": str(plan.cache),
+    }
+    return {"plan": plain}
+
+
+def _stages(stages: Iterable[Stage]) -> list[dict[str, Any]]:
+    return [_stage(stage) for stage in stages]
+
+
+def _stage(stage: Stage) -> dict[str, Any]:
+    return {"stage": stage.name(), "options": stage.options()}

@@ -59,7 +59,8 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
                 f"{bundle.path} is made for the engine '{engine}'; {suggest(engine, known)}.", fix_for(engine, known)
             )
     mine, theirs = candidate.manifest, baseline.manifest
-    differs = _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs)
+    rates = [(name, getattr(mine.spec, of), getattr(theirs.spec, of)) for name, of in RATE.items()]
+    differs = _tensors(mine, theirs) or _differences(rates) or _program(mine, theirs)
     if gate.plan.episodes and gate.plan.policy is None:  # they are played in what the bundles name
         differs = differs or _scene(mine, theirs)
     if differs:
@@ -146,11 +147,6 @@ def _in_words(value: Any) -> Any:
     if not isinstance(value, tuple):
         return value
     return tuple(describe_conversion(each) if isinstance(each, Conversion) else each for each in value)
-
-
-def _rates(mine: Manifest, theirs: Manifest) -> str:
-    pairs = [(name, getattr(mine.spec, of), getattr(theirs.spec, of)) for name, of in RATE.items()]
-    return _differences(pairs)
 
 
 def _program(mine: Manifest, theirs: Manifest) -> str:

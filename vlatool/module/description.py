@@ -267,11 +267,7 @@ def write_location(out: Path, folder: Path) -> None:
 
 
 def read_location(bundle: Path) -> Path:
-    """Return the folder of the policy's code.
-
-    Raises:
-        SourceError: when the bundle has no note, or the folder is gone.
-    """
+    """Return the folder of the policy's code; raises SourceError when the bundle has no note, or the folder is gone."""
     try:
         folder = Path(json.loads((bundle / LOCATION).read_text(encoding="utf-8"))["folder"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:

@@ -65,11 +65,7 @@ class Source(Transform):
 
     @classmethod
     def of(cls, typed: str) -> Self:
-        """Return the stage for what a person types as SOURCE, which this source claims.
-
-        Raises:
-            SourceError: when it is wrong.
-        """
+        """Return the stage for a typed SOURCE that this source claims; raises SourceError when it is wrong."""
         return cls.model_validate({"policy": Path(typed)})
 
     def describe(self) -> Description | None:
@@ -179,11 +175,7 @@ def source_of_policy(typed: str | Path) -> Source:
 
 
 def describe(policy: Path) -> Description:
-    """Return the description of a policy, read by the source that claims it.
-
-    Raises:
-        SourceError: when there is none.
-    """
+    """Return the description of a policy, read by the source that claims it; raises SourceError when there is none."""
     described = source_of_policy(policy).describe()
     if described is None:
         raise SourceError(f"{policy} has no description.", "write a policy.yaml beside it")

@@ -125,17 +125,13 @@ class _FileSearch:
 
 
 def build_record(bundle: Bundle) -> tuple[Entry, ...]:
-    """Return the entries of a bundle's build record, checked.
-
-    Raises:
-        BundleError: when there is none (made by an older vlatool), or an entry is invalid.
-    """
+    """Return the checked build record; raises BundleError when there is none (older vlatool), or it is invalid."""
     entries = history(bundle)
     if not entries:
         version = bundle.manifest.made_by.get("vlatool", "an unknown version")
         raise BundleError(
             f"{bundle.path} has no build record; vlatool {version} did not write one yet, or no stage made it.",
-            "make the bundle again, with the command that made it",
+            UNUSABLE,
         )
     for number, entry in enumerate(entries):
         where, stage = f"Entry {number} of the build record of {bundle.path}", entry.get("stage")

@@ -218,11 +218,7 @@ class BundlePolicy:
 
     @contextlib.contextmanager
     def _stopped_after(self, seconds: float) -> Iterator[None]:
-        """Stop the engine if the inference in this block takes longer.
-
-        Raises:
-            GraphError: when it was stopped.
-        """
+        """Stop the engine if the inference in this block takes longer; raises GraphError when it was stopped."""
         limited = [session for session in self.program.sessions.values() if hasattr(session, "deadline")]
         for session in limited:
             session.deadline = time.monotonic() + seconds

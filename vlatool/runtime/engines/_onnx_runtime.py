@@ -152,11 +152,7 @@ class OnnxRuntimeSession(Engine):
 
     @classmethod
     def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
-        """Open a graph with ONNX Runtime's trace of every node on.
-
-        Raises:
-            GraphError: when ONNX Runtime refuses it.
-        """
+        """Open a graph with ONNX Runtime's trace of every node on; raises GraphError when ONNX Runtime refuses it."""
         ort = cls.onnxruntime()
         return profiling_session(ort, path, session_options(ort, threads), scratch, cls.providers)
 
