@@ -227,7 +227,10 @@ def test_an_input_may_hold_several_moments():
         ({"history": 2, "shape": [2]}, "history 2"),
         ({"history": 2, "shape": []}, "history 2"),
         ({"shape": [1, 2, "n"]}, "history and the dynamic shape"),
-        ({"image": {"frame": "rgb", "layout": "hwc", "camera": [8, 8]}}, "history and an image"),
+        ({"image": {"frame": "rgb", "layout": "hwc", "camera": [8, 8]}}, "an image of the layout hwc has 3 axes"),
+        ({"image": {"camera": [8, 8]}, "shape": [1, 2, 5, 3, 8, 8]}, "only axes of 1"),
+        ({"image": {"camera": [8, 8]}, "shape": [1, 3, 3, 8, 8]}, "history 2"),
+        ({"image": {"camera": [8, 8]}, "shape": [1, 2, 3, "h", 8]}, "dynamic shape"),
         ({"shape": [1, 2], "kind": "text", "tokenizer": "w.json", "max_tokens": 2}, "history 2 and, as text"),
     ],
 )

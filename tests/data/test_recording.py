@@ -8,10 +8,18 @@ import pytest
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.data import npz, observations_for, read_recording, recorded_observations, synthetic_observations
+from vlatool.data import (
+    npz,
+    observations_for,
+    random_observations,
+    read_recording,
+    recorded_observations,
+    synthetic_observations,
+)
 from vlatool.data._random_observations import words_of
 from vlatool.errors import DataError
 from vlatool.files.rows import Rows
+from vlatool.runtime.observation import ObservationEncoder
 
 COUNT = 6
 SPEC = PolicySpec(
@@ -103,6 +111,36 @@ def test_a_selection_looks_back_beyond_itself(tmp_path: Path):
 def test_a_sample_of_an_input_with_history_is_one_moment(tmp_path: Path):
     whole = np.zeros((COUNT, 3, 2), np.float32)
     refused(tmp_path, r"'state' .* shape \[6, 3, 2\]; wanted \[N, 2\]", MOMENTS, state=whole)
+
+
+TURN = {"op": "rotation", "parts": [[0, 3]], "robot": "axis_angle", "network": "6d_rows"}
+
+
+def test_what_is_converted_is_recorded_as_the_robot_has_it(tmp_path: Path):
+    state, action = (
+        TensorSpec.from_dict({"name": name, "shape": shape, "convert": [TURN]})
+        for name, shape in (("state", [1, 6]), ("action", [1, 2, 7]))
+    )
+    spec = PolicySpec((state,), (action,), 10.0, chunk=2)
+    given = {"state": np.ones((COUNT, 3), np.float32), "action": np.ones((COUNT, 2, 4), np.float32)}
+    assert read(tmp_path, spec, **given).observation(0)["state"].shape == (3,)
+    refused(tmp_path, r"'state' in .* \[6, 6\]; wanted \[N, 3\]", spec, **given | {"state": np.ones((COUNT, 6))})
+    refused(tmp_path, "has 7 elements; the policy gives 4", spec, **given | {"action": np.ones((COUNT, 2, 7))})
+    drawn = random_observations(spec, 3)
+    assert [each["state"].shape for each in drawn] == [(3,)] * 3
+
+
+def test_frames_of_any_size_may_have_a_history(tmp_path: Path):
+    image = {"layout": "hwc", "steps": [{"op": "resize", "size": [4, 6]}]}
+    frames = TensorSpec.from_dict(
+        {"name": "image", "shape": [1, 2, 4, 6, 3], "dtype": "uint8", "history": 2, "image": image}
+    )
+    spec = PolicySpec((frames,), (TensorSpec("action", (1, 2)),), 10.0)
+    recording = read(tmp_path, spec)
+    assert recording.observation(1)["image"].shape == (2, 2, 2, 3)
+    encode = ObservationEncoder(spec, tmp_path)
+    assert encode(recording.observation(1))["image"].shape == (1, 2, 4, 6, 3)
+    assert [encode(each)["image"].shape for each in random_observations(spec, 3)] == [(1, 2, 4, 6, 3)] * 3
 
 
 def test_text_with_a_batch_axis_is_the_text_itself(tmp_path: Path):

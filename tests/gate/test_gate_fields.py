@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from vlatool.bundle.bundle import Bundle, replace_manifest
+from vlatool.bundle.conversion import Conversion
 from vlatool.bundle.image import Image
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.program import ProgramStep
@@ -112,6 +113,11 @@ COMPARED: dict[str, tuple[Change, str]] = {
         "frame 'bgr' in the candidate, '' in the baseline",
     ),
     "TensorSpec.history": (tensor("inputs", 0, history=8), "history 8 in the candidate, 0 in the baseline"),
+    "TensorSpec.parts": (tensor("outputs", 0, parts={"arm": (0, 2)}), "parts {'arm': \\(0, 2\\)} in the candidate"),
+    "TensorSpec.convert": (
+        tensor("outputs", 0, convert=(Conversion("scale", (0,), factor=(-1.0,)),)),
+        r"convert \['scale, parts \[0\], factor \[-1.0\]'\] in the candidate, \[\] in the baseline",
+    ),
     "PolicySpec.inputs": (
         lambda before: spec(inputs=(*before.spec.inputs, TensorSpec("gripper", (1, 1))))(before),
         "input gripper: it is in the candidate alone",

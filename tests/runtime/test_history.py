@@ -16,6 +16,7 @@ from vlatool.episodes.frames import FrameRecorder
 from vlatool.errors import DataError, GraphError, PluginError
 from vlatool.runtime import ChunkQueue, Policy, load
 from vlatool.runtime.control.late import LateController
+from vlatool.runtime.image import FrameEncoder
 
 MOMENTS = TensorSpec("x", (1, 3, 2), history=3)
 CHUNK = TensorSpec("y", (1, 3, 2))
@@ -180,3 +181,66 @@ def test_recorded_frames_hold_what_the_graph_was_given(tmp_path: Path):
             queue.act({"x": [step, 0]})
     frames = np.load(tmp_path / "frames/x.npy")
     assert frames[..., 0].tolist() == [[0, 0, 0], [0, 1, 2], [2, 3, 4]]
+
+
+SQUARE = {"layout": "hwc", "steps": [{"op": "resize", "size": [4, 6]}], "range": [0, 1]}
+
+
+def filmed(folder: Path, image: dict[str, Any], channels: int = 3) -> Policy:
+    """Open a policy that gives, of each of two moments that it is given, the first pixels' brightness."""
+    axes = f"4,6,{channels}" if channels > 1 else "4,6"
+    text = (
+        f"g (float[1,2,{axes}] x) => (float[1,2,{24 * channels}] y) <int64[3] s = {{1, 2, -1}}> {{ y = Reshape(x, s) }}"
+    )
+    spec = {"name": "x", "shape": [1, 2, *map(int, axes.split(","))], "history": 2, "image": image}
+    return load(
+        written(folder, text, (TensorSpec.from_dict(spec),), (TensorSpec("y", (1, 2, 24 * channels)),), chunk=2).path
+    )
+
+
+def grey(brightness: int, *shape: int) -> Any:
+    return np.full(shape, brightness, np.uint8)
+
+
+def test_frames_of_any_size_are_preprocessed_once_and_the_history_holds_them(tmp_path: Path, monkeypatch) -> None:
+    policy, calls = filmed(tmp_path, SQUARE), []
+    encoded = FrameEncoder.__call__
+    monkeypatch.setattr(FrameEncoder, "__call__", lambda self, value: calls.append(value.shape) or encoded(self, value))
+    frames = [grey(51, 8, 12, 3), grey(102, 4, 6, 3), grey(153, 40, 30, 3), grey(204, 1, 9, 13, 3)]
+    for number, frame in enumerate(frames):
+        first, second = policy.infer({"x": frame}).chunk
+        np.testing.assert_allclose(first, max(1, number) / 5, rtol=1e-6)
+        np.testing.assert_allclose(second, (number + 1) / 5, rtol=1e-6)
+    assert calls == [frame.shape for frame in frames]
+    policy.reset()
+    policy.observe({"x": frames[2]})
+    np.testing.assert_allclose(policy.infer({"x": frames[0]}).chunk[:, 0], [0.6, 0.2], rtol=1e-6)
+
+
+@pytest.mark.parametrize("batch", [(), (1,)])
+def test_all_frames_may_be_given_at_once(tmp_path: Path, batch) -> None:
+    policy = filmed(tmp_path, SQUARE)
+    whole = np.stack([grey(51, 8, 12, 3), grey(255, 8, 12, 3)]).reshape(*batch, 2, 8, 12, 3)
+    np.testing.assert_allclose(policy.infer({"x": whole}).chunk[:, 0], [0.2, 1], rtol=1e-6)
+    np.testing.assert_allclose(policy.infer({"x": grey(0, 5, 5, 3)}).chunk[:, 0], [1, 0], rtol=1e-6)
+    with pytest.raises(DataError, match="given as 3 frames; the policy takes 2"):
+        policy.infer({"x": grey(0, 3, 8, 12, 3)})
+
+
+@pytest.mark.parametrize("shape", [(2, 6), (2, 6, 1), (1, 2, 6), (1, 2, 6, 1)])
+def test_a_grey_frame_of_two_rows_is_one_moment(tmp_path: Path, shape) -> None:
+    policy = filmed(tmp_path, {**SQUARE, "layout": "hw", "frame": "grey", "channels": "grey"}, 1)
+    policy.observe({"x": grey(51, 9, 9)})
+    np.testing.assert_allclose(policy.infer({"x": grey(102, *shape)}).chunk[:, 0], [0.2, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(policy.infer({"x": grey(204, 2, 9, 9)}).chunk[:, 0], [0.8, 0.8], rtol=1e-6)
+    np.testing.assert_allclose(policy.infer({"x": grey(255, 1, 2, 9, 9)}).chunk[:, 0], [1, 1], rtol=1e-6)
+    np.testing.assert_allclose(policy.infer({"x": grey(255, 2, 9, 9, 1)}).chunk[:, 0], [1, 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("frame", [grey(0, 8, 12, 4), grey(0, 8), np.zeros((8, 12, 3), np.float32), "left", None])
+def test_what_is_no_frame_is_refused_and_not_kept(tmp_path: Path, frame) -> None:
+    policy = filmed(tmp_path, SQUARE)
+    policy.observe({"x": grey(51, 8, 12, 3)})
+    with pytest.raises(DataError):
+        policy.infer({"x": frame})
+    np.testing.assert_allclose(policy.infer({"x": grey(102, 8, 12, 3)}).chunk[:, 0], [0.2, 0.4], rtol=1e-6)

@@ -15,6 +15,7 @@ import onnx
 import pytest
 
 from vlatool.bundle.bundle import Bundle, replace_manifest, seal
+from vlatool.bundle.conversion import Conversion
 from vlatool.bundle.image import Image, ImageStep
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.program import ProgramStep
@@ -99,6 +100,14 @@ DIFFERENT: dict[str, Edit] = {
     "rate": _with_spec(control_hz=10.5),
     "executed actions": _with_spec(execute=3),
     "epsilon": _with_tensor("inputs", 1, epsilon=1e-8),
+    "parts": _with_tensor("outputs", 0, parts={"arm": (0, 2)}),
+    "relative": _with_tensor("outputs", 0, mode="", convert=(Conversion("relative", (0,), "proprio"),)),
+    "a sign": _with_tensor("inputs", 1, convert=(Conversion("scale", (0,), factor=(-1.0,)),)),
+    "a bound": _with_tensor("outputs", 0, convert=(Conversion("clip", high=(1.0,)),)),
+    "another bound": _with_tensor("outputs", 0, convert=(Conversion("clip", high=(2.0,)),)),
+    "relative to another element": _with_tensor(
+        "outputs", 0, mode="", convert=(Conversion("relative", (0,), "proprio", (1,)),)
+    ),
     "NaN allowed": _with_tensor("inputs", 1, finite=False),
     "reordered inputs": _reordered,
     "tokens": _with_tensor("inputs", 2, max_tokens=3),

@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from vlatool.bundle.spec import TensorSpec
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError
 from vlatool.machine.host import LEROBOT_PYTHON
 from vlatool.registry import Claim
+from vlatool.runtime.converter import action_converter
+from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.sources import _lerobot_directory as directory
 from vlatool.sources._lerobot_checkpoint import read_checkpoint
@@ -159,14 +161,12 @@ def quantiles(files: dict[str, Any]) -> None:
     files["policy_preprocessor.json"]["steps"][3]["config"]["norm_map"]["STATE"] = "QUANTILES"
 
 
-def pi0(files: dict[str, Any], relative: object = False) -> None:
+def pi0(files: dict[str, Any], enabled: object = False) -> None:
     """Make the files those of pi0 as LeRobot 0.6.1 saves them: an instruction, and steps that do nothing."""
     files["config.json"]["type"] = "pi0"
     names = ("pi0_new_line_processor", "tokenizer_processor")
-    steps, behind = (files[f"policy_{name}processor.json"]["steps"] for name in ("pre", "post"))
-    steps[2:2] = [{"registry_name": name, "config": {}} for name in names]
-    for kind, listed in (("relative", steps), ("absolute", behind)):
-        listed.append({"registry_name": f"{kind}_actions_processor", "config": {"enabled": relative}})
+    files["policy_preprocessor.json"]["steps"][2:2] = [{"registry_name": name, "config": {}} for name in names]
+    relative(place=5, enabled=enabled, absolute=enabled)(files)
 
 
 def test_pi0_has_an_instruction_and_steps_that_are_not_enabled(tmp_path: Path) -> None:
@@ -176,11 +176,11 @@ def test_pi0_has_an_instruction_and_steps_that_are_not_enabled(tmp_path: Path) -
     assert (checkpoint.family, checkpoint.inputs["observation.state"].mode) == ("pi0", "MEAN_STD")
 
 
-@pytest.mark.parametrize("relative", [True, None, 0, "no"])
-def test_relative_actions_are_refused_unless_they_are_plainly_off(tmp_path: Path, relative: object) -> None:
+@pytest.mark.parametrize("enabled", [None, 0, "no"])
+def test_relative_actions_that_are_neither_on_nor_off_are_refused(tmp_path: Path, enabled: object) -> None:
     files = parts()
-    pi0(files, relative)
-    with pytest.raises(SourceError, match="'relative_actions_processor'"):
+    pi0(files, enabled)
+    with pytest.raises(SourceError, match="relative_actions_processor with enabled"):
         read_checkpoint(write(tmp_path / "c", files))
 
 
@@ -191,6 +191,106 @@ def test_an_instruction_that_is_not_processed_is_refused(tmp_path: Path, number:
     gone = files["policy_preprocessor.json"]["steps"].pop(number)["registry_name"]
     with pytest.raises(SourceError, match=f"has no step '{gone}'"):
         read_checkpoint(write(tmp_path / "c", files))
+
+
+def aloha_state(value: np.ndarray) -> np.ndarray:
+    """SmolVLA's ``_pi_aloha_decode_state`` of LeRobot 0.6.1, in float32."""
+    value = value * 1
+    value[..., [1, 2, 8, 9]] *= -1
+    for at in (6, 13):
+        metres = value[..., at] * np.float32(0.058 - 0.01844) + np.float32(0.01844)
+        sines = (0.022**2 + metres**2 - 0.036**2) / (2 * 0.022 * metres)
+        value[..., at] = (np.arcsin(np.clip(sines, -1, 1)) - np.float32(0.4)) / np.float32(1.1)
+    return value
+
+
+def aloha_action(value: np.ndarray) -> np.ndarray:
+    """Its ``_pi_aloha_encode_actions``."""
+    value = value * 1
+    value[..., [1, 2, 8, 9]] *= -1
+    for at in (6, 13):
+        value[..., at] = (value[..., at] * np.float32(1.1) + np.float32(0.4 + 0.6213)) / np.float32(1.491 + 0.6213)
+    return value
+
+
+@pytest.mark.parametrize("mode", ["IDENTITY", "MEAN_STD"])
+def test_what_smolvla_does_for_aloha_is_data(tmp_path: Path, mode: str) -> None:
+    files, wide = parts(), {"shape": [14]}
+    norms = {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode}
+    config = {**CONFIG, "type": "smolvla", "adapt_to_pi_aloha": True, "normalization_mapping": norms}
+    config["input_features"] = {"observation.state": {**STATE, **wide}}
+    config["output_features"] = {"action": {**ACTION, **wide}}
+    files["config.json"] = config
+    mean, std = np.linspace(-1, 1, 14), np.linspace(0.5, 2, 14)
+    for name, step in (("policy_preprocessor", -1), ("policy_postprocessor", 0)):
+        settings = files[f"{name}.json"]["steps"][step]["config"]
+        settings.update(norm_map=norms, features={**config["input_features"], **config["output_features"]})
+    for file in [name for name in files if name.startswith("policy_") and name.endswith(".safetensors")]:
+        files[file] = {f"{key}.{row}": value for key in ("observation.state", "action")
+                       for row, value in (("mean", mean), ("std", std))}  # fmt: skip
+    relative(exclude_joints=["x"])(files)
+    checkpoint = read_checkpoint(write(tmp_path / "c", files))
+    state, action = checkpoint.inputs["observation.state"], checkpoint.action
+    rows = {each.key: directory._rows(each) for each in (state, action)}
+    (tmp_path / "statistics.json").write_text(json.dumps(rows))
+    said = [{"name": each.key, "shape": [1, 14], **directory._tensor(each)} for each in (state, action)]
+    spec = PolicySpec.from_dict({"inputs": said[:1], "outputs": said[1:], "control_hz": 30})
+    random = np.random.default_rng(0)
+    seen, given = (random.uniform(0, 1, (1, 14)).astype(np.float32) for _ in range(2))
+    offset, scale = (np.float32(mean), np.float32(std)) if mode == "MEAN_STD" else (np.float32(0), np.float32(1))
+    encoded = ObservationEncoder(spec, tmp_path)({state.key: seen})
+    np.testing.assert_allclose(encoded[state.key], aloha_state((seen - offset) / scale), atol=2e-5, rtol=1e-4)
+    chunk = action_converter(spec, tmp_path).to_robot(given, seen[0])
+    np.testing.assert_allclose(chunk, aloha_action(given) * scale + offset + seen, rtol=1e-5, atol=1e-6)
+
+
+def relative(
+    place: int = 3, behind: int = 1, absolute: Any = True, width: int = 2, **config: Any
+) -> Callable[[dict[str, Any]], None]:
+    """Return an edit after which actions are relative to the state."""
+
+    def edit(files: dict[str, Any]) -> None:
+        settings = {"enabled": True, "exclude_joints": [], "action_names": None, **config}
+        step = {"registry_name": "relative_actions_processor", "config": settings}
+        files["policy_preprocessor.json"]["steps"].insert(place, step)
+        if absolute is not None:
+            step = {"registry_name": "absolute_actions_processor", "config": {"enabled": absolute}}
+            files["policy_postprocessor.json"]["steps"].insert(behind, step)
+        if width != 2:
+            files["config.json"]["output_features"]["action"] = {"type": "ACTION", "shape": [width]}
+            name = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
+            files[name] |= {"action.min": [-1] * width, "action.max": [1] * width}
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("config", "parts_of", "labels"),
+    [
+        ({}, [[0, 2]], ()),
+        ({"exclude_joints": ["Grip"]}, [[0, 2]], ()),
+        (
+            {"exclude_joints": ["Grip"], "action_names": ["arm.pos", "gripper.pos"]},
+            [[0, 1]],
+            ("arm.pos", "gripper.pos"),
+        ),
+        ({"exclude_joints": ["arm"], "action_names": ["arm.pos"]}, [[1, 2]], ()),
+        ({"exclude_joints": [""], "action_names": ["a", "b", "c"]}, [[0, 2]], ()),
+        ({"exclude_joints": ["a"], "action_names": ["a1", "a2"]}, [], ("a1", "a2")),
+        ({"enabled": False, "absolute": False, "action_names": ["a", "b"]}, [], ("a", "b")),
+        ({"action_names": ["a", "a"]}, [[0, 2]], ()),
+    ],
+)
+def test_relative_actions_are_a_step_of_the_spec(
+    tmp_path: Path, config: dict[str, Any], parts_of: list[Any], labels: tuple[str, ...]
+) -> None:
+    files = parts()
+    relative(**config)(files)
+    action = read_checkpoint(write(tmp_path / "c", files)).action
+    assert action.labels == labels
+    assert [step["parts"] for step in action.convert] == ([parts_of] if parts_of else [])
+    assert directory._tensor(action).get("mode") == ("absolute" if parts_of else None)
+    TensorSpec.from_dict({"name": "action", "shape": [1, 4, 2], **directory._tensor(action)})
 
 
 INPUTS = ("config.json", "input_features")
@@ -227,7 +327,19 @@ BROKEN = {
     "no steps to execute": (edited("config.json", "n_action_steps", to=-2), "n_action_steps"),
     "code": (edited(*STEPS, 1, to={"class": "subprocess.Popen", "config": {"args": "touch pwned"}}), "that is code"),
     "a step of text": (edited(*STEPS, 1, to="to_batch_processor"), "that is code"),
-    "unknown step": (edited(*STEPS, 1, "registry_name", to="relative_actions_processor"), "relative_actions_processor"),
+    "unknown step": (edited(*STEPS, 1, "registry_name", to="evo1_pad_state_processor"), "evo1_pad_state_processor"),
+    "relative alone": (relative(absolute=None), "actions would stay relative"),
+    "absolute alone": (relative(enabled=False), "although none were made relative"),
+    "relative to normalised states": (relative(place=4), "wrong side of the statistics"),
+    "absolute before its statistics": (relative(behind=0), "wrong side of the statistics"),
+    "relative to too few": (relative(width=4), "4 elements that are relative to 3"),
+    "enabled by text": (relative(enabled="true"), "enabled 'true'"),
+    "ALOHA of three joints": (
+        lambda files: files["config.json"].update(type="smolvla", adapt_to_pi_aloha=True), "the 14 joints of ALOHA"),
+    "ALOHA by text": (
+        lambda files: files["config.json"].update(type="smolvla", adapt_to_pi_aloha="no"), "adapt_to_pi_aloha 'no'"),
+    "joints of numbers": (relative(exclude_joints=[1]), "exclude_joints"),
+    "one joint of text": (relative(action_names="gripper"), "action_names"),
     "unknown mode": (edited(*STEPS, 3, "config", "norm_map", "STATE", to="ZCA"), "ZCA"),
     "missing statistic": (edited(STATES, "observation.state.std", to=None), "would pass .* unchanged, silently"),
     "other key": (edited(STATES, "observation.state.mean", to=None), "has no 'observation.state.mean'"),

@@ -13,10 +13,11 @@ import torch
 from torch import nn
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.conversion import Conversion
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import TensorSpec
 from vlatool.data import calibration_recording
-from vlatool.errors import DataError
+from vlatool.errors import DataError, SpecError
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.training.expert import Expert, encoded_actions, expert_loss, write_noise
 from vlatool.training.losses.l1 import L1
@@ -76,6 +77,30 @@ def test_without_actions_there_is_no_expert(source_bundle: Bundle, tmp_path: Pat
 def test_indices_stay_indices(source_bundle: Bundle):
     actions = encoded_actions(DISCRETE, source_bundle, np.array([[2, 0]], np.int32))
     assert (actions.dtype, actions.tolist()) == (np.int64, [[2, 0]])
+
+
+def converted(bundle: Bundle, *convert: Conversion) -> tuple[TensorSpec, Bundle]:
+    """Return the action of a bundle with conversions, and the bundle that has it."""
+    spec = bundle.manifest.spec
+    action = replace(spec.action, mode="absolute", convert=convert)
+    return action, replace(bundle, manifest=replace(bundle.manifest, spec=replace(spec, outputs=(action,))))
+
+
+def test_recorded_targets_become_the_differences_that_the_network_gives(source_bundle: Bundle):
+    random = np.random.default_rng(0)
+    targets, states = (random.normal(size=size).astype(np.float32) for size in ((5, 4, 2), (5, 3)))
+    action, bundle = converted(source_bundle, Conversion("relative", (1,), "proprio", (2,)))
+    wanted = targets.copy()
+    wanted[:, :, 1] -= states[:, None, 2]
+    found = encoded_actions(action, bundle, targets, states)
+    np.testing.assert_allclose(found, encoded_actions(source_bundle.manifest.spec.action, source_bundle, wanted))
+
+
+def test_what_has_no_way_back_is_not_trained_on(source_bundle: Bundle):
+    action, bundle = converted(source_bundle, Conversion("binarise", (1,)))
+    with pytest.raises(SpecError, match="binarise, has no way back") as caught:
+        encoded_actions(action, bundle, np.zeros((2, 4, 2), np.float32))
+    assert "train on what the network gives" in caught.value.fix
 
 
 def test_noise_is_drawn_for_every_row(tmp_path: Path):

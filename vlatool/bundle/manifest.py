@@ -154,8 +154,8 @@ class Manifest:
         values["spec"] = PolicySpec.from_dict(values["spec"])
         if values["spec"].schema > values["schema"]:
             raise BundleError(
-                f"The manifest has the schema {values['schema']}, but an 'image', 'epsilon' or 'quantile10', which "
-                f"begin with {values['spec'].schema}."
+                f"The manifest has the schema {values['schema']}, but what begins with "
+                f"{values['spec'].schema}, such as 'image', 'history', 'epsilon', 'parts' or 'convert'."
             )
         values["graphs"] = {name: _graph(name, graph) for name, graph in values.get("graphs", {}).items()}
         values["program"] = program_from(values.get("program", []))

@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from vlatool.bundle.conversion import (
+    OUTPUTS_ALONE,
+    Conversion,
+    Layout,
+    Span,
+    conversions_from,
+    layouts_of,
+    parts_from,
+)
 from vlatool.bundle.image import Image
 from vlatool.bundle.prompt import Prompt
 from vlatool.errors import SpecError, suggest
@@ -60,6 +69,9 @@ class TensorSpec:
         history: number of moments that the second axis of an input holds, oldest first, from 2; 0 for an input of one
             moment. The robot gives one moment at each control step, and the runtime keeps the last ones.
         prompt: what is written around the text of an input before it becomes ids (``kind: text``); nothing when None.
+        parts: names of parts of the vector that the robot gives or gets: name -> [start, stop), or one place.
+        convert: steps between the values of the robot and those of the network, from the robot to the network; the
+            shape is that of the network, labels, units and parts are those of the robot.
     """
 
     name: str
@@ -78,10 +90,15 @@ class TensorSpec:
     epsilon: float = 0.0
     history: int = 0
     prompt: Prompt | None = None
+    parts: dict[str, Span] = field(default_factory=dict)
+    convert: tuple[Conversion, ...] = ()
 
     def __post_init__(self) -> None:
         self._check_words()
+        object.__setattr__(self, "parts", parts_from(self.parts, f"'{self.name}'"))
+        object.__setattr__(self, "convert", conversions_from(self.convert))
         self._check_shape()
+        self._check_conversions()
         self._check_history()
         self._check_kind()
         if self.normalisation != "none" and "#" not in self.statistics:
@@ -104,8 +121,8 @@ class TensorSpec:
 
     def _check_words(self) -> None:
         text(self.name, "The name of a tensor", SpecError, empty=False)
-        for field in ("statistics", "tokenizer"):
-            text(getattr(self, field), f"The {field} of '{self.name}'", SpecError)
+        for name in ("statistics", "tokenizer"):
+            text(getattr(self, name), f"The {name} of '{self.name}'", SpecError)
         if not isinstance(self.labels, tuple) or not isinstance(self.unit, str | tuple):
             got = f"labels {short_repr(self.labels)} and unit {short_repr(self.unit)}"
             raise SpecError(f"'{self.name}' has {got}; labels must be a list.")
@@ -114,11 +131,11 @@ class TensorSpec:
         integer(self.max_tokens, f"The max_tokens of '{self.name}'", SpecError)
         check_limit("tokens", self.max_tokens, f"'{self.name}'", SpecError)
         allowed = {"dtype": DTYPES, "kind": KINDS, "normalisation": NORMALISATIONS, "mode": MODES}
-        for field, values in allowed.items():
-            got = getattr(self, field)
+        for name, values in allowed.items():
+            got = getattr(self, name)
             if got not in values:
                 allowed_values = suggest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
-                raise SpecError(f"'{self.name}' has {field} {short_repr(got)}; {allowed_values}.")
+                raise SpecError(f"'{self.name}' has {name} {short_repr(got)}; {allowed_values}.")
 
     def _check_shape(self) -> None:
         for axis in self.shape:
@@ -129,11 +146,50 @@ class TensorSpec:
             if isinstance(axis, str):
                 text(axis, f"An axis of '{self.name}'", SpecError, empty=False)
         check_limit("elements", self.elements, f"'{self.name}'", SpecError)
-        width = self.width
-        for field in ("labels", "unit"):
-            value = getattr(self, field)
+        width = self.robot_width
+        if self.convert and self.width and width < 1:
+            raise SpecError(f"'{self.name}' has {self.width} elements; its rotations alone have more in the network.")
+        where = "" if width == self.width else ", as the robot has it"
+        for name in ("labels", "unit"):
+            value = getattr(self, name)
             if isinstance(value, tuple) and value and len(value) != width:
-                raise SpecError(f"'{self.name}' has {len(value)} {field} for a last axis of {width}.")
+                raise SpecError(f"'{self.name}' has {len(value)} {name} for a last axis of {width}{where}.")
+
+    def _check_conversions(self) -> None:
+        if not self.convert and not self.parts:
+            return
+        if self.kind != "tensor" or self.image is not None or self.width < 1:
+            raise SpecError(
+                f"'{self.name}' has {'convert' if self.convert else 'parts'} and is "
+                f"{'an image' if self.image else self.kind} {list(self.shape)}; they are for vectors of a known width.",
+                "leave them out there",
+            )
+        if both := [name for name in self.parts if name in self.labels]:
+            raise SpecError(f"'{self.name}' has a part and a label of the name '{both[0]}'.", "rename the part")
+        if self.convert and (not self.dtype.startswith("float") or not self.finite):
+            raise SpecError(
+                f"'{self.name}' has convert, is {self.dtype} and has finite: {str(self.finite).lower()}; finite floats "
+                "alone are converted."
+            )
+        robot = self.layouts()[0]
+        for name, (_, stop) in self.parts.items():
+            robot.spans(((stop - 1),), f"The part '{name}' of '{self.name}'")
+        marks = [index for index, step in enumerate(self.convert) if step.op == "normalisation"]
+        if marks and (len(marks) > 1 or self.normalisation == "none"):
+            raise SpecError(
+                f"'{self.name}' has {len(marks)} steps 'normalisation' in convert, and normalisation "
+                f"{self.normalisation}; allowed: one, with a normalisation."
+            )
+        if marks and any(step.op == "relative" for step in self.convert[marks[0] :]):
+            raise SpecError(
+                f"'{self.name}' is relative behind its normalisation; the state is in the units of the robot.",
+                "let the step 'relative' stand before it: statistics are then those of the differences",
+            )
+        if marks and any(step.growth for step in self.convert[marks[0] :]):
+            raise SpecError(
+                f"'{self.name}' has another number of elements behind its normalisation.",
+                "let such steps stand before it: statistics have one number for each element of the network",
+            )
 
     def _check_kind(self) -> None:
         if self.kind == "text" and (not self.tokenizer or self.max_tokens < 1):
@@ -170,16 +226,11 @@ class TensorSpec:
                 f"{str(self.finite).lower()}; an image is a finite tensor with a mean and std of its own.",
                 "leave those out; write mean and std into 'image'",
             )
-        image.check_input(self.name, self.shape, self.dtype)
+        image.check_input(self.name, self.moment.shape, self.dtype)
 
     def _check_history(self) -> None:
         if not integer(self.history, f"The history of '{self.name}'", SpecError):
             return
-        if self.image is not None:
-            raise SpecError(
-                f"'{self.name}' has a history and an image; frames with a history are given as the graph takes them.",
-                "leave the image out, and scale the frames in forward()",
-            )
         if self.kind != "tensor" or self.history < 2 or self.shape[1:2] != (self.history,):
             raise SpecError(
                 f"'{self.name}' has the history {self.history} and, as {self.kind}, the shape {list(self.shape)}; the "
@@ -205,6 +256,20 @@ class TensorSpec:
         return last if isinstance(last, int) else 0
 
     @property
+    def robot_width(self) -> int:
+        """Length of the last axis as the robot has it; ``width`` where nothing else is said."""
+        return self.width - sum(step.growth * len(step.parts or ("all",)) for step in self.convert)
+
+    def layouts(self) -> list[Layout]:
+        """Return the layout on the side of the robot of each conversion, and that of the network at the end.
+
+        Raises:
+            SpecError: for parts that are not there, or overlap.
+        """
+        places = {label: (index, index + 1) for index, label in enumerate(self.labels)}
+        return layouts_of(Layout(self.robot_width, {**places, **self.parts}), self.convert)
+
+    @property
     def moment(self) -> TensorSpec:
         """Spec of what the robot gives at one control step: without the axis of moments, if it has a history."""
         return replace(self, shape=(self.shape[0], *self.shape[2:]), history=0) if self.history else self
@@ -215,22 +280,26 @@ class TensorSpec:
         return math.prod(axis if isinstance(axis, int) else 1 for axis in self.shape)
 
     def units(self) -> tuple[str, ...]:
-        """Return one unit for each element of the last axis."""
-        return self.unit if isinstance(self.unit, tuple) else (self.unit,) * self.width
+        """Return one unit for each element of the last axis, as the robot has it."""
+        return self.unit if isinstance(self.unit, tuple) else (self.unit,) * self.robot_width
 
     @property
     def observation(self) -> TensorSpec:
-        """The input as observations have it: where it is an image, a frame of the camera."""
+        """The input as observations have it: where it is an image, a frame of the camera; before all conversions."""
+        if self.convert:
+            shape = (*self.shape[:-1], self.robot_width)
+            return replace(self, shape=shape, convert=(), normalisation="none", statistics="", epsilon=0.0)
         if self.image is None:
             return self
-        shape = (1, *self.image.frame_shape(self.shape))
+        moments = (self.history,) if self.history else ()
+        shape = (1, *moments, *self.image.frame_shape(self.shape))
         return replace(self, shape=shape, dtype="uint8", image=None, unit="", labels=())
 
     @property
     def schema(self) -> int:
         """The first version of the manifest that has all that this tensor says."""
-        later = self.image or self.epsilon or self.history or self.prompt or self.normalisation == "quantile10"
-        return 2 if later else 1
+        later = self.image or self.epsilon or self.history or self.prompt or self.parts or self.convert
+        return 2 if later or self.normalisation == "quantile10" else 1
 
     @property
     def frame(self) -> str:
@@ -261,6 +330,7 @@ class TensorSpec:
             values["image"] = Image.from_dict(values["image"])
         if values.get("prompt") is not None:
             values["prompt"] = Prompt.from_dict(values["prompt"])
+        values["convert"] = conversions_from(values.get("convert", ()))
         if values.get("kind") == "discrete":
             values.setdefault("labels", _indices(values["shape"]))
         return cls(**values)
@@ -318,6 +388,7 @@ class PolicySpec:
                 )
             if tensor.history:
                 raise SpecError(f"The output '{tensor.name}' has a history.", "leave it out there; it is for inputs")
+        self._check_conversions()
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
         hz = self.control_hz
@@ -328,6 +399,63 @@ class PolicySpec:
         check_limit("elements", self.chunk, "chunk", SpecError)
         if integer(self.execute, "execute", SpecError) > self.chunk:
             raise SpecError(f"chunk is {self.chunk!r} and execute {self.execute!r}; allowed: 1 <= execute <= chunk.")
+
+    def _check_conversions(self) -> None:
+        """Refuse steps that stand where they are not done, and states that are not there."""
+        for tensor in (*self.inputs, *self.outputs[1:]):
+            for step in tensor.convert:
+                if step.op in OUTPUTS_ALONE or tensor in self.outputs:
+                    raise SpecError(
+                        f"'{tensor.name}' has the step '{step.op}' in convert; that is for the action "
+                        f"'{self.action.name}' alone."
+                    )
+        steps = [step for step in self.action.convert if step.op == "relative"]
+        if len({step.to for step in steps}) > 1:
+            raise SpecError(f"'{self.action.name}' is relative to several inputs; allowed: one, with all of its parts.")
+        if steps and self.action.mode not in ("", "absolute"):
+            raise SpecError(
+                f"'{self.action.name}' has the mode {self.action.mode}, and is made absolute by its step 'relative'.",
+                "write mode: absolute, or leave the step out: the controller then adds the state itself",
+            )
+        for step in steps:
+            self.state_spans(step)
+
+    def state_spans(self, step: Conversion) -> tuple[tuple[Span, Span], ...]:
+        """Return, for a step ``relative`` of the action, the places in the action and those in the state.
+
+        Raises:
+            SpecError: when the state is not an input, or has not as many elements as the action.
+        """
+        state = next((tensor for tensor in self.inputs if tensor.name == step.to), None)
+        if state is None:
+            known = [tensor.name for tensor in self.inputs]
+            raise SpecError(
+                f"{step.where} is relative to '{step.to}', which is not an input; {suggest(step.to, known)}."
+            )
+        vector = len(state.shape) == (3 if state.history else 2)
+        if state.kind != "tensor" or state.image or not state.dtype.startswith("float") or not vector:
+            raise SpecError(
+                f"{step.where} is relative to '{step.to}', {state.dtype} {list(state.shape)}; wanted: a vector of "
+                "floats, [1, WIDTH], with a history [1, MOMENTS, WIDTH]."
+            )
+        layout = self.action.layouts()[self.action.convert.index(step)]
+        spans = layout.spans(step.parts, step.where)
+        whole = not step.parts and ((0, layout.width),)
+        theirs = whole or state.layouts()[0].spans(step.state or step.parts, f"{step.where} of the state '{step.to}'")
+        for mine, other in zip(spans, theirs, strict=True):
+            if mine[1] - mine[0] != other[1] - other[0] or other[1] > state.robot_width:
+                raise SpecError(
+                    f"{step.where} takes the elements {list(mine)} of the action from {list(other)} of '{step.to}', "
+                    f"which has {state.robot_width}.",
+                    "name as many elements of the state under 'state' as of the action under 'parts'",
+                )
+        return tuple(zip(spans, theirs, strict=True))
+
+    @property
+    def reference(self) -> TensorSpec | None:
+        """The input that the action is relative to; None when there is none."""
+        names = {step.to for step in self.action.convert if step.op == "relative"}
+        return next((tensor for tensor in self.inputs if tensor.name in names), None)
 
     @property
     def schema(self) -> int:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from vlatool.bundle.bundle import Bundle, manifest_bytes
+from vlatool.bundle.conversion import describe_conversion
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import UNKNOWN, TensorSpec
 from vlatool.cli._console import progress
@@ -165,8 +166,9 @@ def describe(bundle: Bundle) -> list[str]:
     rate = f"{spec.control_hz:g} Hz control" if known else f"control at an {UNKNOWN} rate"
     lines += [f"  rate       {rate}, {executed}{ends}"]
     lines += [f"  unknown    {', '.join(spec.unknown())}"] if spec.unknown() else []
-    lines += [f"  input      {_tensor(tensor)}" for tensor in spec.inputs]
-    lines += [f"  output     {_tensor(tensor)}" for tensor in spec.outputs]
+    for side, tensors in (("input ", spec.inputs), ("output", spec.outputs)):
+        for tensor in tensors:
+            lines += [f"  {side}     {_tensor(tensor)}", *_conventions(tensor)]
     for name, graph in manifest.graphs.items():
         shares = ", ".join(f"{share:.1%} {kind}" for kind, share in graph.precision.items())
         size = _megabytes(bundle, graph.file) + "".join(
@@ -224,6 +226,13 @@ def _tensor(tensor: TensorSpec) -> str:
     labels = f" ({', '.join(tensor.labels)})" if tensor.labels else ""
     kind = "text -> " if tensor.kind == "text" else ""
     return f"{tensor.name}: {kind}{tensor.dtype} {shape}{labels} {rest}".rstrip()
+
+
+def _conventions(tensor: TensorSpec) -> list[str]:
+    """Return the parts of a vector, and what lies between the robot and the network, a line each."""
+    parts = [f"{name} [{start}, {stop})" for name, (start, stop) in tensor.parts.items()]
+    lines = [f"    parts    {', '.join(parts)}"] if parts else []
+    return lines + [f"    convert  {describe_conversion(step)}" for step in tensor.convert]
 
 
 def _short(value: str) -> str:

@@ -64,7 +64,7 @@ class Drawer:
         assets = bundle.path / "assets"
         texts = [tensor for tensor in self._inputs if tensor.kind == "text"]
         self._words = {text.name: words_of(assets / text.tokenizer) for text in texts}
-        self._normalisers = {tensor.name: load_normaliser(tensor, assets) for tensor in self._inputs}
+        self._normalisers = {tensor.name: load_normaliser(tensor.observation, assets) for tensor in self._inputs}
 
     def draw(self, count: int, random: np.random.Generator) -> list[Drawn]:
         """Return ``count`` observations of all kinds that can be drawn, in random order."""

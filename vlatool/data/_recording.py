@@ -282,10 +282,10 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
 
 
 def _any_size(tensor: TensorSpec) -> TensorSpec:
-    """Return an input as recordings have it: frames of any size, where it is an image."""
-    if tensor.image is None:
-        return tensor
+    """Return an input as recordings have it: before it is converted; frames of any size, where it is an image."""
     observed = tensor.observation
+    if tensor.image is None:
+        return observed
     return replace(observed, shape=(1, "height", "width", *observed.shape[3:]))
 
 
@@ -349,7 +349,7 @@ def _checked_action(path: Path, spec: PolicySpec, values: Array) -> Array:
 
 
 def _numbers(where: str, values: Array, spec: PolicySpec) -> Array:
-    width, got = spec.action.width, list(values.shape)
+    width, got = spec.action.robot_width, list(values.shape)
     if values.dtype.kind not in "iuf":
         raise DataError(f"{where} is {values.dtype}; wanted numbers in physical units.", "store it as float32")
     if values.ndim < 2 or got[-1] != width:

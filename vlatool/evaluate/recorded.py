@@ -205,7 +205,7 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, reference: Ref
         return [reference.agreement.measurement(hits / total, samples=total, low=low, high=high)]
     steps = min(got.shape[1], wanted.shape[1])
     got, wanted = got[:, :steps].astype(np.float64), wanted[:, :steps].astype(np.float64)
-    labels = action.labels or tuple(str(index) for index in range(action.width))
+    labels = action.labels or tuple(str(index) for index in range(action.robot_width))
     errors = np.abs(got - wanted)
     mean, count = errors.mean(axis=(0, 1)), len(got)
     scale = scale_of(action, wanted)

@@ -7,6 +7,7 @@ from typing import Any
 
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.conversion import Conversion, describe_conversion
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.spec import TensorSpec
@@ -15,7 +16,20 @@ from vlatool.gate.config import Gate
 from vlatool.graph.files import read
 from vlatool.graph.random_ops import random_operators
 
-MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite", "frame", "history")
+MEANING = (
+    "shape",
+    "dtype",
+    "kind",
+    "unit",
+    "labels",
+    "mode",
+    "max_tokens",
+    "finite",
+    "frame",
+    "history",
+    "parts",
+    "convert",
+)
 """Fields that a robot relies on; files of statistics and tokenizers may differ."""
 RATE = {"control_hz": "control_hz", "chunk": "chunk", "executed": "executed_actions"}
 """Name of a rate in messages -> field or property of the spec."""
@@ -124,7 +138,15 @@ def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
     """Return in words how an input or output of the candidate differs from the baseline's; nothing when it does not."""
     if mine is None or theirs is None:
         return f"it is in the {'baseline' if mine is None else 'candidate'} alone"
-    return _differences([(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING])
+    pairs = [(name, *(_in_words(getattr(each, name)) for each in (mine, theirs))) for name in MEANING]
+    return _differences(pairs)
+
+
+def _in_words(value: Any) -> Any:
+    """Return a value of the spec for a message; each conversion as a line of ``vlatool inspect``."""
+    if not isinstance(value, tuple):
+        return value
+    return tuple(describe_conversion(each) if isinstance(each, Conversion) else each for each in value)
 
 
 def _program(mine: Manifest, theirs: Manifest) -> str:

@@ -58,7 +58,8 @@ class FrameEncoder:
     def _checked(self, frame: Array) -> Array:
         """Return a frame as (H, W, C)."""
         channels = ORDERS[self._image.frame]
-        if frame.ndim == 4 and frame.shape[0] == 1:
+        batched = frame.ndim == 4 or (frame.ndim == 3 and channels == 1 and frame.shape[-1] != 1)
+        if batched and frame.shape[0] == 1:
             frame = frame[0]
         if frame.ndim == 2 and channels == 1:
             frame = frame[:, :, None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError
 from vlatool.runtime.assets import Assets, asset_path
+from vlatool.runtime.converter import Converter, newest_moment
 from vlatool.runtime.history import History
 from vlatool.runtime.image import FrameEncoder
 from vlatool.runtime.statistics import load_normaliser
@@ -28,6 +30,9 @@ Encoder = Callable[[Any], Array]
 
 class EncodedObservation(dict[str, Array]):
     """An observation as the graphs take it, name -> (1, ...): normalised, text as ids. ``infer`` takes it as it is."""
+
+    state: Array | None = None
+    """(S,) what the action is relative to, in the units of the robot, where the spec says so."""
 
 
 class ObservationEncoder:
@@ -46,6 +51,8 @@ class ObservationEncoder:
         self.names = [tensor.name for tensor in spec.inputs]
         self._encoders = [(tensor.name, _encoder(tensor, assets, history)) for tensor in spec.inputs]
         self._dtypes = {tensor.name: tensor.dtype for tensor in spec.inputs}
+        self._reference = spec.reference
+        self._of_reference = Converter(spec.reference, assets) if spec.reference else None
 
     def __call__(self, observation: Mapping[str, Any]) -> EncodedObservation:
         """Return one array with a batch axis for each input of the spec; those of an encoded observation as they are.
@@ -59,7 +66,7 @@ class ObservationEncoder:
                 NaN or infinity where its spec does not say ``finite: false``.
         """
         if isinstance(observation, EncodedObservation):
-            return EncodedObservation(observation)
+            return self._copied(observation)
         values = EncodedObservation()
         with np.errstate(over="raise"):
             for name, encode in self._encoders:
@@ -71,6 +78,17 @@ class ObservationEncoder:
                     values[name] = encode(value)
                 except (RuntimeWarning, FloatingPointError):
                     raise self._too_large(name, value) from None
+        if self._reference is not None:
+            values.state = newest_moment(observation[self._reference.name], self._reference.robot_width)
+        return values
+
+    def _copied(self, encoded: EncodedObservation) -> EncodedObservation:
+        """Return an encoded observation, with the state that the action is relative to."""
+        values = EncodedObservation(encoded)
+        values.state = encoded.state
+        if values.state is None and self._reference is not None and self._of_reference is not None:
+            robot = self._of_reference.to_robot(np.asarray(encoded[self._reference.name], np.float32))
+            values.state = newest_moment(robot, self._reference.robot_width)
         return values
 
     def _too_large(self, name: str, value: Any) -> DataError:
@@ -107,7 +125,9 @@ def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None)
     if tensor.history and history is not None:
         return _moment_encoder(tensor, assets, history)
     if tensor.image is not None:
-        return _frame_encoder(tensor, FrameEncoder(tensor, tensor.image))
+        return _frame_encoder(tensor, FrameEncoder(tensor.moment, tensor.image))
+    if tensor.convert:
+        return _converting_encoder(tensor, assets)
     dtype = np.dtype(tensor.dtype)
     normaliser = load_normaliser(tensor, assets)
     checked = dtype.kind == "f" and tensor.finite
@@ -140,6 +160,23 @@ def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None)
     return encode
 
 
+def _converting_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
+    """Return an encoder of the robot's values, which are checked before they are converted; float16 in float32."""
+    wide = "float32" if tensor.dtype == "float16" else tensor.dtype
+    checked, converter = _encoder(replace(tensor.observation, dtype=wide), assets), Converter(tensor, assets)
+
+    def encode(value: Any) -> Array:
+        converted = converter.to_network(checked(value))
+        if not all_finite(converted):
+            raise DataError(
+                f"The input '{tensor.name}' holds {_not_finite(converted)} once it is converted.",
+                "check where it comes from: a quaternion of zeros is not a rotation",
+            )
+        return converted.astype(tensor.dtype, copy=False)
+
+    return encode
+
+
 def _as_array(value: Any, tensor: TensorSpec) -> Array:
     try:
         return np.asarray(value)
@@ -155,8 +192,19 @@ def _as_array(value: Any, tensor: TensorSpec) -> Array:
 
 
 def _frame_encoder(tensor: TensorSpec, encode_frame: FrameEncoder) -> Encoder:
+    """Return an encoder of one frame, or of those of all moments where the input has a history."""
+
     def encode(value: Any) -> Array:
-        return encode_frame(value if isinstance(value, np.ndarray) else _as_array(value, tensor))
+        frame = value if isinstance(value, np.ndarray) else _as_array(value, tensor)
+        if not tensor.history:
+            return encode_frame(frame)
+        frames = frame[0] if len(frame) == 1 and frame.ndim > len(tensor.observation.shape) - 1 else frame
+        if len(frames) != tensor.history:
+            raise DataError(
+                f"The input '{tensor.name}' is given as {len(frames)} frames; the policy takes {tensor.history}.",
+                "give the frame of this moment alone, or those of all moments",
+            )
+        return np.stack([encode_frame(each) for each in frames], axis=1)
 
     return encode
 
@@ -165,9 +213,13 @@ def _moment_encoder(tensor: TensorSpec, assets: Assets, history: History) -> Enc
     """Return an encoder of one moment, to which those before it are added, or of all moments at once."""
     whole, moment = _encoder(tensor, assets), _encoder(tensor.moment, assets)
 
+    axes = len(tensor.observation.shape)
+
     def encode(value: Any) -> Array:
         shape = _shape(value)
-        if len(shape) == len(tensor.shape) or (len(shape) == len(tensor.shape) - 1 and shape[0] != 1):
+        if tensor.frame == "grey" and len(shape) > 2 and shape[-1] == 1:
+            shape = shape[:-1]  # a grey frame may be (H, W, 1)
+        if len(shape) == axes or (len(shape) == axes - 1 and shape[0] != 1):
             return whole(value)
         return history.window(tensor.name, moment(value))
 

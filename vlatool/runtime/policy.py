@@ -28,7 +28,7 @@ from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.history import History
 from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.interface import Action, Array
-from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.observation import EncodedObservation, ObservationEncoder
 from vlatool.runtime.program import Program, Session
 
 FLOAT_ROUNDING = 1e-3
@@ -147,25 +147,42 @@ class BundlePolicy:
         with self._turn, limit:
             try:
                 self._busy = True
+                encoded = self.encode(observation)
                 if self._direct:
-                    values = self.program.run(self.encode(observation), noise)
+                    values = self.program.run(encoded, noise)
                     outputs = {name: values[name] for name in self._outputs.names}
-                    chunk, labels = self._decode(outputs[self._action])
+                    chunk, labels = self._decode(outputs[self._action], encoded.state)
                 else:
-                    outputs, (chunk, labels) = self.program.run(self.encode(observation), noise, self._answer)
+                    answer = functools.partial(self._answer, encoded.state)
+                    outputs, (chunk, labels) = self.program.run(encoded, noise, answer)
                 sequence = self._sequence
                 self._sequence += 1
             finally:
                 self._busy = False
         return Action(chunk, labels, (time.perf_counter_ns() - start) / 1e6, sequence, outputs)
 
-    def _answer(self, values: dict[str, Any]) -> tuple[dict[str, Array], tuple[Array, tuple[str, ...]]]:
+    def _answer(
+        self, state: Array | None, values: dict[str, Any]
+    ) -> tuple[dict[str, Array], tuple[Array, tuple[str, ...]]]:
         outputs = self._outputs(values)
-        return outputs, self._decode(outputs[self._action])
+        return outputs, self._decode(outputs[self._action], state)
 
-    def decode(self, raw: Array) -> Array:
-        """Return the chunk of the graph's raw action: (T, A) in the units of the spec, or (T,) indices."""
-        return self._decode(raw)[0]
+    def decode(self, raw: Array, encoded: EncodedObservation | None = None) -> Array:
+        """Return the chunk of the graph's raw action: (T, A) in the units of the spec, or (T,) indices.
+
+        Args:
+            encoded: the observation that it answers, for an action that is relative to a state.
+        """
+        return self._decode(raw, None if encoded is None else encoded.state)[0]
+
+    def golden_chunk(self, action: Action) -> Array:
+        """Return what of an action is compared between machines in physical units: (T, A), or (T,) indices.
+
+        That is the chunk, of an action that is converted the chunk before it is.
+        """
+        if not self.spec.action.convert:
+            return action.chunk
+        return self._decode.unnormalise(action.outputs[self._action])
 
     def _check_overlap(self) -> None:
         """Refuse a call during an inference if waiting for it would not help."""
@@ -259,7 +276,7 @@ class BundlePolicy:
                 action = self.infer(observation, noise=noise)
                 errors.append(relative_error(action.outputs[self.spec.action.name], expected))
                 if chunks:
-                    of_chunks.append(self.chunk_error(action.chunk, chunks[number % len(steps)]))
+                    of_chunks.append(self.golden_difference(action, chunks[number % len(steps)]))
         finally:
             self.limit_s = limit
         self.reset()
@@ -294,6 +311,10 @@ class BundlePolicy:
             return ""
         return f"the bundle was made for {engine}: load it with engine={engine!r}, or make one for {self.engine}"
 
+    def golden_difference(self, action: Action, expected: Array) -> float:
+        """Return the relative L2 difference of an action's ``golden_chunk`` from another."""
+        return self._spread_error(self.golden_chunk(action), expected)
+
     def chunk_error(self, got: Array, expected: Array) -> float:
         """Return the relative L2 difference of two chunks in physical units; infinite when their sizes differ.
 
@@ -305,6 +326,9 @@ class BundlePolicy:
             got: Chunk (T, A) in the units of the spec.
             expected: Recorded chunk of the same shape and units.
         """
+        return relative_error(got, expected) if self.spec.action.convert else self._spread_error(got, expected)
+
+    def _spread_error(self, got: Array, expected: Array) -> float:
         normaliser = self._decode.normaliser
         if normaliser is None or got.shape != expected.shape:
             return relative_error(got, expected)

@@ -235,7 +235,7 @@ class Switchboard:
     def _error(self, group: Sequence[LayerId], rows: list[tuple[Array, ...]]) -> LayerError:
         spec = self.policy.spec.action
         errors, flips, jumps, elements = (np.mean([row[index] for row in rows], axis=0) for index in range(4))
-        labels = spec.labels or tuple(str(index) for index in range(spec.width))
+        labels = spec.labels or tuple(str(index) for index in range(spec.robot_width))
         named = {} if spec.kind == "discrete" else dict(zip(labels, elements.tolist(), strict=True))
         graphs = ", ".join(dict.fromkeys(graph for graph, _ in group))
         share = float(sum(self.shares[layer_id] for layer_id in group))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,15 @@ from numpy.typing import NDArray
 from vlatool.errors import SourceError, require, suggest
 from vlatool.files.json import read_json
 from vlatool.files.printable import truncate
+from vlatool.sources._lerobot_conversions import (
+    ABSOLUTE,
+    RELATIVE,
+    STATE,
+    Steps,
+    aloha_steps,
+    joint_names,
+    relative_parts,
+)
 
 FAMILIES = ("act", "diffusion", "pi0", "smolvla")
 """Types of policies that ``_lerobot_child`` traces."""
@@ -23,14 +32,13 @@ TEXT_STEPS = {
     "pi0": ("pi0_new_line_processor", "tokenizer_processor"),
 }
 """Family -> steps of its instruction; ``_lerobot_child`` writes the tokenizer that does both."""
-RELATIVE = ("relative_actions_processor", "absolute_actions_processor")
-"""Steps that do nothing unless they are ``enabled``; what they do then is not known."""
 RENAME, NORMALIZER, UNNORMALIZER = "rename_observations_processor", "normalizer_processor", "unnormalizer_processor"
 MODES = {
     "IDENTITY": (), "MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"),
     "QUANTILE10": ("q10", "q90"),
 }  # fmt: skip
 """Normalisation of LeRobot (``processor/normalize_processor.py`` of 0.6) -> the statistics that it takes."""
+NORMALISATION = {"op": "normalisation"}
 EMPTY_CAMERA = "observation.images.empty_camera_"
 """Cameras that the policy fills with a constant itself."""
 COMPLETE = "save the policy again with save_pretrained, its processors, too: config.json, model.safetensors and both "
@@ -48,6 +56,8 @@ class Feature:
         mode: how LeRobot normalises it, of ``MODES``.
         statistics: what the mode takes, float64 of the feature's elements; (3,) for pictures.
         epsilon: what LeRobot adds to a standard deviation on the way in, not on the way out, and puts for a range of 0.
+        convert: steps of the spec between the values of the robot and those of the network.
+        labels: names of its elements, where the checkpoint says them.
     """
 
     key: str
@@ -56,6 +66,8 @@ class Feature:
     mode: str
     statistics: Statistics
     epsilon: float
+    convert: tuple[dict[str, Any], ...] = ()
+    labels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,14 +109,14 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     steps = _steps(
         folder,
         "policy_preprocessor.json",
-        (*HARMLESS, *TEXT_STEPS.get(str(family), ()), RENAME, NORMALIZER),
+        (*HARMLESS, *TEXT_STEPS.get(str(family), ()), RENAME, RELATIVE, NORMALIZER),
     )
     for name in TEXT_STEPS.get(str(family), ()):
         if name not in steps:
             raise SourceError(
                 f"{folder / 'policy_preprocessor.json'} has no step '{name}', as {family} has it.", COMPLETE
             )
-    behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER))
+    behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER, ABSOLUTE))
     mapping = config.get("normalization_mapping")
     trained_with = mapping if isinstance(mapping, dict) else {}
     robot_key = _robot_keys(folder, steps.get(RENAME, {}).get("rename_map", {}))
@@ -119,10 +131,38 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     if list(outputs) != ["action"]:
         raise SourceError(f"{folder} has the outputs {sorted(outputs)}; wanted: action.", COMPLETE)
     action = _feature(folder, ("action", "action"), outputs["action"], behind.get(UNNORMALIZER, {}), trained_with)
+    action = _converted(folder, action, inputs.get(STATE), (steps, behind))
+    if family == "smolvla":
+        inputs, action = _adapted(folder, config, inputs, action)
     execute = config.get("n_action_steps", 1)
     if not isinstance(execute, int) or execute < 1:
         raise SourceError(f"config.json of {folder} has n_action_steps {truncate(repr(execute), 40)}.", COMPLETE)
     return Checkpoint(folder, str(family), inputs, action, execute)
+
+
+def _converted(folder: Path, action: Feature, state: Feature | None, steps: tuple[Steps, Steps]) -> Feature:
+    """Return the action with what lies between it and the robot, and the names of its elements."""
+    width = action.shape[-1]
+    labels = tuple(joint_names(folder, steps[0], width))
+    parts = relative_parts(folder, steps, (state.shape[-1] if state else 0, width))
+    if not parts or state is None:
+        return replace(action, labels=labels)
+    return replace(action, labels=labels, convert=({"op": "relative", "to": state.key, "parts": parts},))
+
+
+def _adapted(
+    folder: Path, config: Mapping[str, Any], inputs: dict[str, Feature], action: Feature
+) -> tuple[dict[str, Feature], Feature]:
+    """Return the features with what the policy itself does to the state and the action of ALOHA."""
+    state = inputs.get(STATE)
+    of_state, of_action = aloha_steps(folder, config, (state.shape[-1] if state else 0, action.shape[-1]))
+    if state is None or not of_state:
+        return inputs, action
+    adapted = [
+        replace(feature, convert=(*feature.convert, *([] if feature.mode == "IDENTITY" else [NORMALISATION]), *more))
+        for feature, more in ((state, of_state), (action, of_action))
+    ]
+    return {**inputs, STATE: adapted[0]}, adapted[1]
 
 
 def _robot_keys(folder: Path, renames: Any) -> dict[str, str]:
@@ -182,8 +222,6 @@ def _steps(folder: Path, name: str, known: tuple[str, ...]) -> dict[str, dict[st
         registered = str(step["registry_name"])
         found = step.get("config")
         settings: dict[str, Any] = found if isinstance(found, dict) else {}
-        if registered in RELATIVE and settings.get("enabled") is False:
-            continue
         if registered not in known:
             raise SourceError(
                 f"{folder / name} has the step '{truncate(registered, 80)}'; {suggest(registered, known)}.",

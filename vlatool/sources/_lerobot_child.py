@@ -286,8 +286,8 @@ def write_tokenizer(name, out):
 def smolvla(policy, observation, values, out):
     """Return the graphs of SmolVLA with an example of their inputs, and the program."""
     config = policy.config
-    if config.adapt_to_pi_aloha or config.n_obs_steps != 1:
-        raise SystemExit("adapt_to_pi_aloha and more than one observation step are not supported")
+    if config.n_obs_steps != 1:
+        raise SystemExit("more than one observation step is not supported")
     prefix = Prefix(policy, observation, write_tokenizer(config.vlm_model_name, out))
     return flow(policy, prefix, dict(zip(observation.keys, values, strict=True)), config.num_steps)
 
@@ -419,6 +419,8 @@ def main(request):
     checkpoint, out = Path(request["checkpoint"]).resolve(), Path(request["out"]).resolve()
     config = PreTrainedConfig.from_pretrained(checkpoint, local_files_only=True)
     config.device = "cpu"
+    if hasattr(config, "adapt_to_pi_aloha"):
+        config.adapt_to_pi_aloha = False  # the robot's runtime does it: it is data of the spec
     if hasattr(config, "pretrained_backbone_weights"):
         config.pretrained_backbone_weights = None  # the checkpoint has all weights; nothing is downloaded
     for name, value in {"dtype": "float32", "compile_model": False, "gradient_checkpointing": False}.items():

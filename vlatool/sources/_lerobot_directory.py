@@ -203,7 +203,11 @@ def _description(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> dict[str, 
 def _tensor(feature: Feature) -> dict[str, Any]:
     if feature.kind == "VISUAL":
         return {"dtype": "uint8", "unit": "rgb"}
+    said = {"labels": list(feature.labels), "convert": list(feature.convert)}
+    more = {name: value for name, value in said.items() if value}
+    if any(step["op"] == "relative" for step in feature.convert):
+        more["mode"] = "absolute"  # what is relative in the network is a target once the state is added
     if feature.mode == "IDENTITY":
-        return {"dtype": "float32"}
+        return {"dtype": "float32", **more}
     how = {"normalisation": feature.mode.lower(), "epsilon": feature.epsilon}  # a spec calls the modes as LeRobot does
-    return {"dtype": "float32", **how, "statistics": f"statistics.json#{feature.key}"}
+    return {"dtype": "float32", **how, "statistics": f"statistics.json#{feature.key}", **more}

@@ -310,7 +310,7 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
 
     Each has a sample axis. The outputs are what the graphs say: the engine that the bundle is made for may compute
     something else. The samples follow each other without a reset between, so that what a program keeps shows in the
-    second. The chunk is the action in physical units: it shows other statistics, too.
+    second. The chunk is the action in physical units, before it is converted: it shows other statistics, too.
 
     Args:
         draft: the bundle as written so far; its graphs are what runs.
@@ -325,13 +325,18 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     own = _outputs(policy, samples, engine_class(policy.engine))
     arrays: dict[str, list[Any]] = {}
     for (observation, noise), action in zip(samples, expected, strict=True):
-        parts = (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", {name: action.chunk}))
+        parts = (
+            ("in", observation),
+            ("noise", noise),
+            ("out", action.outputs),
+            ("chunk", {name: policy.golden_chunk(action)}),
+        )
         for prefix, values in parts:
             for key, value in values.items():
                 arrays.setdefault(f"{prefix}.{key}", []).append(value)
     (out / GOLDEN).parent.mkdir(exist_ok=True)
     save_npz(out / GOLDEN, {key: np.stack([np.asarray(item) for item in items]) for key, items in arrays.items()})
-    of_chunk = _worst(policy.chunk_error(a.chunk, b.chunk) for a, b in zip(own, expected, strict=True))
+    of_chunk = _worst(policy.golden_difference(a, policy.golden_chunk(b)) for a, b in zip(own, expected, strict=True))
     largest = _worst(_largest(a.outputs[name], b.outputs[name]) for a, b in zip(own, expected, strict=True))
     return Golden(samples, expected, _worst(_differences(own, expected, name)), of_chunk, largest)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError, require
 from vlatool.files.rows import in_memory
 from vlatool.module.batched_program import BatchedProgram, draw_noise
+from vlatool.runtime.converter import action_converter
 from vlatool.runtime.interface import Array
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.training.frames import BLOCK_ROWS, Frames, new_array
@@ -76,7 +78,8 @@ class Expert:
         def write(target: Path) -> None:
             action = source.manifest.spec.action
             write_observations(encode, chosen, target, chosen.begins())
-            np.save(file_of(target, EXPERT + action.name), encoded_actions(action, source, chosen.actions))
+            states = None if (state := source.manifest.spec.reference) is None else chosen.inputs[state.name]
+            np.save(file_of(target, EXPERT + action.name), encoded_actions(action, source, chosen.actions, states))
             write_noise(source, len(chosen), (seed, CHOICE), target)
 
         if not self.frames.count:
@@ -112,13 +115,24 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
     return recording.subset(used)
 
 
-def encoded_actions(action: TensorSpec, source: Bundle, actions: Any) -> Array:
-    """Return recorded actions as a graph gives them: (N, T, A) normalised float32, or (N, T) int64 indices."""
+def encoded_actions(action: TensorSpec, source: Bundle, actions: Any, states: Any = None) -> Array:
+    """Return recorded actions as a graph gives them: (N, T, A) normalised float32, or (N, T) int64 indices.
+
+    Args:
+        states: (N, S) what they are relative to in the graph, where the spec says so.
+
+    Raises:
+        SpecError: when a step of ``convert`` cannot be undone.
+    """
     if action.kind == "discrete":
         return np.asarray(in_memory(actions), np.int64)
-    normaliser = load_normaliser(action, source)
     physical = np.asarray(in_memory(actions), np.float32)
-    return physical if normaliser is None else normaliser.forward(physical)
+    if not action.convert:
+        normaliser = load_normaliser(action, source)
+        return physical if normaliser is None else normaliser.forward(physical)
+    converter = action_converter(source.manifest.spec, source)
+    known = repeat(None) if states is None else np.asarray(in_memory(states), np.float32)
+    return np.stack([converter.to_network(chunk, state) for chunk, state in zip(physical, known, strict=False)])
 
 
 def write_noise(source: Bundle, rows: int, seed: Sequence[int], target: Path) -> None:

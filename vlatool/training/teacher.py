@@ -160,8 +160,8 @@ def _check_units(name: str, teacher: tuple[TensorSpec, Bundle], student: tuple[T
 
 
 def _unit(tensor: TensorSpec, _bundle: Bundle) -> Any:
-    """Unit or mode."""
-    return tensor.units(), tensor.mode
+    """Unit, mode, parts or conversions."""
+    return tensor.units(), tensor.mode, tensor.parts, tensor.convert
 
 
 def _statistics(tensor: TensorSpec, bundle: Bundle) -> Any:

@@ -128,10 +128,17 @@ def _of_action(policy: Policy, samples: Sequence[Sample], tolerance: float) -> I
     """Try what a wrong denormalisation would do."""
     if policy.spec.action.kind == "discrete":
         return
-    if policy.spec.action.normalisation != "none" and all(
-        policy.chunk_error(sample.raw.reshape(-1, sample.expected.shape[1])[: len(sample.expected)], sample.expected)
-        <= tolerance
-        for sample in samples
+    action = policy.spec.action
+    if (
+        action.normalisation != "none"
+        and action.width == samples[0].expected.shape[1]
+        and all(
+            policy.chunk_error(
+                sample.raw.reshape(-1, sample.expected.shape[1])[: len(sample.expected)], sample.expected
+            )
+            <= tolerance
+            for sample in samples
+        )
     ):
         yield "The denormalisation differs: the original gives the network's output as it is, still normalised."
         return
@@ -176,7 +183,7 @@ def _changes(policy: Policy) -> Iterator[tuple[str, Change]]:
     inputs = policy.spec.inputs
     for tensor in inputs:
         name = tensor.name
-        if tensor.kind != "text" and tensor.normalisation != "none":
+        if tensor.kind != "text" and tensor.normalisation != "none" and not tensor.convert:
             words = f"The normalisation of '{name}' differs: the original takes it as it is, this policy with "
             yield words + f"{tensor.normalisation}.", _as_it_is(name)
         axis = _channels_axis(tensor)
@@ -225,7 +232,7 @@ def _equal(policy: Policy, samples: Sequence[Sample], change: Change, tolerance:
     for sample in chosen:
         try:
             values = policy.program.run({name: value.copy() for name, value in change(sample).items()}, sample.noise)
-            chunk = policy.decode(values[policy.spec.action.name])
+            chunk = policy.decode(values[policy.spec.action.name], sample.encoded)
         except VlatoolError:
             return False
         if (

@@ -79,7 +79,8 @@ def _sample(
 ) -> Sample:
     steps = policy.bundle.manifest.program
     noise = {name: draw(expected, random) for step in steps for name, expected in step.noise.items()}
-    encoded = {name: value.copy() for name, value in policy.encode(observation).items()}
+    encoded = policy.encode(observation)
+    encoded.update({name: value.copy() for name, value in encoded.items()})
     action = policy.infer(observation, noise=noise)
     expected = original.act(observation, noise, number)
     chunk = action.chunk.astype(expected.dtype)[: len(expected)]
@@ -95,7 +96,7 @@ def _elements(spec: PolicySpec, samples: list[Sample]) -> list[dict[str, Any]]:
     """Return the largest difference of each element of the action, and where it is."""
     if spec.action.kind == "discrete":
         return []
-    labels = spec.action.labels or tuple(str(index) for index in range(spec.action.width))
+    labels = spec.action.labels or tuple(str(index) for index in range(spec.action.robot_width))
     errors = np.stack([np.abs(sample.chunk - sample.expected).max(axis=0) for sample in samples])
     sizes = np.max([np.abs(sample.expected).max(axis=0) for sample in samples], axis=0)
     rows = []

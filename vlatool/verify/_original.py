@@ -123,7 +123,7 @@ class Original:
 
     def _chunk(self, answer: Any, number: int) -> Array:
         array, action = self._array(answer, "act()", number), self._spec.action
-        width, most = action.width, self._spec.chunk
+        width, most = action.robot_width, self._spec.chunk
         wide = array if array.ndim else array[None]
         if wide.shape[-1] != width or not 1 <= wide.size // width <= most:
             raise SourceError(

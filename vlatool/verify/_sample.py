@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.runtime.interface import Array
+from vlatool.runtime.observation import EncodedObservation
 from vlatool.runtime.policy import Policy
 
 MAX_ERROR = 1e9
@@ -33,7 +34,7 @@ class Sample:
     number: int
     observation: dict[str, Any]
     noise: dict[str, Array]
-    encoded: dict[str, Array]
+    encoded: EncodedObservation
     raw: Array
     chunk: Array
     expected: Array

@@ -179,5 +179,6 @@ def _output_spreads(policy: Policy, base: NDArray[np.float64]) -> NDArray[np.flo
     """Return the training deviation of each element of the action; that over the observations where not known."""
     action = policy.spec.action
     normaliser = None if action.kind == "discrete" else load_normaliser(action, policy.bundle)
-    spread = base.std(axis=0) if normaliser is None else normaliser.scale.astype(np.float64)
+    known = normaliser is not None and not action.convert
+    spread = normaliser.scale.astype(np.float64) if normaliser is not None and known else base.std(axis=0)
     return np.where(spread > 0, spread, 1.0)

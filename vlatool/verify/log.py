@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.bundle.spec import TensorSpec
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import Recording, read_recording, recordings_of
 from vlatool.errors import DataError
 from vlatool.machine.host import fingerprint
@@ -126,10 +126,15 @@ def verify_log(bundle: Bundle, options: LogOptions, context: Context) -> Report:
     context.progress("comparing inputs", None)
     references = [read_recording(path, spec) for path in _references(bundle, options)]
     found, paired = explain_inputs(bundle, log, references, own=options.reference is None)
-    if bundle.manifest.graphs:
+    if bundle.manifest.graphs and not _shifts_actions(spec, found):
         context.progress("comparing commands", None)
         found += explain_actions(Policy.open(bundle, threads=1, seed=0), log, options.samples)
     return _report(bundle, options, log, found, paired)
+
+
+def _shifts_actions(spec: PolicySpec, found: Sequence[Explanation]) -> bool:
+    """Return whether the state that actions are relative to is wrong, which alone makes them other actions."""
+    return spec.reference is not None and any(each.signal == spec.reference.name for each in found)
 
 
 def explain_inputs(

@@ -1,9 +1,11 @@
 """Make a LeRobot checkpoint with random weights, and record what its policy does; run in the Python that has LeRobot.
 
-    python _lerobot_checkpoints.py act|diffusion-ddim|diffusion-ddpm|smolvla|pi0 FOLDER [--small] [--steps 50]
+    python _lerobot_checkpoints.py act|diffusion-ddim|diffusion-ddpm|smolvla|pi0[-relative] FOLDER [--small] [--steps N]
 
 Writes ``FOLDER/checkpoint`` and ``FOLDER/episode.npz``: the observations of an episode (N, ...), the actions (N, A) of
-``select_action`` with LeRobot's own processors around it, and the noise that each inference drew.
+``select_action`` with LeRobot's own processors around it, and the noise that each inference drew. The actions of a kind
+``-relative`` are differences from the state but for the grippers; as in LeRobot's real-time chunking, all of a chunk
+are added to the state that it was inferred for.
 """
 
 import argparse
@@ -121,16 +123,33 @@ def observation(config, generator, still):
     return raw
 
 
+def processors(config, stats, relative):
+    """Return what stands before and behind the policy, with relative actions where that is asked for."""
+    from lerobot.processor import AbsoluteActionsProcessorStep, RelativeActionsProcessorStep
+
+    before, after = make_pre_post_processors(config, dataset_stats=stats)
+    if relative:
+        names = [f"{side}_{joint}" for side in ("left", "right") for joint in (*map(str, range(6)), "Gripper")]
+        step = RelativeActionsProcessorStep(enabled=True, exclude_joints=["gripper"], action_names=names)
+        kinds = [type(each).__name__ for each in before.steps]
+        before.steps.insert(kinds.index("NormalizerProcessorStep"), step)
+        after.steps.insert(1, AbsoluteActionsProcessorStep(enabled=True, relative_step=step))
+    return before, after
+
+
 def main(kind, folder, small, steps):
     """Write the checkpoint and the episode."""
+    relative, kind = kind.endswith("-relative"), kind.removesuffix("-relative")
     torch.manual_seed(0)
     folder.mkdir(parents=True, exist_ok=True)
     make = {"act": lambda: act(small), "smolvla": lambda: smolvla(folder), "pi0": lambda: pi0(folder, small)}
     policy = make.get(kind, lambda: diffusion(kind.rpartition("-")[2].upper(), small))().eval()
     config, stats = policy.config, statistics(policy.config)
-    before, after = make_pre_post_processors(config, dataset_stats=stats)
+    before, after = processors(config, stats, relative)
     for part in (policy, before, after):
         part.save_pretrained(folder / "checkpoint")
+    before, after = make_pre_post_processors(config, pretrained_path=folder / "checkpoint")
+    anchors = [step for step in before.steps if type(step).__name__ == "RelativeActionsProcessorStep"]
     generator, drawn = torch.Generator().manual_seed(5), []
 
     def noise(shape, *_, **__):
@@ -144,7 +163,7 @@ def main(kind, folder, small, steps):
     elif kind != "act":
         scheduler = sys.modules[type(policy.diffusion.noise_scheduler).__module__]
         replaced.append(mock.patch.object(scheduler, "randn_tensor", noise))
-    seen, actions, counts = [], [], []
+    seen, actions, counts, state = [], [], [], None
     policy.reset()
     with torch.no_grad():
         for _ in range(steps):
@@ -159,6 +178,10 @@ def main(kind, folder, small, steps):
             with mock.patch.object(torch, "randn", real):
                 batch = before(fed)
             chosen = _with(replaced, policy, batch) if kind.startswith("diffusion") else policy.select_action(batch)
+            for anchor in anchors:
+                infers = len(seen) % config.n_action_steps == 0
+                state = anchor._last_state if infers else state
+                anchor._last_state = state
             actions.append(after(chosen)[0].numpy())
             counts.append(len(drawn) - start)
             seen.append(raw)
@@ -178,7 +201,8 @@ def _with(replaced, policy, batch):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kind", choices=("act", "diffusion-ddim", "diffusion-ddpm", *TEXT_KINDS))
+    kinds = ("act", "diffusion-ddim", "diffusion-ddpm", *TEXT_KINDS)
+    parser.add_argument("kind", choices=(*kinds, *(f"{kind}-relative" for kind in kinds)))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--small", action="store_true")
     parser.add_argument("--steps", type=int, default=50)

@@ -21,7 +21,7 @@ import numpy as np
 
 import vlatool
 
-KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla", "pi0")
+KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla", "pi0", "act-relative", "diffusion-ddim-relative")
 LIMIT = 1e-4
 MAKE = Path(__file__).with_name("_lerobot_checkpoints.py")
 SMALL = Path(__file__).with_name("_small_pi0.py")
