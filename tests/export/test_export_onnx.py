@@ -538,4 +538,4 @@ def test_a_mismatch_names_the_node_and_its_module(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     bundle = source.run(None, tmp_path / "source", Context()).bundle
     with pytest.raises(GraphError, match=r"they differ from the node 'inner\.linear/Gemm' of the graph 'main' on"):
-        ExportOnnx().run(bundle, tmp_path / "out", Context())
+        ExportOnnx(exporter="dynamo").run(bundle, tmp_path / "out", Context())
