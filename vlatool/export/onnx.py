@@ -19,6 +19,7 @@ from vlatool.errors import GraphError, RecipeError, SourceError, VlatoolError, r
 from vlatool.files.validate import short_repr
 from vlatool.graph.float32_conversion import ROUNDING, describe_conversion, rewrite_as_float32
 from vlatool.graph.loop_invariants import changing_feeds, compute_once, cut_loop_invariants, name_of_once
+from vlatool.graph.opsets import fit_file
 from vlatool.machine.engine_calls import engine_call
 from vlatool.module.divergence import first_divergence
 from vlatool.module.edits import is_changed
@@ -44,11 +45,13 @@ from vlatool.stage.precision_shares import count_shares
 from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from vlatool.hardware.profile import Profile
 
 
 LOWEST_OPSET = 18
-"""Lowest opset of torch's dynamo exporter."""
+"""Lowest opset of torch's dynamo exporter; graphs are written in an older one afterwards."""
 RANDOM_OBSERVATIONS = 4
 """Random observations on which each graph is compared with its module, beside the recorded ones."""
 RANDOM_SEED = 1
@@ -78,14 +81,15 @@ class ExportOnnx(Transform):
     )
     loop_invariants: bool = Field(True, description="compute once what is alike in all repeats of a graph")
 
+    def on(self, board: Profile | None) -> Self:
+        """Return the stage with an opset that the board's preferred engine takes, where the default is too new."""
+        limit = board.engines[board.engine].opset if board else None
+        return self.unless_given({"opset": int(limit.value)} if limit and limit.value < OPSET else {})
+
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """What exports is installed: the child process that imports it takes seconds to say so."""
         for module in ("torch", "onnxscript", "onnx"):
             require_present(module, "build")
-        if self.opset < LOWEST_OPSET:
-            raise RecipeError(
-                f"opset = {self.opset}: torch exports opset {LOWEST_OPSET} and later.", "leave --opset out"
-            )
         if self.shape:
             raise RecipeError(
                 "--shape gives the free axes of an ONNX file their lengths; a torch policy has none.",
@@ -100,6 +104,7 @@ class ExportOnnx(Transform):
         gone = {name: rewrite_as_float32(out / graph.file) for name, graph in graphs.items()}
         messages = notes
         for name, graph in graphs.items():
+            fit_file(out / graph.file, self.opset, None)
             shares, uncounted = count_shares(out / graph.file)
             graphs[name], messages = replace(graph, precision=shares), messages + uncounted
         carry_over(source, out)
@@ -174,7 +179,7 @@ class ExportOnnx(Transform):
         feeds = [np.asarray(feed, order="C") for feed in (session.first_feeds or {}).values()]
         arguments = tuple(map(torch.from_numpy, feeds))
         exporters = tuple(EXPORTERS) if self.exporter == "auto" else (self.exporter,)
-        exported = proven_export(session, arguments, self.opset, self.tolerance, exporters)
+        exported = proven_export(session, arguments, max(self.opset, LOWEST_OPSET), self.tolerance, exporters)
         (out / "graphs").mkdir(exist_ok=True)
         beside = beside or weight_bytes(session.module) > EXTERNAL_DATA_BYTES
         graphs = {name: Graph(f"graphs/{name}.onnx", {"float32": 1.0}, self.opset)}

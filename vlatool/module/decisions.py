@@ -50,11 +50,11 @@ def decisions_of(run: Callable[[], Any]) -> Decisions:
     class Reading(require("torch.overrides", "build").TorchFunctionMode):  # type: ignore[misc]
         def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
             result = func(*args, **(kwargs or {}))
-            place = _place() if getattr(func, "__name__", "") in READERS or _is_discrete(result) else ""
+            line = _line() if getattr(func, "__name__", "") in READERS or _is_discrete(result) else ""
             if _is_discrete(result):
-                found.values.append((place, result))
+                found.values.append((line, result))
             if getattr(func, "__name__", "") in READERS:
-                found.readers[place] = None
+                found.readers[line] = None
             return result
 
     with Reading():
@@ -67,7 +67,7 @@ def _is_discrete(value: Any) -> bool:
     return all(map(_is_discrete, value)) if isinstance(value, list | tuple) else isinstance(value, int)
 
 
-def _place() -> str:
+def _line() -> str:
     """Return file and line of the policy's code, or of a library that it calls."""
     frame = sys._getframe(2)
     while is_tool(frame) and frame.f_back is not None:

@@ -42,7 +42,7 @@ MAX_CALLS = 12
 """Calls of a module on which its graph is compared with it."""
 MAX_BYTES = 1 << 29
 """Bytes of these calls; two are always kept."""
-SAME = 2.0**-22
+LEAST_DIFFERENCE = 2.0**-22
 """Largest difference of an element of outputs that count as the same: two roundings of a float32 near 1."""
 NUDGE = 1e-6
 """Relative change of an input after which a function that does not jump gives the same."""
@@ -98,9 +98,9 @@ class CalledSession(TorchSession):
     def _remember(self, feeds: Mapping[str, Any], outputs: Mapping[str, Any]) -> None:
         size = sum(np.asarray(value).nbytes for value in (*feeds.values(), *outputs.values()))
         limit = min(MAX_CALLS, max(2, MAX_BYTES // max(size, 1)))
-        place = self._count if self._count < limit else int(self._random.integers(1, self._count + 1))
-        if place < limit:
-            self.calls[place : place + 1] = [(feeds, outputs)]
+        index = self._count if self._count < limit else int(self._random.integers(1, self._count + 1))
+        if index < limit:
+            self.calls[index : index + 1] = [(feeds, outputs)]
         self._count += 1
 
 
@@ -211,7 +211,7 @@ def difference(got: Any, expected: Any) -> float:
     if got.shape != expected.shape or not np.array_equal(got[~finite], expected[~finite]):
         return float("inf")
     one, other = got[finite].astype(np.float64), expected[finite].astype(np.float64)
-    return 0.0 if np.max(np.abs(one - other), initial=0.0) <= SAME else relative_error(one, other)
+    return 0.0 if np.max(np.abs(one - other), initial=0.0) <= LEAST_DIFFERENCE else relative_error(one, other)
 
 
 def _jumps(session: CalledSession, feeds: Mapping[str, Any], expected: Any, name: str, allowed: float) -> bool:
@@ -253,4 +253,4 @@ def _readers(session: CalledSession) -> tuple[str, ...]:
                 "of them.",
                 "decide with torch.where() instead of 'if', a fixed number of turns instead of 'while'",
             )
-    return tuple(dict.fromkeys(place for each in found for place in each.readers))
+    return tuple(dict.fromkeys(line for each in found for line in each.readers))

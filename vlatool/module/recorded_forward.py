@@ -46,7 +46,7 @@ def record_forward(module: nn.Module, arguments: Sequence[Any], graph: str) -> A
     with _module_calls(recorder.call), recorder:
         result = module(*given)
     outputs = result if isinstance(result, tuple | list) else [result]
-    recorder.graph.output(tuple(recorder.written(value) for value in outputs))
+    recorder.graph.output(tuple(recorder.as_nodes(value) for value in outputs))
     return fx.GraphModule(recorder.attributes, recorder.graph).eval()
 
 
@@ -112,7 +112,7 @@ def _recorder(module: nn.Module, parts: Mapping[int, str]) -> Any:
                 if _holds_tensor(torch, item):
                     self.define(item, self.graph.call_function(get, (node, key)))
 
-        def written(self, value: Any) -> Any:
+        def as_nodes(self, value: Any) -> Any:
             """Return a value with nodes in the place of its tensors."""
             return torch.utils._pytree.tree_map_only(torch.Tensor, self._node, value)
 
@@ -121,7 +121,7 @@ def _recorder(module: nn.Module, parts: Mapping[int, str]) -> Any:
             if self._inside or id(part) not in parts:
                 return run()
             self.attributes[parts[id(part)]] = part
-            node = self.graph.call_module(parts[id(part)], self.written(args), self.written(kwargs))
+            node = self.graph.call_module(parts[id(part)], self.as_nodes(args), self.as_nodes(kwargs))
             self._inside = True
             try:
                 result = run()
@@ -135,9 +135,9 @@ def _recorder(module: nn.Module, parts: Mapping[int, str]) -> Any:
             if self._inside:
                 return result
             if getattr(func, "__name__", "") == "__setitem__":
-                self.graph.call_function(operator.setitem, self.written(args))
+                self.graph.call_function(operator.setitem, self.as_nodes(args))
             elif _holds_tensor(torch, result):
-                self.define(result, self._called(func, self.written(args), self.written(dict(kwargs or {}))))
+                self.define(result, self._called(func, self.as_nodes(args), self.as_nodes(dict(kwargs or {}))))
             return result
 
         def _node(self, tensor: Any) -> Any:
