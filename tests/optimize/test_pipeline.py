@@ -516,12 +516,12 @@ def test_the_limit_on_calls_of_an_environment_reaches_the_episodes(model, tmp_pa
 
 
 def test_calibration_data_is_found_beside_the_description(policy_dir, model):
-    assert brings_calibration(str(policy_dir))
-    assert brings_calibration(str(model))
+    assert brings_calibration(source_stage(str(policy_dir)))
+    assert brings_calibration(source_stage(str(model)))
     (policy_dir / "calibration.npz").unlink()
-    assert not brings_calibration(str(policy_dir))
+    assert not brings_calibration(source_stage(str(policy_dir)))
     (policy_dir / "policy.yaml").unlink()
-    assert not brings_calibration(str(model))
+    assert not brings_calibration(source_stage(str(model)))
 
 
 def test_a_source_with_graphs_is_not_exported_again(model, tmp_path):

@@ -13,7 +13,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import crew, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
 from vlatool.cli._document import document, put, report_document
-from vlatool.cli._options import Force, Workers
+from vlatool.cli._options import Force, MapNames, Workers
 from vlatool.cli._plan import plan_document
 from vlatool.cli._proposal import propose
 from vlatool.cli._torchrun import launch_for
@@ -68,6 +68,12 @@ EveryCandidate = Annotated[
 StudyPlace = Annotated[
     str | None, typer.Option(help="file or database URL that stores the trials, so that several machines share them")
 ]
+Calibration = Annotated[
+    Path | None, typer.Option(help="recording or dataset to calibrate with, instead of what policy.yaml names")
+]
+Evaluation = Annotated[
+    Path | None, typer.Option(help="recording or dataset to evaluate on; of --calibration a half is held out if unset")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout: the report, or the plan with --dry-run")]
 
 
@@ -75,6 +81,9 @@ def optimize(
     source: PolicySource,
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)],
     profile: Board = None,
+    calibration: Calibration = None,
+    evaluation: Evaluation = None,
+    map_names: MapNames = None,
     max_drop: Drop = None,
     max_distance: Distance = None,
     max_motion: Motion = None,
@@ -109,13 +118,16 @@ def optimize(
     better than actions that ignore the observation, so that it cannot serve as a reference.
     """
     from vlatool.hardware.profile import load_profile
+    from vlatool.module.source import RecordingOptions
     from vlatool.optimize import pipeline
     from vlatool.optimize.plan import make_plan
+    from vlatool.sources import brings_calibration, source_stage
     from vlatool.stage.run import cache_directory
 
     launch_for("vlatool optimize", trains=False)
     if not dry_run:
-        refuse_existing(output, force, source, recipe, file_or_none(profile), cache, kind=BUNDLE)
+        inputs = (source, recipe, file_or_none(profile), cache, calibration, evaluation)
+        refuse_existing(output, force, *inputs, kind=BUNDLE)
     board = load_profile(profile) if profile else None
     limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
     shares = {"max_distance": max_distance, "max_motion": max_motion, "worst_task": worst_task}
@@ -124,11 +136,14 @@ def optimize(
         "episodes": episodes, "iterations": iterations, "threads": threads, "every_candidate": every_candidate,
         "environment_timeout": environment_timeout,
     }  # fmt: skip
-    chosen = _recipe(recipe, source, board, asked, {name: value for name, value in effort.items() if value is not None})
+    recordings = RecordingOptions(str(calibration or ""), str(evaluation or ""), tuple(map_names or ()))
+    calibrated = brings_calibration(source_stage(source).with_recordings(recordings))
+    given = {name: value for name, value in effort.items() if value is not None}
+    chosen = _recipe(recipe, calibrated, board, asked, given)
     chosen = chosen.model_copy(update={"pruning": _pruning(chosen.pruning, trials, train_steps, study)})
     if search is not None:
         chosen = chosen.model_copy(update={"search": search})
-    plan = make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
+    plan = make_plan(source, board, chosen, cache or cache_directory(), recordings, fresh=fresh)
     if dry_run:
         _show_plan(plan, as_json)
         return
@@ -160,16 +175,15 @@ def _limits(
 
 
 def _recipe(
-    file: Path | None, source: str, board: Profile | None, limits: dict[str, Any], effort: dict[str, Any]
+    file: Path | None, calibrated: bool, board: Profile | None, limits: dict[str, Any], effort: dict[str, Any]
 ) -> Recipe:
     """Return the recipe of a file, or the default one, with the limits and the effort that were given."""
     from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
-    from vlatool.sources import brings_calibration
 
     if file is None:
         engine = board.engine if board else DEFAULT_ENGINE
         features = board.units[board.engines[engine].unit].isa if board else isa() or ()
-        return default_recipe(Limits(**limits), Effort(**effort), brings_calibration(source), engine, features)
+        return default_recipe(Limits(**limits), Effort(**effort), calibrated, engine, features)
     recipe = read_recipe(file)
     update = {"limits": recipe.limits.model_copy(update=limits), "effort": recipe.effort.model_copy(update=effort)}
     return recipe.model_copy(update=update)

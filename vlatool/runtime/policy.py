@@ -91,7 +91,8 @@ class BundlePolicy:
             name: open_graph(bundle, graph, session, threads) for name, graph in manifest.graphs.items()
         }
         check_graphs(manifest, sessions, limit_mb)
-        return cls(bundle, Program(manifest.program, sessions, seed), engine)
+        outputs = [tensor.name for tensor in manifest.spec.outputs]
+        return cls(bundle, Program(manifest.program, sessions, seed, outputs), engine)
 
     @functools.cached_property
     def identity(self) -> str:
