@@ -43,7 +43,7 @@ class Tensorrt(Transform):
     """Write a bundle that TensorRT engines are built of on the board: graphs as its ONNX parser takes them, and a plan.
 
     Pairs of quantize/dequantize become int8 around 0 with per-channel weights on axis 0 and float biases. Operators and
-    types are held against the published list of TensorRT 10.1. tensorrt/build.sh calls trtexec, tensorrt/build.py
+    types are compared with the published list of TensorRT 10.1. tensorrt/build.sh calls trtexec, tensorrt/build.py
     TensorRT's Python: strongly typed, with shapes and workspace of tensorrt/plan.json. An engine is bound to its card
     and release; it is built here only if tensorrt is installed. The actions are compared in ONNX Runtime.
     """
