@@ -65,7 +65,7 @@ Export = Callable[..., Bundle]
 
 @pytest.fixture
 def export(tmp_path: Path) -> Export:
-    """A function that exports the policy whose ``forward`` has this body."""
+    """A function that exports the policy whose ``forward`` has this body, with dynamo alone."""
 
     def run(body: str, description: str = YAML, takes: str = "x") -> Bundle:
         folder, out = tmp_path / "policy", tmp_path / "out"
@@ -79,7 +79,7 @@ def export(tmp_path: Path) -> Export:
         (folder / "policy.py").write_text(code)
         (folder / "policy.yaml").write_text(description)
         source = TorchModule(policy=folder).run(None, tmp_path / "source", Context()).bundle
-        return ExportOnnx().run(source, out, Context()).bundle
+        return ExportOnnx(exporter="dynamo").run(source, out, Context()).bundle
 
     return run
 

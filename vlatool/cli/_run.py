@@ -115,6 +115,20 @@ def transform(
     else:
         typer.echo("\n  ".join(_lines(result.bundle, out, before, (*messages, *result.messages), on_board)))
     _refuse(result.bundle, source if isinstance(opened, Bundle) else "")
+    _refuse_newer(result.bundle, board)
+
+
+def _refuse_newer(bundle: Bundle, board: Profile | None) -> None:
+    """Fail when a graph has an opset that the board's engine does not take; the bundle stays where it is."""
+    limit = board.engines[board.engine].opset if board else None
+    newer = {name: graph.opset for name, graph in bundle.manifest.graphs.items() if limit and graph.opset > limit.value}
+    if board and limit and newer:
+        graphs = ", ".join(f"{name} has opset {opset}" for name, opset in newer.items())
+        raise GateFailed(
+            f"{bundle.path} was written, but {board.engine} on {board.name} takes opset {limit.value:g} at most: "
+            f"{graphs}.",
+            f"vlatool export opset {bundle.path} --profile {board.name} -o NEW",
+        )
 
 
 def _board(profile: str | None) -> Profile | None:
@@ -141,7 +155,7 @@ def _start(
 
     if isinstance(opened, Bundle):
         return stage, opened, ()
-    if stage.kind() == "export" and opened.has_graphs:
+    if stage.kind() == "export" and stage.takes_modules and opened.has_graphs:
         return _graph_source(stage, opened), None, ()
     start = source_bundle(opened, cache_directory(), context)
     if not _takes_source(stage, start.bundle):
@@ -209,6 +223,8 @@ def _difference(bundle: Bundle) -> Iterator[str]:
 def _graph_source(export: Transform, source: Source) -> Transform:
     """Return the source of a policy that is graphs, all the export that there is, with the options of that export."""
     asked = export.model_fields_set & set(type(source).model_fields)
+    if "exporter" in export.model_fields_set - asked:
+        raise UsageError("--exporter: this policy is a file that torch does not export.", "leave --exporter out")
     return source.model_copy(update={name: getattr(export, name) for name in asked})
 
 

@@ -1,11 +1,12 @@
-"""ONNX through torch's dynamo exporter, believed only after ONNX Runtime ran it."""
+"""ONNX through torch's exporters, believed only after ONNX Runtime ran it."""
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,24 +14,23 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.program import ProgramStep
-from vlatool.data import observations_for
-from vlatool.errors import GraphError, RecipeError, SourceError, require, require_present
+from vlatool.data import observations_for, synthetic_observations
+from vlatool.errors import GraphError, RecipeError, SourceError, VlatoolError, require, require_present
 from vlatool.files.validate import short_repr
 from vlatool.graph.float32_conversion import ROUNDING, describe_conversion, rewrite_as_float32
 from vlatool.graph.loop_invariants import changing_feeds, compute_once, cut_loop_invariants, name_of_once
+from vlatool.graph.opsets import fit_file
 from vlatool.machine.engine_calls import engine_call
 from vlatool.module.divergence import first_divergence
 from vlatool.module.edits import is_changed
-from vlatool.module.folding import fold_weights
+from vlatool.module.exporters import EXPORTERS
 from vlatool.module.memory import refuse_kept_values
+from vlatool.module.proven_export import WHERE_DIFFERENT, CalledSession, proven_export
 from vlatool.module.sharded_weights import graph_weights, stored_modules, takes_shards, weights_on_demand
 from vlatool.module.to_onnx import (
     EXTERNAL_DATA_BYTES,
     IMPORTS,
     OPSET,
-    exported_by_torch,
-    name_by_module,
-    strip_notes,
     weight_bytes,
 )
 from vlatool.module.torch_policy import TorchSession, load_modules
@@ -45,38 +45,51 @@ from vlatool.stage.precision_shares import count_shares
 from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from vlatool.hardware.profile import Profile
 
 
 LOWEST_OPSET = 18
-"""Lowest opset of torch's dynamo exporter."""
+"""Lowest opset of torch's dynamo exporter; graphs are written in an older one afterwards."""
+RANDOM_OBSERVATIONS = 4
+"""Random observations on which each graph is compared with its module, beside the recorded ones."""
+RANDOM_SEED = 1
 
 
 class ExportOnnx(Transform):
-    """Export every graph of a torch policy to ONNX (dynamo exporter, static shapes).
+    """Export every graph of a torch policy to ONNX (static shapes).
 
-    The files are accepted only after ONNX Runtime has loaded them and, through the policy's whole program, given the
-    same results as torch on calibration observations.
+    torch's exporters are tried in turn: dynamo; split, which records what forward() does between its modules and
+    exports these with dynamo; the legacy one; and a trace. A graph is accepted only after ONNX Runtime has loaded it
+    and given the same outputs as torch on recorded and random inputs, and the bundle only after that of its whole
+    program on calibration observations.
     """
 
     takes_modules: ClassVar[bool] = True
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
     imports: ClassVar[tuple[str, ...]] = IMPORTS
 
-    opset: int = Field(OPSET, ge=7, le=23, description="opset of the default ONNX domain; of a torch policy from 18")
+    opset: int = Field(
+        OPSET, ge=7, le=23, description="opset of the default ONNX domain; what torch exports is lowered below 18"
+    )
     shape: tuple[str, ...] = Field((), description="lengths of an ONNX file's free axes: NAME=1,3,224,224")
     samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")
     tolerance: float = Field(1e-3, gt=0, description="largest relative L2 difference between torch and ONNX Runtime")
+    exporter: Literal["auto", "dynamo", "split", "legacy", "trace"] = Field(
+        "auto", description="exporter of torch; auto: the first whose graphs give what torch gives"
+    )
     loop_invariants: bool = Field(True, description="compute once what is alike in all repeats of a graph")
+
+    def on(self, board: Profile | None) -> Self:
+        """Return the stage with an opset that the board's preferred engine takes, where the default is too new."""
+        limit = board.engines[board.engine].opset if board else None
+        return self.unless_given({"opset": int(limit.value)} if limit and limit.value < OPSET else {})
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """What exports is installed: the child process that imports it takes seconds to say so."""
         for module in ("torch", "onnxscript", "onnx"):
             require_present(module, "build")
-        if self.opset < LOWEST_OPSET:
-            raise RecipeError(
-                f"opset = {self.opset}: torch exports opset {LOWEST_OPSET} and later.", "leave --opset out"
-            )
         if self.shape:
             raise RecipeError(
                 "--shape gives the free axes of an ONNX file their lengths; a torch policy has none.",
@@ -87,10 +100,11 @@ class ExportOnnx(Transform):
         """Export, run, compare, and write the bundle."""
         check_chunk(source.manifest.spec)
         observations = observations_for(source, self.samples)
-        expected, graphs, program = self._run_and_export(source, observations, out, context)
+        expected, graphs, program, notes = self._run_and_export(source, observations, out, context)
         gone = {name: rewrite_as_float32(out / graph.file) for name, graph in graphs.items()}
-        messages: tuple[str, ...] = ()
+        messages = notes
         for name, graph in graphs.items():
+            fit_file(out / graph.file, self.opset, None)
             shares, uncounted = count_shares(out / graph.file)
             graphs[name], messages = replace(graph, precision=shares), messages + uncounted
         carry_over(source, out)
@@ -107,30 +121,32 @@ class ExportOnnx(Transform):
 
     def _run_and_export(
         self, bundle: Bundle, observations: list[dict[str, Any]], out: Path, context: Context
-    ) -> tuple[list[Any], dict[str, Graph], tuple[ProgramStep, ...]]:
-        """Return what torch gives, the graphs, and the program that runs them; no module is in memory afterwards.
+    ) -> tuple[list[Any], dict[str, Graph], tuple[ProgramStep, ...], tuple[str, ...]]:
+        """Return what torch gives, the graphs, the program that runs them, and notes; no module is in memory then.
 
         A pruned policy whose weights stay in shards may be too large to be there as a whole: it runs with one weight at
         a time, and the weights of one graph are read to export it, which go into a file of their own.
         """
         stored = stored_modules(bundle) if is_changed(bundle) and takes_shards(bundle) else None
         modules = stored.modules if stored else load_modules(bundle)
-        sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
+        sessions = {step.graph: CalledSession(modules[step.graph], step) for step in bundle.manifest.program}
         context.progress("running the torch policy", None)
         with weights_on_demand(stored) if stored else contextlib.nullcontext():
             expected = self._actions(bundle, sessions, observations)
             for session in sessions.values():
                 refuse_kept_values(session.module, session.step, session.last_feeds)
-        graphs, program = dict[str, Graph](), bundle.manifest.program
+            with contextlib.suppress(VlatoolError):  # what the policy does not answer is not compared
+                self._actions(bundle, sessions, synthetic_observations(bundle, RANDOM_OBSERVATIONS, RANDOM_SEED))
+        graphs, program, notes = dict[str, Graph](), bundle.manifest.program, tuple[str, ...]()
         for number, (name, session) in enumerate(sessions.items()):
             context.progress(f"exporting {name}", number / len(sessions))
             with graph_weights(stored, name) if stored else contextlib.nullcontext():
-                made, program = self._export(name, session, program, out, beside=stored is not None)
-            graphs |= made
-        return expected, graphs, program
+                made, program, said = self._export(name, session, program, out, beside=stored is not None)
+            graphs, notes = graphs | made, (*notes, *said)
+        return expected, graphs, program, notes
 
     def _actions(
-        self, bundle: Bundle, sessions: dict[str, TorchSession], observations: list[dict[str, Any]]
+        self, bundle: Bundle, sessions: Mapping[str, TorchSession], observations: list[dict[str, Any]]
     ) -> list[Any]:
         """Return the raw action of each observation."""
         spec = bundle.manifest.spec
@@ -154,19 +170,17 @@ class ExportOnnx(Transform):
         return [run(number, observation) for number, observation in enumerate(observations)]
 
     def _export(
-        self, name: str, session: TorchSession, program: tuple[ProgramStep, ...], out: Path, beside: bool
-    ) -> tuple[dict[str, Graph], tuple[ProgramStep, ...]]:
-        """Write a graph, and one of what it would compute anew in each repeat; return both, and the program."""
-        torch = require("torch", "build")
+        self, name: str, session: CalledSession, program: tuple[ProgramStep, ...], out: Path, beside: bool
+    ) -> tuple[dict[str, Graph], tuple[ProgramStep, ...], tuple[str, ...]]:
+        """Write a graph, and one of what it would compute anew in each repeat; return both, the program, and notes."""
+        torch, ir = require("torch", "build"), require("onnx_ir", "build")
         for module in ("onnxscript", "onnx"):
             require(module, "build")
         feeds = [np.asarray(feed, order="C") for feed in (session.first_feeds or {}).values()]
         arguments = tuple(map(torch.from_numpy, feeds))
-        exported = exported_by_torch(session.module, arguments, session.step, self.opset)
+        exporters = tuple(EXPORTERS) if self.exporter == "auto" else (self.exporter,)
+        exported = proven_export(session, arguments, max(self.opset, LOWEST_OPSET), self.tolerance, exporters)
         (out / "graphs").mkdir(exist_ok=True)
-        fold_weights(exported.model)
-        name_by_module(exported.model)
-        strip_notes(exported.model)
         beside = beside or weight_bytes(session.module) > EXTERNAL_DATA_BYTES
         graphs = {name: Graph(f"graphs/{name}.onnx", {"float32": 1.0}, self.opset)}
         changing = changing_feeds(program, name) if self.loop_invariants else None
@@ -175,11 +189,10 @@ class ExportOnnx(Transform):
             once = name_of_once(program, name)
             graphs[once] = replace(graphs[name], file=f"graphs/{once}.onnx")
             program = compute_once(program, name, once, cut)
-            require("onnx_ir", "build").save(
-                cut.model, str(out / graphs[once].file), external_data=f"{once}.onnx.data" if beside else None
-            )
-        exported.save(str(out / graphs[name].file), external_data=beside)
-        return graphs, program
+            ir.save(cut.model, str(out / graphs[once].file), external_data=f"{once}.onnx.data" if beside else None)
+        data = f"{name}.onnx.data" if beside else None
+        ir.save(exported.model, str(out / graphs[name].file), external_data=data)
+        return graphs, program, exported.notes(name, len(session.calls))
 
     def _compare(
         self, source: Bundle, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any],
@@ -198,8 +211,7 @@ class ExportOnnx(Transform):
                 raise GraphError(
                     f"ONNX Runtime and torch differ on calibration sample {number}: relative L2 error {error:.3g}, "
                     f"allowed {tolerance:g}{self._place(source, exported, observation, tolerance)}.",
-                    "look for state that forward() keeps in its modules (declare it with 'keep' in the program), or "
-                    "raise --tolerance if you know why",
+                    WHERE_DIFFERENT,
                 )
         return largest
 

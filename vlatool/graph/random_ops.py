@@ -35,6 +35,13 @@ def refuse_random_ops(model: Any, graph: str) -> None:
     Raises:
         GraphError: with number and location of the draws, and how to declare the noise instead.
     """
+    dropping = [node for node in model.graph.all_nodes() if _drops(node)]
+    if dropping:
+        raise GraphError(
+            f"forward() of '{graph}' draws random numbers, {_count_text(dropping)} an inference: dropout is in "
+            "training mode.",
+            "let make() return a module in evaluation mode, and forward() call F.dropout(..., training=self.training)",
+        )
     draws = [node for node in model.graph.all_nodes() if node.op_type in DISTRIBUTIONS]
     if not draws:
         return
@@ -51,6 +58,13 @@ def refuse_random_ops(model: Any, graph: str) -> None:
         "let forward() take them as an input, and declare that in the program of policy.yaml: "
         f"{_noise_declaration(draws, drawn)}{index}; {GUIDE_HINT}",
     )
+
+
+def _drops(node: Any) -> bool:
+    """Return whether a node of an ``onnx_ir.Model`` is a dropout that nothing constant switches off."""
+    index = TRAINING_MODE_INPUT.get(node.op_type, 0)
+    mode = node.inputs[index] if index and len(node.inputs) > index else None
+    return mode is not None and (mode.const_value is None or bool(mode.const_value.numpy().any()))
 
 
 def refuse_random_file(model: Any, path: Path) -> None:

@@ -118,6 +118,9 @@ class EngineFigures(Strict):
         runtime: Whose published latencies the predictions for it rest on (a runtime of the predictor's data); empty
             where there are none, and then latency is unknown.
         dtypes: What it computes in here, the fastest first; int4 and int8 weights alone are written ``w4`` and ``w8``.
+        opset: Highest opset of the default ONNX domain that it takes in the releases of ``software``; None where none
+            was found.
+        ir_version: The same of the version of the ONNX file format.
     """
 
     unit: str
@@ -126,6 +129,8 @@ class EngineFigures(Strict):
     base_mb: Figure
     runtime: str = ""
     dtypes: tuple[Computed, ...] = Field(min_length=1)
+    opset: Figure | None = None
+    ir_version: Figure | None = None
     note: str = ""
 
 

@@ -162,7 +162,7 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def _cause(chain: list[BaseException], module: Any) -> Cause:
-    if any(frame.f_code.co_name == "generate" for frame, _line in _frames(chain[-1]) if not _is_tool(frame)):
+    if any(frame.f_code.co_name == "generate" for frame, _line in _frames(chain[-1]) if not is_tool(frame)):
         return GENERATE
     if any(type(part).__module__.startswith("torch.jit") for part in getattr(module, "modules", list)()):
         return TORCHSCRIPT
@@ -204,7 +204,7 @@ def _node(chain: list[BaseException]) -> Any:
     for error in chain:
         for frame, _line in _frames(error):
             node = frame.f_locals.get("node")
-            if _is_tool(frame) and hasattr(node, "meta") and hasattr(node, "op"):
+            if is_tool(frame) and hasattr(node, "meta") and hasattr(node, "op"):
                 return node
     return None
 
@@ -226,7 +226,7 @@ def _of_node(node: Any) -> str:
 
 def _of_frames(chain: list[BaseException]) -> str:
     """Return the innermost line of a policy's code, or of a library that it calls, and the module that ran."""
-    frames = [(frame, line) for frame, line in _frames(chain[-1]) if not _is_tool(frame)]
+    frames = [(frame, line) for frame, line in _frames(chain[-1]) if not is_tool(frame)]
     if not frames:
         return ""
     frame, line = frames[-1]
@@ -250,7 +250,7 @@ def _frames(error: BaseException) -> Iterator[tuple[FrameType, int]]:
         trace = trace.tb_next
 
 
-def _is_tool(frame: FrameType) -> bool:
+def is_tool(frame: FrameType) -> bool:
     """Return whether a frame is of torch, its exporter, vlatool or Python itself."""
     package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
     file = os.path.realpath(frame.f_code.co_filename)

@@ -32,6 +32,8 @@ IMPORTS = (
 """What the first export of a process imports, half of its time; names that a release has no more cost that alone."""
 OPSET = 20
 """Opset of the default domain, unless another one is asked for."""
+NAME_SCOPES = "pkg.torch.onnx.name_scopes"
+"""Where torch's exporter notes the modules that a node is from."""
 EXTERNAL_DATA_BYTES = 1_500_000_000
 """Weights above this go into a file beside the graph: protobuf ends at 2 GiB."""
 
@@ -46,10 +48,29 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
         GraphError: when torch cannot, or the graph would draw random numbers.
         SourceError: when an output depends on a buffer that the module changes.
     """
+    exported = translate(module, arguments, step, opset, **options)
+    refuse_changed_buffers(exported.exported_program, step.graph)
+    refuse_random_ops(exported.model, step.graph)
+    rewrite_for_engines(exported.model)
+    return exported
+
+
+def rewrite_for_engines(model: Any) -> None:
+    """Write what torch's exporters give as engines recognise it, in place."""
+    divide_by_roots(model)
+    extract_gemm_factors(model)
+
+
+def translate(module: Any, arguments: Sequence[Any], step: ProgramStep, opset: int, **options: Any) -> Any:
+    """Return the ``ONNXProgram`` that torch's dynamo exporter makes, as it makes it.
+
+    Raises:
+        GraphError: when torch cannot.
+    """
     torch = require("torch", "build")
     try:
         with quiet_exporter(), shared_table(), torch.no_grad(), map_user_exceptions("the policy's forward()"):
-            exported = torch.onnx.export(
+            return torch.onnx.export(
                 module, tuple(arguments), dynamo=True, opset_version=opset, input_names=list(step.feeds),
                 output_names=list(step.gives), verbose=False, **options,
             )  # fmt: skip
@@ -58,11 +79,6 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     except Exception as error:  # the seam: the exporter raises many foreign types
         raise_interrupt(error)
         raise export_error(error, step.graph, module) from error
-    refuse_changed_buffers(exported.exported_program, step.graph)
-    refuse_random_ops(exported.model, step.graph)
-    divide_by_roots(exported.model)
-    extract_gemm_factors(exported.model)
-    return exported
 
 
 def raise_interrupt(error: BaseException | None) -> None:
@@ -84,7 +100,7 @@ def name_by_module(model: Any) -> None:
     """
     seen: Counter[str] = Counter()
     for node in model.graph.all_nodes():
-        scopes = node.metadata_props.get("pkg.torch.onnx.name_scopes", "")
+        scopes = node.metadata_props.get(NAME_SCOPES, "")
         names = ast.literal_eval(scopes) if scopes.startswith("[") else []
         if len(names) < 2 or not names[-2]:
             continue

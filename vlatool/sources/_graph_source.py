@@ -21,6 +21,7 @@ from vlatool.graph.files import save
 from vlatool.graph.float32_conversion import ROUNDING, as_float32, describe_conversion
 from vlatool.graph.layers import MIN_OPSET
 from vlatool.graph.onnx_graph import type_name
+from vlatool.graph.opsets import opset_of
 from vlatool.graph.random_ops import refuse_random_file
 from vlatool.machine.engine_calls import REMEDY, engine_call
 from vlatool.module.description import FILE, Description, carry_recordings, copy_assets, read_description
@@ -29,7 +30,7 @@ from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
 from vlatool.runtime.program import Program
-from vlatool.sources._onnx_axes import axes_text, fix_axes, opset_of, shapes_from, with_opset
+from vlatool.sources._onnx_axes import axes_text, fix_axes, shapes_from, with_opset
 from vlatool.sources._onnx_batch import add_batch_axes
 from vlatool.sources._onnx_ends import complete_outputs, refuse_types
 from vlatool.sources._onnx_files import WHERE_MADE

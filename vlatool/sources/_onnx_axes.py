@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vlatool.errors import SourceError, require
+from vlatool.graph.opsets import opset_of
 
 Shapes = Mapping[str, tuple[int | str, ...]]
 INFERRED_BYTES = 1_500_000_000
@@ -114,11 +115,6 @@ def with_opset(model: Any, opset: int) -> Any:
             f"The ONNX file has opset {now}, which onnx cannot convert to {opset}: {reason}.",
             f"leave --opset out, or export the file again with opset {opset} where it was made",
         ) from error
-
-
-def opset_of(model: Any) -> int:
-    """Return the opset of the default domain, 0 when there is none."""
-    return max((entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")), default=0)
 
 
 def _inputs(model: Any) -> list[Any]:

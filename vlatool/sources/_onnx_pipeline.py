@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from vlatool.errors import SourceError, require, suggest
 from vlatool.graph.nodes import rename_reads
+from vlatool.graph.opsets import opset_of
 from vlatool.runtime.engine import engine_class
-from vlatool.sources._onnx_axes import opset_of, with_opset
+from vlatool.sources._onnx_axes import with_opset
 from vlatool.sources._onnx_files import load_onnx
 
 BEGUN_FLAG = "begun"
