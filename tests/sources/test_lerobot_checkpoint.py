@@ -161,11 +161,20 @@ def quantiles(files: dict[str, Any]) -> None:
     files["policy_preprocessor.json"]["steps"][3]["config"]["norm_map"]["STATE"] = "QUANTILES"
 
 
+def instruct(family: str, **config: Any) -> Callable[[dict[str, Any]], None]:
+    """Return an edit that makes the policy one of that family, with the steps of its instruction."""
+
+    def edit(files: dict[str, Any]) -> None:
+        files["config.json"].update(type=family, **config)
+        names = (f"{family}_new_line_processor", "tokenizer_processor")
+        files["policy_preprocessor.json"]["steps"][2:2] = [{"registry_name": name, "config": {}} for name in names]
+
+    return edit
+
+
 def pi0(files: dict[str, Any], enabled: object = False) -> None:
     """Make the files those of pi0 as LeRobot 0.6.1 saves them: an instruction, and steps that do nothing."""
-    files["config.json"]["type"] = "pi0"
-    names = ("pi0_new_line_processor", "tokenizer_processor")
-    files["policy_preprocessor.json"]["steps"][2:2] = [{"registry_name": name, "config": {}} for name in names]
+    instruct("pi0")(files)
     relative(place=5, enabled=enabled, absolute=enabled)(files)
 
 
@@ -229,6 +238,7 @@ def test_what_smolvla_does_for_aloha_is_data(tmp_path: Path, mode: str) -> None:
         files[file] = {f"{key}.{row}": value for key in ("observation.state", "action")
                        for row, value in (("mean", mean), ("std", std))}  # fmt: skip
     relative(exclude_joints=["x"])(files)
+    instruct("smolvla")(files)
     checkpoint = read_checkpoint(write(tmp_path / "c", files))
     state, action = checkpoint.inputs["observation.state"], checkpoint.action
     rows = {each.key: directory._rows(each) for each in (state, action)}
@@ -335,9 +345,9 @@ BROKEN = {
     "relative to too few": (relative(width=4), "4 elements that are relative to 3"),
     "enabled by text": (relative(enabled="true"), "enabled 'true'"),
     "ALOHA of three joints": (
-        lambda files: files["config.json"].update(type="smolvla", adapt_to_pi_aloha=True), "the 14 joints of ALOHA"),
+        instruct("smolvla", adapt_to_pi_aloha=True), "the 14 joints of ALOHA"),
     "ALOHA by text": (
-        lambda files: files["config.json"].update(type="smolvla", adapt_to_pi_aloha="no"), "adapt_to_pi_aloha 'no'"),
+        instruct("smolvla", adapt_to_pi_aloha="no"), "adapt_to_pi_aloha 'no'"),
     "joints of numbers": (relative(exclude_joints=[1]), "exclude_joints"),
     "one joint of text": (relative(action_names="gripper"), "action_names"),
     "unknown mode": (edited(*STEPS, 3, "config", "norm_map", "STATE", to="ZCA"), "ZCA"),
