@@ -1,6 +1,7 @@
 # Every target makes its own .venv when there is none and installs what it needs.
 PYTHON ?= python3
 PYTHON310 ?= python3.10
+PYTHON312 ?= python3.12
 OUT ?= out
 SAMPLES := vln-babyai vla-metaworld vla-flow
 SET :=
@@ -34,7 +35,7 @@ BIN := $(VENV)/bin
 
 RUNTIME_WHEEL := $(OUT)/wheels/vlatool_runtime-*.whl
 
-.PHONY: able confined sets wheels foreign gate peers python310 arm64 ladder help install demo test soak coverage check robot docs format clean metaworld
+.PHONY: able confined sets wheels foreign lerobot gate peers python310 arm64 ladder help install demo test soak coverage check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -133,7 +134,17 @@ $(OUT)/foreign/lerobot/.made: tests/validation/foreign/lerobot.txt pyproject.tom
 	$(OUT)/foreign/lerobot/bin/python -m pip install --quiet --disable-pip-version-check -r tests/validation/foreign/lerobot.txt -e '.[ort,openvino,build,text]'
 	@touch $@
 
-foreign: $(OUT)/foreign/common/.made $(OUT)/foreign/lerobot/.made  ## seven policies of others through every command, and the guides as written (hours, 15 GB; FOREIGN="--only ppo_mlp")
+$(OUT)/foreign/lerobot06/.made:
+	@test -x $(OUT)/foreign/lerobot06/bin/python || $(PYTHON312) -m venv $(OUT)/foreign/lerobot06
+	$(OUT)/foreign/lerobot06/bin/python -m pip install --quiet --disable-pip-version-check 'lerobot[dataset,diffusion,smolvla]==0.6.1'
+	@touch $@
+
+lerobot: $(VENV)/.dev $(OUT)/foreign/lerobot06/.made  ## checkpoints and datasets of LeRobot 0.6, which is installed for Python 3.12 (7 GB; half an hour)
+	$(BIN)/python tests/validation/foreign/lerobot_datasets.py --python $(OUT)/foreign/lerobot06/bin/python -o $(OUT)/foreign/datasets
+	$(BIN)/python tests/validation/foreign/lerobot_checkpoints.py --python $(OUT)/foreign/lerobot06/bin/python --small --steps 48
+	$(BIN)/python tests/validation/foreign/lerobot_optimize.py --python $(OUT)/foreign/lerobot06/bin/python -o $(OUT)/foreign/lerobot-optimize
+
+foreign: lerobot $(OUT)/foreign/common/.made $(OUT)/foreign/lerobot/.made  ## seven policies of others through every command, and the guides as written (hours, 15 GB; FOREIGN="--only ppo_mlp")
 	$(PYTHON) tests/validation/foreign/table.py --common $(OUT)/foreign/common --lerobot $(OUT)/foreign/lerobot -o $(OUT)/foreign/made $(FOREIGN)
 
 docs: $(VENV)/.dev  ## write docs/reference, the picture of the rooms and the counts from the code

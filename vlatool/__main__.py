@@ -12,11 +12,7 @@ from vlatool.errors import DISTRIBUTION, MissingExtra
 
 
 def without_command_line(module: str) -> MissingExtra:
-    """Say what the command line lacks, where it cannot be imported.
-
-    Args:
-        module: The module that is absent.
-    """
+    """Say what the command line lacks where it cannot be imported: ``module``."""
     if DISTRIBUTION != "vlatool":
         why = f"{DISTRIBUTION} loads and runs bundles; the command line is in vlatool."
         fix = "pip install vlatool on another machine; its vlatool benchmark --target measures on this one through ssh"

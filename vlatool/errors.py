@@ -219,11 +219,7 @@ def refuse_two_distributions(packages: Path = PACKAGE.parent) -> None:
 
 
 def require_present(module: str, extra: str) -> None:
-    """Raise an error that names the extra for a missing module, without importing it.
-
-    Raises:
-        MissingExtra: when the module is not installed.
-    """
+    """Raise MissingExtra, which names the extra, when a module is not installed; nothing is imported."""
     try:
         absent = module not in sys.modules and importlib.util.find_spec(module) is None
     except ImportError:
@@ -233,11 +229,7 @@ def require_present(module: str, extra: str) -> None:
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import a module, or raise an error that names the extra that provides it.
-
-    Raises:
-        MissingExtra: when the module is not installed.
-    """
+    """Import a module; raises MissingExtra, which names the extra that provides it, when it is not installed."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -182,11 +182,7 @@ class Report:
 
     @classmethod
     def from_json(cls, text: str) -> Report:
-        """Read what ``to_json`` wrote.
-
-        Raises:
-            DataError: when the text is not a report, or of a newer schema.
-        """
+        """Read what ``to_json`` wrote; raises DataError when the text is not a report, or of a newer schema."""
         try:
             data = json.loads(text)
             if data["schema"] > SCHEMA:
@@ -202,11 +198,7 @@ class Report:
 
 
 def read_report(path: Path) -> Report:
-    """Read a report file, or ``report.json`` (``reports/report.json``) of a directory.
-
-    Raises:
-        DataError: when there is none, or it cannot be read.
-    """
+    """Read a report file, or ``[reports/]report.json`` of a directory; raises DataError when none can be read."""
     for candidate in (path, path / REPORT, path / "reports" / REPORT):
         if candidate.is_file():
             try:

@@ -21,10 +21,9 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.files.messages import from_json, to_json
 from vlatool.graph.workload import workload
 from vlatool.graph.zeros import zero_share
-from vlatool.measurement.cold_start import ColdStart, cold_start, run
+from vlatool.measurement.cold_start import ColdStart, cold_start, peak_rss_mb, resident_mb, run
 from vlatool.measurement.interleaved import BLOCKS, Contestant, latency_measurements, speedup, unique_names
 from vlatool.measurement.jobs import ColdStartJob, LatencyJob
-from vlatool.measurement.memory import peak_rss_mb, resident_mb
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage

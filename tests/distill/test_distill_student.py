@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from _full import full
 from _tiny import deepen, observations, with_expert
 from _trainings import RECORDED, training_of
 from safetensors.torch import load_file, save_file
@@ -38,12 +43,37 @@ pytestmark = pytest.mark.usefixtures("in_this_process")
 @pytest.fixture
 def deep(policy_dir: Path) -> Path:
     """The folder of the tiny policy with three blocks, which its expert has, too."""
+    return with_three_blocks(policy_dir)
+
+
+def with_three_blocks(policy_dir: Path) -> Path:
     deepen(policy_dir)
     code = policy_dir / "policy.py"
     code.write_text(code.read_text().replace("def make(layers=1)", "def make(layers=3)"))
     for number, (name, count) in enumerate((("calibration", 24), ("evaluation", 16)), 1):
         np.savez(policy_dir / f"{name}.npz", **with_expert(observations(count, seed=number), policy_dir))
     return policy_dir
+
+
+@dataclass(frozen=True)
+class Short:
+    """A student made in one command: of what, the bundle, and what was printed."""
+
+    policy: Path
+    made: Bundle
+    printed: str
+
+
+@pytest.fixture(scope="module")
+def short(policy_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Short:
+    """Read only."""
+    place = tmp_path_factory.mktemp("short")
+    deep = with_three_blocks(Path(shutil.copytree(policy_template, place / "tiny")))
+    with pytest.MonkeyPatch.context() as patched, contextlib.redirect_stdout(io.StringIO()) as printed:
+        patched.setenv("VLATOOL_CACHE", str(place / "cache"))
+        patched.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
+        ran("distill", "policy", deep, "--student", STUDENT, "-o", place / "out", *flags())
+    return Short(deep, Bundle.open(place / "out"), printed.getvalue())
 
 
 def ran(*words: object) -> None:
@@ -83,29 +113,27 @@ def test_what_is_no_student_is_refused(text: str, says: str):
     assert says in str(caught.value)
 
 
-def test_it_is_what_the_stages_make_one_by_one_and_is_made_again(deep: Path, tmp_path: Path):
+def test_it_is_what_the_stages_make_one_by_one_and_is_made_again(short: Short, tmp_path: Path):
     """Three blocks: half of them is one and a half, so two stay, and one goes."""
-    ran("distill", "policy", deep, "--student", STUDENT, "-o", tmp_path / "short", *flags())
+    deep = short.policy
     ran("prune", "depth", deep, "--ratio", 0.5, "-o", tmp_path / "d")
     ran("prune", "structured", tmp_path / "d", "--ratio", 0.25, "-o", tmp_path / "w", "--trust", deep)
     ran("distill", "policy", tmp_path / "w", "-o", tmp_path / "long", "--trust", deep, *flags())
-    short, long = (Bundle.open(tmp_path / name) for name in ("short", "long"))
-    assert short.hash == long.hash
-    assert [entry["stage"] for entry in short.manifest.build][1:] == STAGES
-    blocks, *units = read_edits(short)
+    assert short.made.hash == Bundle.open(tmp_path / "long").hash
+    assert [entry["stage"] for entry in short.made.manifest.build][1:] == STAGES
+    blocks, *units = read_edits(short.made)
     assert (blocks.axis, len(blocks.keep)) == ("blocks", 2)
     assert units
-    assert rebuild(short, Context(), source=str(deep), cache=tmp_path / "none").identical
+    assert rebuild(short.made, Context(), source=str(deep), cache=tmp_path / "none").identical
 
 
-def test_its_size_is_told_beside_that_of_the_teacher(deep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    ran("distill", "policy", deep, "--student", STUDENT, "-o", tmp_path / "out", *flags())
-    made = Bundle.open(tmp_path / "out")
-    whole = run_transform(TorchModule(policy=deep), None, tmp_path / "whole", Context()).bundle
+def test_its_size_is_told_beside_that_of_the_teacher(short: Short, tmp_path: Path):
+    made = short.made
+    whole = run_transform(TorchModule(policy=short.policy), None, tmp_path / "whole", Context()).bundle
     counted = {"student": parameters(load_modules(made)), "teacher": parameters(load_modules(whole))}
     assert training_of(made)["parameters"] == counted
     share = 100 * counted["student"] / counted["teacher"]
-    assert f"  {counted['student']:,} of {counted['teacher']:,} parameters ({share:.0f} %)" in capsys.readouterr().out
+    assert f"  {counted['student']:,} of {counted['teacher']:,} parameters ({share:.0f} %)" in short.printed
     assert share < 75
 
 
@@ -189,6 +217,11 @@ def test_protected_blocks_may_go_where_they_are_named(deep: Path, tmp_path: Path
     assert "prune.depth (ratio 0.5)" in told
     ran("distill", "policy", deep, "--student", STUDENT, "--include", "decoder", "-o", tmp_path / "short", *flags())
     assert "kept 2 of 3 blocks of decoder" in capsys.readouterr().out
+    _, *entries = Bundle.open(tmp_path / "short").manifest.build
+    included = {entry["stage"]: entry["options"].get("include") for entry in entries}
+    assert included == {**dict.fromkeys(STAGES), "prune.depth": ["decoder"]}, "as the stages one by one would have it"
+    if not full():
+        return
     ran("prune", "depth", deep, "--include", "decoder", "-o", tmp_path / "d")
     ran("prune", "structured", tmp_path / "d", "--ratio", 0.25, "-o", tmp_path / "w", "--trust", deep)
     ran("distill", "policy", tmp_path / "w", "-o", tmp_path / "long", "--trust", deep, *flags())

@@ -8,7 +8,7 @@ import yaml
 from vlatool.bundle.bundle import LOCATION
 from vlatool.bundle.program import single_graph
 from vlatool.errors import DataError, SourceError, SpecError
-from vlatool.module.description import copy_assets, read_description, read_location, write_location
+from vlatool.module.description import carry_recordings, read_description, read_location, write_location
 
 SPEC = {
     "inputs": [{"name": "x", "shape": [1, 2]}],
@@ -123,17 +123,17 @@ def test_a_recording_without_an_input_is_named_as_the_user_knows_it(policy_dir: 
         arrays = {name: value for name, value in stored.items() if name != "proprio"}
     np.savez(policy_dir / "evaluation.npz", **arrays)
     with pytest.raises(DataError, match=rf"^{policy_dir}/evaluation.npz has no 'proprio'; .*known: ") as caught:
-        copy_assets(described, tmp_path / "out")
+        carry_recordings(described, tmp_path / "out")
     assert caught.value.fix.startswith("record every input of the spec under its name")
     (policy_dir / "evaluation.npz").write_bytes(b"PK")
     with pytest.raises(DataError, match=rf"^{policy_dir}/evaluation.npz cannot be read: "):
-        copy_assets(described, tmp_path / "broken")
+        carry_recordings(described, tmp_path / "broken")
     data = bytearray((policy_dir / "calibration.npz").read_bytes())
     at = data.rindex(b"PK\x01\x02")  # the last entry of the directory: a version that nobody reads yet
     data[at + 6 : at + 8] = b"\xff\xff"
     (policy_dir / "evaluation.npz").write_bytes(data)
     with pytest.raises(DataError, match=rf"^{policy_dir}/evaluation.npz cannot be read: "):
-        copy_assets(described, tmp_path / "other")
+        carry_recordings(described, tmp_path / "other")
 
 
 @pytest.mark.parametrize("key", ["calibration", "evaluation"])
@@ -145,7 +145,7 @@ def test_a_sample_that_is_not_finite_is_named_in_the_file_of_the_user(policy_dir
     np.savez(policy_dir / f"{key}.npz", **arrays)
     message = rf"^'proprio' in {policy_dir}/{key}.npz is not finite in 2 of \d+ samples; the first is sample 2\.$"
     with pytest.raises(DataError, match=message.removesuffix("$")):
-        copy_assets(read_description(policy_dir), tmp_path / "out")
+        carry_recordings(read_description(policy_dir), tmp_path / "out")
 
 
 def test_text_that_is_no_utf8(tmp_path: Path):
@@ -212,7 +212,7 @@ def test_a_recording_may_have_other_names(tmp_path: Path, key: str):
     assert described.recordings() == {key: tmp_path / "walk.npz"}
     assert described.maps[key] == {"x": "observation.x"}
     (tmp_path / "out").mkdir()
-    copy_assets(described, tmp_path / "out")
+    carry_recordings(described, tmp_path / "out")
     with np.load(tmp_path / f"out/data/{key}.npz") as arrays:
         assert arrays["x"].shape == (20, 2)
 

@@ -259,7 +259,7 @@ def test_the_plan_says_what_will_be_computed_in(monkeypatch, capsys, policy_temp
 
 
 def test_a_host_that_lacks_the_set_computes_as_it_is_and_the_report_warns(
-    monkeypatch, policy_template: Path, tmp_path: Path
+    monkeypatch, float_bundle: Bundle, policy_dir: Path, tmp_path: Path
 ):
     """The flags are planted: this host can be anything."""
     pytest.importorskip("openvino")
@@ -269,7 +269,8 @@ def test_a_host_that_lacks_the_set_computes_as_it_is_and_the_report_warns(
     recipe = tmp_path / "recipe.yaml"
     few = RECIPE.replace("episodes: 4", "episodes: 0").splitlines()
     recipe.write_text("\n".join(line for line in few if not line.startswith(("  full", "  reduced"))))
-    line = ["optimize", policy_template, "-o", tmp_path / "out", "--recipe", recipe, "--profile", "intel-nuc-13-pro"]
+    model = shutil.copyfile(float_bundle.path / "graphs/main.onnx", policy_dir / "tiny.onnx")
+    line = ["optimize", model, "-o", tmp_path / "out", "--recipe", recipe, "--profile", "intel-nuc-13-pro"]
     with contextlib.suppress(SystemExit):
         main([str(part) for part in line])
     report = read_report(tmp_path / "out")

@@ -10,7 +10,7 @@ import contextlib
 import io
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import pytest
 from _arithmetic import full_range_or_less
 from _full import small_or_full
 
+from vlatool.benchmark import latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
 from vlatool.cli._run import with_graphs
@@ -75,17 +76,12 @@ def optimize(source: Path, out: Path, cache: Path, *more: Any) -> Run:
 def from_torch(policy_template, tmp_path_factory) -> Run:
     """The whole way, all default candidates, once; read only."""
     folder = tmp_path_factory.mktemp("optimized")
-    run = optimize(
-        policy_template,
-        folder / "out",
-        folder / "cache",
-        "--max-drop",
-        "100%",
-        "--episodes",
-        "10",
-        "--every-candidate",
-        "--json",
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(latency, "COLD_STARTS", small_or_full(1, latency.COLD_STARTS))
+        run = optimize(
+            policy_template, folder / "out", folder / "cache",
+            "--max-drop", "100%", "--episodes", "10", "--every-candidate", "--json",
+        )  # fmt: skip
     assert run.code == 0, run.stderr
     return run
 
@@ -112,17 +108,49 @@ def shared_cache(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def run(model, tmp_path, shared_cache):
+def no_explanation(monkeypatch) -> None:
+    """Runs that have no sentences on what takes the time; ``from_torch`` has them."""
+    monkeypatch.setattr("vlatool.optimize.pipeline.explanation_in_child", lambda *_, **__: ())
+
+
+@pytest.fixture
+def run(model, tmp_path, shared_cache, no_explanation):
     """Optimize the ONNX file; what another test has made or measured is not made again."""
     numbers = iter(range(99))
     return lambda *more: optimize(model, tmp_path / f"out{next(numbers)}", shared_cache, *more)
 
 
 @pytest.fixture
-def run_apart(model, tmp_path):
+def run_apart(model, tmp_path, no_explanation):
     """Optimize the ONNX file; every run of the test shares one cache, and no other test has it."""
     numbers = iter(range(99))
     return lambda *more: optimize(model, tmp_path / f"out{next(numbers)}", tmp_path / "cache", *more)
+
+
+@pytest.fixture(scope="session")
+def dynamic_once(policy_template, float_bundle, tmp_path_factory) -> Run:
+    """A run with one candidate and the nearest kept; read only."""
+    folder = tmp_path_factory.mktemp("dynamic")
+    shutil.copytree(policy_template, folder / "tiny")
+    model = shutil.copyfile(float_bundle.path / "graphs/main.onnx", folder / "tiny/tiny.onnx")
+    (folder / "recipe.yaml").write_text(DYNAMIC)
+    made = optimize(model, folder / "out", folder / "cache", *NEAREST, "--recipe", folder / "recipe.yaml")
+    made.cache.rename(folder / "kept")
+    return made
+
+
+@pytest.fixture
+def first(dynamic_once) -> Iterator[Run]:
+    """The same with its cache, which the test may change."""
+    shutil.copytree(dynamic_once.cache.with_name("kept"), dynamic_once.cache)
+    yield dynamic_once
+    shutil.rmtree(dynamic_once.cache)
+
+
+@pytest.fixture
+def run_again(first, tmp_path, no_explanation):
+    """Optimize the ONNX file of ``first`` with its cache."""
+    return lambda *more: optimize(first.out.parent / "tiny/tiny.onnx", tmp_path / "again", first.cache, *more)
 
 
 def stamps(cache: Path) -> dict[str, tuple[int, int]]:
@@ -263,8 +291,8 @@ def test_the_summary_says_which_engine_the_robot_needs(run, recipe):
 # ---- repeat
 
 
-def test_the_recipe_of_the_result_makes_the_same_graphs_again_without_the_cache(run_apart, recipe, model, tmp_path):
-    first = run_apart(*NEAREST, *recipe(STATIC))
+def test_the_recipe_of_the_result_makes_the_same_graphs_again_without_the_cache(run, recipe, model, tmp_path):
+    first = run(*NEAREST, *recipe(STATIC))
     assert first.code == 1
     written = read_recipe(first.out / "recipe.yaml")
     assert list(written.candidates) == ["mine"]
@@ -275,20 +303,17 @@ def test_the_recipe_of_the_result_makes_the_same_graphs_again_without_the_cache(
     assert (again.out / "recipe.yaml").read_bytes() == (first.out / "recipe.yaml").read_bytes()
 
 
-def test_a_second_run_writes_nothing_new_into_the_cache(run_apart):
-    first = run_apart(*NEAREST)
+def test_a_second_run_writes_nothing_new_into_the_cache(first, run_again, recipe):
     before = stamps(first.cache)
-    second = run_apart(*NEAREST)
+    second = run_again(*NEAREST, *recipe(DYNAMIC))
     assert stamps(first.cache) == before
     assert (second.out / "manifest.json").read_bytes() == (first.out / "manifest.json").read_bytes()
     assert [row.raw for row in second.report.rows] == [row.raw for row in first.report.rows]
 
 
-def test_fresh_measures_again_and_keeps_what_was_made(run_apart, recipe):
-    mine = recipe(DYNAMIC)
-    first = run_apart(*NEAREST, *mine)
+def test_fresh_measures_again_and_keeps_what_was_made(first, run_again, recipe):
     before = stamps(first.cache)
-    assert run_apart(*NEAREST, *mine, "--fresh").row("mine").raw != first.row("mine").raw
+    assert run_again(*NEAREST, *recipe(DYNAMIC), "--fresh").row("mine").raw != first.row("mine").raw
     after = stamps(first.cache)
     changed = {name.split("/")[1].rpartition("-")[0] for name in after if after[name] != before.get(name)}
     assert changed == {"benchmark.latency"}
@@ -302,12 +327,10 @@ def test_fresh_measures_again_and_keeps_what_was_made(run_apart, recipe):
         *small_or_full([], [("sources.onnx", "manifest.json"), ("evaluate.recorded", "report.json")]),
     ],
 )
-def test_a_damaged_entry_of_the_cache_is_made_again(run_apart, recipe, stage, file):
-    mine = recipe(DYNAMIC)
-    first = run_apart(*NEAREST, *mine)
+def test_a_damaged_entry_of_the_cache_is_made_again(first, run_again, recipe, stage, file):
     (damaged, *_rest) = sorted(first.cache.glob(f"stages/{stage}-*/{file}"))
     damaged.write_bytes(damaged.read_bytes()[:-20])
-    second = run_apart(*NEAREST, *mine)
+    second = run_again(*NEAREST, *recipe(DYNAMIC))
     assert second.code == first.code
     assert f"the cached {stage} is damaged" in second.stderr
     assert (second.out / "manifest.json").read_bytes() == (first.out / "manifest.json").read_bytes()
@@ -315,10 +338,9 @@ def test_a_damaged_entry_of_the_cache_is_made_again(run_apart, recipe, stage, fi
         Bundle.open(damaged.parents[file.count("/")])
 
 
-def test_an_option_of_one_candidate_leaves_the_others_in_the_cache(run_apart, recipe):
-    first = run_apart(*NEAREST, *recipe(DYNAMIC))
+def test_an_option_of_one_candidate_leaves_the_others_in_the_cache(first, run_again, recipe):
     before = stamps(first.cache)
-    run_apart(*NEAREST, *recipe(DYNAMIC.replace("{}", "{per_channel: false}")))
+    run_again(*NEAREST, *recipe(DYNAMIC.replace("{}", "{per_channel: false}")))
     assert {name: stamp for name, stamp in stamps(first.cache).items() if name in before} == before
 
 
@@ -407,13 +429,13 @@ def test_the_terminal_report_ends_with_where_things_are(run, recipe):
     assert made.stdout.endswith(f"report: {made.out / 'reports' / 'report.html'}\n")
 
 
-def test_a_bundle_that_exists_is_replaced_with_force(run, recipe, model, tmp_path):
+def test_a_bundle_that_exists_is_replaced_with_force(recipe, model, tmp_path, shared_cache):
     mine = recipe(DYNAMIC)
     (tmp_path / "out").mkdir()
     refused = optimize(model, tmp_path / "out", tmp_path / "cache", *mine)
     assert (refused.code, list(refused.out.iterdir())) == (3, [])
     assert not refused.cache.exists()
-    assert optimize(model, tmp_path / "out", tmp_path / "cache", *mine, *NEAREST, "--force").code == 1
+    assert optimize(model, tmp_path / "out", shared_cache, *mine, *NEAREST, "--force").code == 1
     Bundle.open(tmp_path / "out")
 
 
@@ -516,12 +538,12 @@ def test_the_limit_on_calls_of_an_environment_reaches_the_episodes(model, tmp_pa
 
 
 def test_calibration_data_is_found_beside_the_description(policy_dir, model):
-    assert brings_calibration(str(policy_dir))
-    assert brings_calibration(str(model))
+    assert brings_calibration(source_stage(str(policy_dir)))
+    assert brings_calibration(source_stage(str(model)))
     (policy_dir / "calibration.npz").unlink()
-    assert not brings_calibration(str(policy_dir))
+    assert not brings_calibration(source_stage(str(policy_dir)))
     (policy_dir / "policy.yaml").unlink()
-    assert not brings_calibration(str(model))
+    assert not brings_calibration(source_stage(str(model)))
 
 
 def test_a_source_with_graphs_is_not_exported_again(model, tmp_path):

@@ -29,11 +29,19 @@ BAD = ({"quantize.static_int8": {"samples": 1, "method": "percentile", "percenti
 
 @pytest.fixture
 def search(float_bundle, tmp_path):
-    def start(profile: str | None = "raspberry-pi-5", **limits) -> Search:
+    """A function that begins a search, in a cache of the test's own unless it names another."""
+
+    def start(profile: str | None = "raspberry-pi-5", cache: Path = tmp_path, **limits) -> Search:
         given = limits or {"metric": "relative_error", "max_metric": 0.1}
-        return Search(float_bundle, Limits(**given), load_profile(profile) if profile else None, tmp_path, Context())
+        return Search(float_bundle, Limits(**given), load_profile(profile) if profile else None, cache, Context())
 
     return start
+
+
+@pytest.fixture(scope="session")
+def shared_cache(tmp_path_factory) -> Path:
+    """A cache of the searches that ask what is chosen, not what is made."""
+    return tmp_path_factory.mktemp("searches")
 
 
 def test_a_board_with_onnx_runtime_alone_gets_its_variants() -> None:
@@ -81,8 +89,8 @@ def test_every_variant_can_be_built_as_stages() -> None:
         assert len(transforms(stages)) == 1
 
 
-def test_every_plan_is_tried_and_the_fastest_inside_join(search) -> None:
-    run = search(metric="relative_error", max_metric=0.5)
+def test_every_plan_is_tried_and_the_fastest_inside_join(search, shared_cache) -> None:
+    run = search(cache=shared_cache, metric="relative_error", max_metric=0.5)
     found = run.run({"static_int8": ({"quantize.static_int8": {}},)})
     assert {trial.name for trial in run.trials} >= {"static_int8", "static_int8_mse", "dynamic_int8"}
     assert all(trial.speedup > 0 and math.isfinite(trial.error) for trial in run.trials)
@@ -113,8 +121,8 @@ def test_a_bad_plan_is_mended_by_leaving_layers_in_float(search) -> None:
     assert all("exclude" in trial.stages[-1]["quantize.static_int8"] for trial in mixed)
 
 
-def test_when_nothing_is_inside_the_most_accurate_plan_stays(search) -> None:
-    run = search(metric="relative_error", max_metric=0.0)
+def test_when_nothing_is_inside_the_most_accurate_plan_stays(search, shared_cache) -> None:
+    run = search(cache=shared_cache, metric="relative_error", max_metric=0.0)
     found = run.run({})
     assert len(found) == 1
     least = min((trial for trial in run.trials if trial.speedup), key=lambda trial: trial.error)
@@ -126,11 +134,12 @@ def made_at(cache: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in (cache / "stages").rglob("*") if path.is_file()}
 
 
-def test_a_second_search_makes_and_measures_nothing_again(search, tmp_path) -> None:
-    search().run({})
-    before = made_at(tmp_path)
-    search().run({})
-    assert made_at(tmp_path) == before
+def test_a_second_search_makes_and_measures_nothing_again(search, shared_cache) -> None:
+    search(cache=shared_cache).run({})
+    before = made_at(shared_cache)
+    assert before
+    search(cache=shared_cache).run({})
+    assert made_at(shared_cache) == before
 
 
 def test_an_interrupted_search_goes_on_where_it_was(search, tmp_path) -> None:
@@ -217,6 +226,7 @@ def made_of(search, monkeypatch):
             run._try(f"int8{ending}", ({"quantize.static_int8": options},))
         for base in list(run.trials):
             run._combine(base)
+        run._try_methods()
         return run
 
     return start
@@ -242,13 +252,26 @@ def test_what_may_be_as_fast_on_a_busy_machine_is_combined_too(made_of) -> None:
 
 def test_of_three_the_one_that_costs_most_is_left_out_again(made_of) -> None:
     three = {**ALONE, "elementwise": (2.2, 0.06), "attention+elementwise+method": (2.8, 0.08)}
-    run = made_of({**three, "attention+method": (2.4, 0.038)}, 0.04)
-    assert [trial.name for trial in run.trials[4:]] == ["int8_attention_elementwise_mse", "int8_attention_mse"]
+    run = made_of({**three, "attention+method": (2.4, 0.038), "elementwise+method": (2.2, 0.05)}, 0.04)
+    assert [trial.name for trial in run.trials[4:6]] == ["int8_attention_elementwise_mse", "int8_attention_mse"]
 
 
 def test_a_way_to_choose_ranges_that_is_no_more_accurate_is_not_combined(made_of) -> None:
-    run = made_of({**ALONE, "method": (2.1, 0.031)}, 0.04)
+    run = made_of({**ALONE, "method": (2.1, 0.031), "attention": (2.1, 0.045)}, 0.04)
     assert len(run.trials) == 4
+
+
+def test_a_way_to_choose_ranges_is_tried_on_a_fast_plan_though_it_lost_on_a_slow_one(made_of) -> None:
+    lost = {**ALONE, "method": (2.0, 0.031)}
+    run = made_of({**lost, "attention+method": (2.4, 0.034)}, 0.04)
+    assert [trial.name for trial in run.trials[4:]] == ["int8_attention_mse"]
+    assert run._finalists()[0].name == "int8_attention_mse"
+    worse = made_of({**lost, "elementwise": (2.6, 0.06), "attention+method": (2.4, 0.034),
+                     "elementwise+method": (2.6, 0.05), "attention+elementwise": (2.9, 0.09),
+                     "attention+elementwise+method": (2.9, 0.08)}, 0.04)  # fmt: skip
+    names = [trial.name for trial in worse.trials]
+    assert len(names) == len(set(names))
+    assert {"int8_attention_mse", "int8_elementwise_mse"} <= set(names)
 
 
 def test_finalists_reach_a_hair_beyond_the_budget_and_hold_a_plan_inside(search) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -137,11 +138,13 @@ def test_no_command_dies_of_the_products_that_an_engine_is_asked_for(
         assert done.returncode == 0 or "SIGABRT" in done.stderr, (line, done.stderr)
 
 
-def test_a_search_goes_on_without_the_candidate(run: Run, policy_dir: Path, tmp_path: Path):
+def test_a_search_goes_on_without_the_candidate(run: Run, float_bundle: Bundle, policy_dir: Path, tmp_path: Path):
+    model = shutil.copyfile(float_bundle.path / "graphs/main.onnx", policy_dir / "tiny.onnx")
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text("candidates:\n  int8: [{quantize.static_int8: {samples: 4}}]\n  half: [{quantize.float16: {}}]\n")
-    line = ("optimize", str(policy_dir), "--recipe", str(recipe), "--max-drop", "relative_error=0.9", "--no-search")
-    done = run("abort:run", INT8, *line, "-o", str(tmp_path / "out"))
+    line = ("optimize", str(model), "--recipe", str(recipe), "--max-drop", "relative_error=0.9", "--no-search")
+    few = ("--episodes", "0", "--iterations", "20")
+    done = run("abort:run", INT8, *line, *few, "-o", str(tmp_path / "out"))
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "out/reports/report.json").read_text())
     (failed,) = [row for row in report["rows"] if row["name"] == "int8"]

@@ -130,7 +130,7 @@ def test_its_method_its_source_and_its_engine_run(run: Run, onnx_file: Path, tmp
     ok(run("quantize", "rounded", str(tmp_path / "tiny.acme"), "-o", str(tmp_path / "out"), "--bits", "8"))
     made = json.loads((tmp_path / "out/manifest.json").read_text())["made_by"]
     assert (made["stage"], made["options"]) == ("quantize.rounded", {"bits": 8})
-    done = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20", "--json"))
+    done = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20", "--no-cold", "--json"))
     (row,) = json.loads(done)["rows"]
     assert row["details"]["engine"][0]["providers"].startswith("AzureExecutionProvider {}; CPUExecutionProvider {}; ")
 
@@ -263,13 +263,12 @@ def test_its_controller_acts_as_it_says(run: Run, float_bundle: Bundle):
     np.testing.assert_array_equal(both, [halved[0]] * 2)
 
 
-def test_optimize_chooses_its_method(run: Run, policy_dir: Path, tmp_path: Path):
+def test_optimize_chooses_its_method(run: Run, float_bundle: Bundle, policy_dir: Path, tmp_path: Path):
+    model = shutil.copyfile(float_bundle.path / "graphs/main.onnx", policy_dir / "tiny.onnx")
     recipe = {"schema": 1, "candidates": {"theirs": [{"quantize.rounded": {"bits": 12}}]}, "search": False}
     (tmp_path / "recipe.yaml").write_text(json.dumps(recipe))
     limits = ["--max-drop", "50%", "--max-memory-mb", "4000", "--episodes", "0", "--iterations", "40"]
-    done = run(
-        "optimize", str(policy_dir), "--recipe", str(tmp_path / "recipe.yaml"), "-o", str(tmp_path / "o"), *limits
-    )
+    done = run("optimize", str(model), "--recipe", str(tmp_path / "recipe.yaml"), "-o", str(tmp_path / "o"), *limits)
     assert (tmp_path / "o/manifest.json").is_file(), done.stdout + done.stderr
     report = json.loads((tmp_path / "o/reports/report.json").read_text())
     assert {row["name"]: row["role"] for row in report["rows"]}["theirs"] == "chosen", done.stdout

@@ -11,8 +11,7 @@ from vlatool.samples._expert import ActionExpert, ExpertShape
 from vlatool.samples._fusion import FusionPolicy, FusionShape
 from vlatool.samples._language import DecoderShape, Prefill
 from vlatool.samples._openvla import OpenDecode, OpenPrefill, OpenShape
-from vlatool.samples._smolvla import Prefix, SmolShape
-from vlatool.samples._smolvla_step import Step
+from vlatool.samples._smolvla import Prefix, SmolShape, Step
 from vlatool.samples._vision import VisionShape
 
 LANGUAGE = DecoderShape(width=32, layers=3, heads=4, shared_heads=2, head_width=8, hidden=48)

@@ -12,9 +12,8 @@ import yaml
 from vlatool import registry
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError
-from vlatool.samples._observations import smooth_image
 from vlatool.samples._words import LONGEST, instructions, vocabulary
-from vlatool.samples._write import write_sample
+from vlatool.samples._write import smooth_image, write_sample
 
 
 @pytest.mark.parametrize("name", registry.names("samples"))

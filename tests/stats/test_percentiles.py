@@ -12,6 +12,7 @@ from vlatool.stats.percentiles import (
     effective_sample_size,
     floor,
     intraclass,
+    mean_ranks,
     percentile,
     proven_above,
     required_exceedances,
@@ -104,6 +105,7 @@ def test_one_long_stall_does_not_hide_that_calls_follow_each_other() -> None:
 
 def test_equal_calls_share_a_rank() -> None:
     coarse = np.round(autoregressive(np.random.default_rng(5), 2000, 0.7), 1)
+    np.testing.assert_array_equal(mean_ranks(coarse), midranks(coarse))
     follow = np.corrcoef(*(ranks := midranks(coarse), np.roll(ranks, -1)))[0, 1]
     assert effective_calls(coarse) == pytest.approx(2000 * (1 - follow) / (1 + follow), rel=0.01)
 

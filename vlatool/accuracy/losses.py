@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.spec import TensorSpec
+from vlatool.stats.bootstrap import resampled_sums
 from vlatool.stats.intervals import paired_drop, student
 
 Array = NDArray[Any]
@@ -98,12 +99,8 @@ def drop(
 
 
 def _bootstrap(sums: Array, counts: Array, confidence: float, seed: int) -> tuple[float, float]:
-    random = np.random.default_rng(seed)
-    means = np.empty(DRAWS)
-    for draw in range(DRAWS):
-        drawn = random.integers(len(sums), size=len(sums))
-        means[draw] = sums[drawn].sum() / counts[drawn].sum()
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    drawn, size = resampled_sums((sums, counts.astype(np.float64)), DRAWS, np.random.default_rng(seed))
+    low, high = np.quantile(drawn / size, [(1 - confidence) / 2, (1 + confidence) / 2])
     return float(low), float(high)
 
 

@@ -25,20 +25,12 @@ class Success:
         self._said: bool | None = None
 
     def look(self, info: Any) -> None:
-        """Read the info of a step.
-
-        Raises:
-            DataError: when one of the keys is there with something else than true or false.
-        """
+        """Read the info of a step; raises DataError when one of the keys has another value than true or false."""
         said = reported_success(info)
         self._said = self._said if said is None else said
 
     def at_the_end(self, task: str, seed: int) -> bool:
-        """Return whether the episode succeeded.
-
-        Raises:
-            DataError: when no step of the episode told it.
-        """
+        """Return whether the episode succeeded; raises DataError when no step of the episode told it."""
         if self._said is None:
             raise DataError(
                 f"The environment of task '{task}' never told whether the episode of seed {seed} succeeded: the info "

@@ -274,11 +274,7 @@ class Latency(Measure):
 
 
 def processors(text: str) -> tuple[int, ...]:
-    """Return the numbers of ``0-3,6``; none for an empty text.
-
-    Raises:
-        UsageError: when it is not such a list.
-    """
+    """Return the numbers of ``0-3,6``; none for an empty text; raises UsageError when it is not such a list."""
     if not text:
         return ()
     if not re.fullmatch(r"\d{1,4}(-\d{1,4})?(,\d{1,4}(-\d{1,4})?)*", text):

@@ -83,11 +83,7 @@ class Choice:
 
 
 def choose(boards: Iterable[Profile], load: Workload, model: LatencyModel, wants: Wants) -> list[Choice]:
-    """Return a choice for each board, the best first.
-
-    Raises:
-        ProfileError: when no board is left to look at.
-    """
+    """Return a choice for each board, the best first; raises ProfileError when no board is left to look at."""
     choices: list[Choice] = []
     asked: dict[str, list[Candidate]] = {}
     profiles = {board.name: board for board in boards}

@@ -18,11 +18,7 @@ SMALLER = 0.5
 
 @dataclass(frozen=True)
 class Bound:
-    """One phase and what holds it back.
-
-    Args:
-        shares: ``compute``, ``memory``, ``overhead`` -> share of its roofline time (0-1).
-    """
+    """One phase and what holds it back: ``compute``, ``memory``, ``overhead`` -> share of its roofline time (0-1)."""
 
     phase: Phase
     shares: Mapping[str, float]
@@ -35,11 +31,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class Change:
-    """What one change would give.
-
-    Args:
-        outcome: The changed policy on the same board.
-    """
+    """What one change would give: ``outcome`` is the changed policy on the same board."""
 
     name: str
     outcome: Outcome

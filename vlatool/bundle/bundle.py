@@ -17,7 +17,7 @@ from vlatool.files import verified_read
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit, limit
 from vlatool.files.ownership import LEDGER, cached_hash
-from vlatool.files.verified_read import DESKTOP_FILES, FIX
+from vlatool.files.verified_read import COPY_AGAIN, DESKTOP_FILES
 
 MANIFEST = "manifest.json"
 DIGEST = "manifest.sha256"
@@ -102,7 +102,9 @@ class Bundle:
                 "let this user read the directory and all that is in it",
             ) from error
         if stranger and (self.path / stranger).is_symlink():
-            raise BundleError(f"The bundle {self.path} holds {stranger}, which is a link; a bundle has none.", FIX)
+            raise BundleError(
+                f"The bundle {self.path} holds {stranger}, which is a link; a bundle has none.", COPY_AGAIN
+            )
         if stranger:
             raise BundleError(
                 f"The bundle {self.path} holds {stranger}, which its manifest does not record.",
@@ -164,7 +166,7 @@ class Bundle:
         for part in name.split("/"):
             path /= part
             if path.is_symlink():
-                raise BundleError(f"The bundle {self.path} lacks the file {name} (missing, or a link).", FIX)
+                raise BundleError(f"The bundle {self.path} lacks the file {name} (missing, or a link).", COPY_AGAIN)
         return path
 
     @property
@@ -248,9 +250,7 @@ def _check_digest(root: Path, content: bytes) -> None:
             f"export the policy again; or, if you trust this copy: cd {root} && sha256sum {MANIFEST} > {DIGEST}",
         )
     if _read_small(root, DIGEST, 4096) != digest_of(content):
-        raise BundleError(
-            f"{root / MANIFEST} has changed: its SHA-256 is not what {DIGEST} says.", "copy or export the bundle again"
-        )
+        raise BundleError(f"{root / MANIFEST} has changed: its SHA-256 is not what {DIGEST} says.", COPY_AGAIN)
 
 
 def _read_small(root: Path, name: str, most: int) -> bytes:

@@ -190,11 +190,7 @@ def check_files(manifest: Manifest) -> None:
 
 
 def check_schema(schema: Any) -> None:
-    """Check the version of a manifest.
-
-    Raises:
-        BundleError: when it is newer than this vlatool supports, or not a version.
-    """
+    """Check the version of a manifest; raises BundleError when it is not one, or newer than this vlatool supports."""
     if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
         raise BundleError(f"The manifest has the schema {short_repr(schema)}; this vlatool reads 1 to {SCHEMA}.")
     if schema > SCHEMA:

@@ -16,11 +16,7 @@ DISTRIBUTIONS = ("normal", "uniform", "zeros")
 
 
 def check_step(step: ProgramStep) -> None:
-    """Refuse an entry whose words have other types, or ask for more than the limits allow.
-
-    Raises:
-        SpecError: naming the word and the graph.
-    """
+    """Refuse wrong types, and values beyond the limits, in an entry; raises SpecError with the word and the graph."""
     text(step.graph, "The graph of a step", SpecError, empty=False)
     for word in ("feeds", "gives", "carry", "schedule", "noise", "keep"):
         mapping(getattr(step, word), f"'{word}' of '{step.graph}'", SpecError)
@@ -121,11 +117,7 @@ def keeps_values(program: Iterable[ProgramStep]) -> bool:
 
 
 def program_from(data: Any) -> tuple[ProgramStep, ...]:
-    """Build a program from a list of mappings.
-
-    Raises:
-        SpecError: for anything but a list of mappings with ``graph``, ``feeds`` and ``gives``.
-    """
+    """Build a program from a list of mappings with ``graph``, ``feeds`` and ``gives``; raises SpecError otherwise."""
     if not isinstance(data, list | tuple):
         raise SpecError(f"The program must be a list of steps; got {type(data).__name__}.")
     check_limit("steps", len(data), "The program", SpecError)

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,12 +17,11 @@ from vlatool.cli._commands import Commands
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._document import Output, forget_kept, output, take_print_failure
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPT_CODE, Failure, failure
-from vlatool.cli._process_server import start_early
 from vlatool.errors import refuse_two_distributions
 from vlatool.files.printable import printable
 from vlatool.machine.host import LEROBOT_PYTHON
 from vlatool.machine.version import VERSION
-from vlatool.user_code import trust
+from vlatool.user_code import children, trust
 
 ROOT_OPTIONS = ("--trust", "--python")
 app = typer.Typer(
@@ -33,6 +33,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+GRAPHS_PRELOAD = ("numpy.random", "onnx", "onnxruntime", "vlatool.stage._child", "vlatool.quantize.static_int8")
+MODULES_PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", "vlatool.stage._child")
+TRAINING_METHOD = "qat"
 
 
 def _trust(folders: list[Path]) -> list[Path]:
@@ -195,3 +198,17 @@ def _tell(error: BaseException, fault: Failure) -> None:
         raise error
     elif fault.exit_code:
         _say(str(fault), fault.fix)
+
+
+def start_early(words: Sequence[str]) -> None:
+    """Start the server of child processes where a command line will need it: it imports while this process does.
+
+    Example:
+        >>> start_early(["doctor"])
+    """
+    if len(words) < 2 or any(word in ("--help", "-h") for word in words):
+        return
+    if words[0] == "quantize" and words[1] != TRAINING_METHOD:
+        children.prepare(GRAPHS_PRELOAD)
+    elif words[0] in ("export", "prune", "distill", "verify", "quantize"):
+        children.prepare(MODULES_PRELOAD)

@@ -78,7 +78,9 @@ def board_summary(bundle: Bundle, source: Bundle | None, profile: Profile, conte
     if bundle.manifest.graphs:
         context.progress(f"predicting for {profile.name}", None)
         with _noting(missing, f"nothing is predicted for {profile.name}"):
-            numbers = _predicted(bundle, profile)
+            from vlatool.latency_model.predict import predictions
+
+            numbers = tuple(number for number in predictions(profile, bundle) if number.name in WORDS_OF)
         with _noting(missing, "the actions were not compared with the source's"):
             error = _error(bundle, source, context)
     else:
@@ -93,12 +95,6 @@ def _noting(missing: list[str], what: str) -> Iterator[None]:
         yield
     except VlatoolError as error:
         missing.append(f"{what}: {error.message}")
-
-
-def _predicted(bundle: Bundle, profile: Profile) -> tuple[Measurement, ...]:
-    from vlatool.latency_model.predict import predictions
-
-    return tuple(number for number in predictions(profile, bundle) if number.name in WORDS_OF)
 
 
 def _error(bundle: Bundle, source: Bundle | None, context: Context) -> Measurement | None:

@@ -144,7 +144,6 @@ def refuse_existing(
     """Refuse an output that cannot be written before the work, not after it.
 
     Args:
-        out: The output, None when there is none.
         force: Whether what vlatool wrote there may be replaced.
         inputs: Files that the command reads.
         kind: What is written: only the same is replaced (None: whatever is there).
@@ -166,10 +165,8 @@ def refuse_video(
     """Refuse a video that cannot be written before the work, not after it.
 
     Args:
-        video: The file, None when there is none.
         force: Whether one that vlatool wrote there may be replaced.
         out: The directory of the report.
-        inputs: Files that the command reads.
 
     Raises:
         UsageError: when its suffix names no format, or it is in the directory of the report.
@@ -215,10 +212,7 @@ def show(
     """Print a report on stdout, write it to a directory where wanted, and exit with the verdict's code.
 
     Args:
-        report: What was found out.
-        as_json: Print JSON.
-        out: Directory for the report, None for none.
-        force: Replace a report that exists there.
+        out: Directory for the report, in which ``force`` replaces one that exists; None for none.
         raw: Print raw samples, too, as JSON.
         unfinished: Folders of what is kept until the report is written.
 

@@ -12,7 +12,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,7 @@ EAGER_OPTIONS = ("--help", "--version")
 
 
 class Output:
-    """What a command line that asks for JSON leaves on standard output.
-
-    Args:
-        printed: Buffer for the text of ``--help`` and ``--version``; None for a command.
-    """
+    """What ``--json`` leaves on standard output; ``printed`` takes the text of ``--help`` or ``--version``."""
 
     def __init__(self, printed: io.StringIO | None = None) -> None:
         self._printed = printed
@@ -70,14 +66,21 @@ _kept: list[Path] = []
 def document(value: Any, text: str = "") -> None:
     """Hand over a command's result: what JSON can say, in dataclasses too; NaN becomes null.
 
-    Args:
-        value: The result.
-        text: How it is written, when not as ``json_text`` does.
+    It is written as ``text`` when there is one, else as ``json_text`` does.
     """
     if _now:
         _now[-1].take(value, text)
     else:
         typer.echo(text or json_text(value), nl=False)
+
+
+def answer(as_json: bool, value: Any, lines: Iterable[str]) -> None:
+    """Hand over a result for ``--json``, or print what a person reads of it."""
+    if as_json:
+        document(value)
+        return
+    for line in lines:
+        typer.echo(line)
 
 
 def json_text(value: Any) -> str:
@@ -89,8 +92,6 @@ def report_document(report: Report, *, raw: bool, file: Path | None) -> dict[str
     """Return a report for standard output: without its raw samples, unless they are asked for.
 
     Args:
-        report: What a command found out.
-        raw: Whether raw samples are wanted.
         file: The report that keeps them, None when none is written.
     """
     plain: dict[str, Any] = asdict(report)

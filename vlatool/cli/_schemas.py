@@ -95,11 +95,7 @@ RAW = record(omitted={"type": "integer", "minimum": 1}, file={"type": ["string",
 
 
 def definitions(report: Schema) -> dict[str, Schema]:
-    """Return the schema of every document by name.
-
-    Args:
-        report: That of a report, with its own definitions in ``$defs``.
-    """
+    """Return the schema of every document by name; ``report`` is that of a report with definitions in ``$defs``."""
     shown = {**report["properties"], "raw_samples": {**RAW, "description": "raw samples that were left out"}}
     return {
         **report["$defs"],

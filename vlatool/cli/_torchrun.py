@@ -40,11 +40,7 @@ def launch_for(command: str, *, trains: bool) -> Launch | None:
 
 
 def with_processes(chosen: Mapping[str, Any], launch: Launch | None) -> dict[str, Any]:
-    """Return options with torchrun's number of processes.
-
-    Raises:
-        UsageError: when another one was asked for.
-    """
+    """Return options with torchrun's number of processes; raises UsageError when another one was asked for."""
     if launch is None:
         return dict(chosen)
     if (asked := chosen.get("processes", launch.size)) != launch.size:

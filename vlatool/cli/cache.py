@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import re
 import time
+from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vlatool.cli._document import document
+from vlatool.cli._document import answer, document
 from vlatool.cli._options import AsJson
 from vlatool.errors import DataError, UsageError, suggest
 from vlatool.files.printable import printable
@@ -30,28 +31,24 @@ Place = Annotated[Path | None, typer.Option("--cache", help="the cache; $VLATOOL
 def size(cache: Place = None, as_json: AsJson = False) -> None:
     """Print how large the cache is, stage by stage; a recording that stages share is counted once."""
     held = _contents(cache)
-    if as_json:
-        document(_head(held) | {"stages": [_sum(held, what) for what in _kinds(held)]})
-        return
-    for what in _kinds(held):
-        stage = _sum(held, what)
-        typer.echo(f"{what:28} {stage['entries']:5d} kept  {_human(stage['bytes']):>9} of their own")
-    typer.echo(f"{'shared':28} {'':10}  {_human(_head(held)['shared_bytes']):>9}")
-    _print_total(held)
+    head, stages = _head(held), [_sum(held, what) for what in sorted({entry.what for entry in held.entries})]
+    lines = [
+        f"{each['stage']:28} {each['entries']:5d} kept  {_human(each['bytes']):>9} of their own" for each in stages
+    ]
+    shared = f"{'shared':28} {'':10}  {_human(head['shared_bytes']):>9}"
+    answer(as_json, head | {"stages": stages}, [*lines, shared, *_total(held)])
 
 
 @app.command("list")
 def list_entries(cache: Place = None, as_json: AsJson = False) -> None:
     """List the cache, least recently used first: age, own size, shared size, name."""
     held = _contents(cache)
-    if as_json:
-        document(_head(held) | {"entries": [_entry_row(held, entry) for entry in held.entries]})
-        return
-    typer.echo(f"{'age':>6}  {'own':>9}  {'shared':>9}  name")
-    for entry in held.entries:
-        own, shared = held.sizes(entry)
-        typer.echo(f"{_age(time.time_ns() / 1e9 - entry.used):>6}  {_human(own):>9}  {_human(shared):>9}  {entry.name}")
-    _print_total(held)
+    rows = [_entry_row(held, entry) for entry in held.entries]
+    lines = [f"{'age':>6}  {'own':>9}  {'shared':>9}  name"]
+    for entry, row in zip(held.entries, rows, strict=True):
+        sizes = f"{_human(row['bytes']):>9}  {_human(row['shared_bytes']):>9}"
+        lines.append(f"{_age(time.time_ns() / 1e9 - entry.used):>6}  {sizes}  {entry.name}")
+    answer(as_json, _head(held) | {"entries": rows}, [*lines, *_total(held)])
 
 
 @app.command("prune")
@@ -111,22 +108,16 @@ def _contents(cache: Path | None) -> Contents:
 def _amount(option: str, text: str, units: dict[str, int], example: str) -> float:
     """Return what a person wrote as a number and a unit, in the smallest unit."""
     match = re.fullmatch(r"\s*(\d{1,15}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", text)
+    given, fix = f"{option} is '{text[:40]}'", f"write it as {option} {example}"
     if match is None:
-        raise UsageError(
-            f"{option} is '{text[:40]}'; it must be a number and a unit, such as {example}.",
-            f"write it as {option} {example}",
-        )
+        raise UsageError(f"{given}; it must be a number and a unit, such as {example}.", fix)
     unit = next((name for name in units if name.lower() == match[2].lower()), None)
     if unit is None:
-        raise UsageError(f"{option} is '{text[:40]}'; {suggest(match[2], units)}.", f"write it as {option} {example}")
+        raise UsageError(f"{given}; {suggest(match[2], units)}.", fix)
     value = float(match[1]) * units[unit]
     if not math.isfinite(value):
-        raise UsageError(f"{option} is '{text[:40]}', which is too large.", f"give less, such as {option} {example}")
+        raise UsageError(f"{given}, which is too large.", f"give less, such as {option} {example}")
     return value
-
-
-def _kinds(held: Contents) -> list[str]:
-    return sorted({entry.what for entry in held.entries})
 
 
 def _sum(held: Contents, what: str) -> dict[str, Any]:
@@ -146,11 +137,11 @@ def _entry_row(held: Contents, entry: Entry) -> dict[str, Any]:
     return {"name": entry.name, "stage": entry.what, "used": used, "bytes": own, "shared_bytes": shared}
 
 
-def _print_total(held: Contents) -> None:
-    typer.echo(f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries")
+def _total(held: Contents) -> Iterator[str]:
+    yield f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries"
     if held.unknown:
         more = f" and {len(held.unknown) - 6} more" if len(held.unknown) > 6 else ""
-        typer.echo(f"not vlatool's, never removed: {', '.join(map(_on_one_line, held.unknown[:6]))}{more}")
+        yield f"not vlatool's, never removed: {', '.join(map(_on_one_line, held.unknown[:6]))}{more}"
 
 
 def _on_one_line(name: str) -> str:

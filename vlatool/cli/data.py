@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vlatool.cli._document import document
+from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson, Force, MapNames
 from vlatool.errors import OutputError, UsageError
 from vlatool.files.printable import printable
@@ -46,13 +46,8 @@ def inspect(
     inspection = inspect_steps(steps, registry.entry_of(type(reader)).partition(".")[2])
     if output is not None:
         write_own_file(output, inspection_page(inspection, steps), force=force, comment="<!-- {} -->")
-    if as_json:
-        document(asdict(inspection))
-        return
-    for line in inspection_lines(inspection):
-        typer.echo(printable(line))
-    if output is not None:
-        typer.echo(f"  page       {output}")
+    page = [] if output is None else [f"  page       {output}"]
+    answer(as_json, asdict(inspection), [*map(printable, inspection_lines(inspection)), *page])
 
 
 @app.command("sample")
@@ -86,10 +81,7 @@ def sample(
     output.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(output) as draft:
         count = sample_columns(named, samples, draft) if spec is None else sample_recording(named, samples, spec, draft)
-    if as_json:
-        document({"written": [str(output)]})
-        return
-    typer.echo(f"{output}: {count} samples of {path}")
+    answer(as_json, {"written": [str(output)]}, [f"{output}: {count} samples of {path}"])
 
 
 def _spec_of(policy: str) -> PolicySpec:

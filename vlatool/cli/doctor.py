@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-import typer
-
-from vlatool.cli._document import document
+from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson
 
 
@@ -15,11 +13,8 @@ def doctor(as_json: AsJson = False) -> None:
     from vlatool.doctor.doctor import diagnose
 
     checks = diagnose()
-    if as_json:
-        document([asdict(check) for check in checks])
-        return
-    marks = {"ok": "ok     ", "warn": "warn   ", "missing": "missing"}
+    lines = []
     for check in checks:
-        typer.echo(f"{marks[check.status]} {check.name}: {check.finding}")
-        if check.fix and check.status != "ok":
-            typer.echo(f"          fix: {check.fix}")
+        lines.append(f"{check.status:7} {check.name}: {check.finding}")
+        lines += [f"          fix: {check.fix}"] if check.fix and check.status != "ok" else []
+    answer(as_json, [asdict(check) for check in checks], lines)

@@ -80,9 +80,10 @@ def run(
         )
     if not base.exists():
         raise BundleError(f"No baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
-    refuse_existing(output, force, candidate, *_read_by(gate, base), config)
+    inputs = (candidate, base, *gate.paths, config)
+    refuse_existing(output, force, *inputs)
     if junit is not None:
-        _check_junit(junit, candidate, *_read_by(gate, base), config)
+        _check_junit(junit, inputs)
     with progress(*crew(workers)) as context:
         bundle = open_with_graphs(candidate, context)
         work = cache_directory() / STREAMS / f"gate-{bundle.hash[-16:]}"
@@ -94,7 +95,9 @@ def run(
         show(report, as_json=as_json, out=output, force=force, raw=raw, unfinished=[work])
     finally:  # after the directory of reports: the file may be in it
         if junit is not None:
-            _write_junit(report, junit)
+            from vlatool.render import render
+
+            write_own_file(junit, render(report, "junit"), force=True, comment="<!-- {} -->")
 
 
 @app.command("init")
@@ -147,11 +150,6 @@ def _folders(files: Iterable[Path]) -> Iterator[None]:
         raise
 
 
-def _read_by(gate: Gate, base: Path) -> tuple[Path | None, ...]:
-    """Return what a gate reads beside the candidate."""
-    return (base, *gate.paths)
-
-
 def _gate(config: Path | None, margin: float | None) -> Gate:
     from vlatool.gate.config import Gate, read_gate
 
@@ -159,7 +157,7 @@ def _gate(config: Path | None, margin: float | None) -> Gate:
     return gate if margin is None else gate.with_options("latency", margin=margin)
 
 
-def _check_junit(junit: Path, *inputs: str | Path | None) -> None:
+def _check_junit(junit: Path, inputs: Iterable[str | Path | None]) -> None:
     """Refuse, before the work, a file that cannot be written, lies in an input, or is not vlatool's to replace."""
     if junit.is_dir():
         raise OutputError(f"--junit {junit} is a directory.", "name a file")
@@ -172,12 +170,6 @@ def _check_junit(junit: Path, *inputs: str | Path | None) -> None:
     refuse_inputs(junit, inputs)
     if os.path.lexists(junit):
         refuse_file(junit, force=True)
-
-
-def _write_junit(report: Report, path: Path) -> None:
-    from vlatool.render import render
-
-    write_own_file(path, render(report, "junit"), force=True, comment="<!-- {} -->")
 
 
 def _tell_github(report: Report) -> None:

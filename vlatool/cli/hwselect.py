@@ -11,7 +11,7 @@ import typer
 from vlatool.cli import _complete
 from vlatool.cli._console import file_or_none, progress, refuse_existing, show
 from vlatool.cli._default import group_with
-from vlatool.cli._document import document
+from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson, BundleOrSource, Force, ReportFolder
 from vlatool.errors import UsageError
 
@@ -158,12 +158,7 @@ def score(
         with progress() as context:
             found = refit_points(points, held_out, seed, refit, context.progress)
         tables = list(found.values())
-    if as_json:
-        document(found)
-        return
-    for table in tables:
-        for line in summary_lines(table):
-            typer.echo(line)
+    answer(as_json, found, [line for table in tables for line in summary_lines(table)])
 
 
 @app.command("fit")
@@ -186,5 +181,4 @@ def fit(
 
     _finite(seconds=seconds)
     fit_files(points, output, seconds, seed, anew, lambda line: typer.echo(line, err=True))
-    if as_json:
-        document({"written": [str(output / name) for name in ("latency.npz", "latency.json")]})
+    answer(as_json, {"written": [str(output / name) for name in ("latency.npz", "latency.json")]}, ())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,7 @@ import typer
 from vlatool.bundle.spec import UNKNOWN
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
-from vlatool.cli._document import document
+from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson
 from vlatool.cli._proposal import proposal
 from vlatool.errors import UsageError
@@ -38,14 +39,25 @@ def new(
 ) -> None:
     """Make a policy directory of a file: a copy of it, and a policy.yaml to complete. Refuses one that exists."""
     from vlatool.sources import source_stage
-    from vlatool.stage.run import cache_directory, cached_transform
-    from vlatool.user_code import trust
 
     refuse_existing(policy, False, source, kind="")
     stage: Any = source_stage(source)
     if (converted := stage.converted_directory()) is not None:
-        _copy(converted, policy, control_hz, as_json, source)
-        return
+        text, unknown = _copy(converted, policy, control_hz)
+    else:
+        text, unknown = _make(stage, source, shape, control_hz, policy)
+    value = {"policy": str(policy), "source": source, "unknown": list(unknown)}
+    then = f"{policy}: complete policy.yaml, then: vlatool optimize {policy} -o BUNDLE"
+    answer(as_json, value, [text.removesuffix("\n"), then])
+
+
+def _make(
+    stage: Any, source: str, shape: list[str] | None, control_hz: float | None, policy: Path
+) -> tuple[str, Iterable[str]]:
+    """Write a directory with the files of a policy and what is proposed; return that, and what is unknown."""
+    from vlatool.stage.run import cache_directory, cached_transform
+    from vlatool.user_code import trust
+
     if stage.describe() is not None:
         raise UsageError(f"{source} has a policy.yaml already.", "name it as it is: vlatool optimize SOURCE -o BUNDLE")
     stage = stage.model_copy(update={"shape": tuple(shape or ()), "control_hz": control_hz})
@@ -64,15 +76,11 @@ def new(
         (draft / "policy.yaml").write_text(text, encoding="utf-8")
     if stage.holds_code:  # the copy of what was trusted
         trust.trust(policy / stage.model.name)
-    if as_json:
-        document({"policy": str(policy), "source": source, "unknown": list(manifest.spec.unknown())})
-        return
-    typer.echo(text, nl=False)
-    typer.echo(f"{policy}: complete policy.yaml, then: vlatool optimize {policy} -o BUNDLE")
+    return text, manifest.spec.unknown()
 
 
-def _copy(converted: Path, policy: Path, control_hz: float | None, as_json: bool, source: str) -> None:
-    """Write the directory that a checkpoint was converted into, with the rate that was given."""
+def _copy(converted: Path, policy: Path, control_hz: float | None) -> tuple[str, Iterable[str]]:
+    """Write the directory that a checkpoint was converted into, with the rate that was given; return as ``_make``."""
     from vlatool.module.description import FILE, read_description
 
     with write_directory(policy) as draft:
@@ -81,9 +89,4 @@ def _copy(converted: Path, policy: Path, control_hz: float | None, as_json: bool
         if control_hz is not None:
             text = text.replace(f"control_hz: {UNKNOWN}", f"control_hz: {control_hz:g}")
             (draft / FILE).write_text(text, encoding="utf-8")
-    if as_json:
-        unknown = list(read_description(policy).spec.unknown())
-        document({"policy": str(policy), "source": source, "unknown": unknown})
-        return
-    typer.echo(text, nl=False)
-    typer.echo(f"{policy}: complete policy.yaml, then: vlatool optimize {policy} -o BUNDLE")
+    return text, read_description(policy).spec.unknown()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,13 +13,13 @@ import typer
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import crew, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
-from vlatool.cli._document import document, put, report_document
-from vlatool.cli._options import Force, Workers
-from vlatool.cli._plan import plan_document
+from vlatool.cli._document import answer, document, put, report_document
+from vlatool.cli._options import Force, MapNames, Workers
 from vlatool.cli._proposal import propose
 from vlatool.cli._torchrun import launch_for
 from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
+from vlatool.files.printable import mask_passwords
 from vlatool.machine.host import isa
 from vlatool.report import REPORT
 from vlatool.runtime.engine import DEFAULT_ENGINE
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
     from vlatool.optimize.plan import Plan
     from vlatool.optimize.recipe import Pruning, Recipe
+    from vlatool.stage.base import Stage
 
 TRAINS = "distill.policy"
 
@@ -68,6 +70,12 @@ EveryCandidate = Annotated[
 StudyPlace = Annotated[
     str | None, typer.Option(help="file or database URL that stores the trials, so that several machines share them")
 ]
+Calibration = Annotated[
+    Path | None, typer.Option(help="recording or dataset to calibrate with, instead of what policy.yaml names")
+]
+Evaluation = Annotated[
+    Path | None, typer.Option(help="recording or dataset to evaluate on; of --calibration a half is held out if unset")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout: the report, or the plan with --dry-run")]
 
 
@@ -75,6 +83,9 @@ def optimize(
     source: PolicySource,
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)],
     profile: Board = None,
+    calibration: Calibration = None,
+    evaluation: Evaluation = None,
+    map_names: MapNames = None,
     max_drop: Drop = None,
     max_distance: Distance = None,
     max_motion: Motion = None,
@@ -109,13 +120,16 @@ def optimize(
     better than actions that ignore the observation, so that it cannot serve as a reference.
     """
     from vlatool.hardware.profile import load_profile
+    from vlatool.module.source import RecordingOptions
     from vlatool.optimize import pipeline
     from vlatool.optimize.plan import make_plan
+    from vlatool.sources import brings_calibration, source_stage
     from vlatool.stage.run import cache_directory
 
     launch_for("vlatool optimize", trains=False)
     if not dry_run:
-        refuse_existing(output, force, source, recipe, file_or_none(profile), cache, kind=BUNDLE)
+        inputs = (source, recipe, file_or_none(profile), cache, calibration, evaluation)
+        refuse_existing(output, force, *inputs, kind=BUNDLE)
     board = load_profile(profile) if profile else None
     limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
     shares = {"max_distance": max_distance, "max_motion": max_motion, "worst_task": worst_task}
@@ -124,13 +138,16 @@ def optimize(
         "episodes": episodes, "iterations": iterations, "threads": threads, "every_candidate": every_candidate,
         "environment_timeout": environment_timeout,
     }  # fmt: skip
-    chosen = _recipe(recipe, source, board, asked, {name: value for name, value in effort.items() if value is not None})
+    recordings = RecordingOptions(str(calibration or ""), str(evaluation or ""), tuple(map_names or ()))
+    calibrated = brings_calibration(source_stage(source).with_recordings(recordings))
+    given = {name: value for name, value in effort.items() if value is not None}
+    chosen = _recipe(recipe, calibrated, board, asked, given)
     chosen = chosen.model_copy(update={"pruning": _pruning(chosen.pruning, trials, train_steps, study)})
     if search is not None:
         chosen = chosen.model_copy(update={"search": search})
-    plan = make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
+    plan = make_plan(source, board, chosen, cache or cache_directory(), recordings, fresh=fresh)
     if dry_run:
-        _show_plan(plan, as_json)
+        answer(as_json, plan_document(plan), plan.lines())
         return
     with progress(*crew(workers)) as context:
         report = pipeline.optimize(plan, output, context, force=force)
@@ -160,16 +177,15 @@ def _limits(
 
 
 def _recipe(
-    file: Path | None, source: str, board: Profile | None, limits: dict[str, Any], effort: dict[str, Any]
+    file: Path | None, calibrated: bool, board: Profile | None, limits: dict[str, Any], effort: dict[str, Any]
 ) -> Recipe:
     """Return the recipe of a file, or the default one, with the limits and the effort that were given."""
     from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
-    from vlatool.sources import brings_calibration
 
     if file is None:
         engine = board.engine if board else DEFAULT_ENGINE
         features = board.units[board.engines[engine].unit].isa if board else isa() or ()
-        return default_recipe(Limits(**limits), Effort(**effort), brings_calibration(source), engine, features)
+        return default_recipe(Limits(**limits), Effort(**effort), calibrated, engine, features)
     recipe = read_recipe(file)
     update = {"limits": recipe.limits.model_copy(update=limits), "effort": recipe.effort.model_copy(update=effort)}
     return recipe.model_copy(update=update)
@@ -192,20 +208,8 @@ def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str
     return pruning.model_copy(update={name: value for name, value in update.items() if value is not None})
 
 
-def _show_plan(plan: Plan, as_json: bool) -> None:
-    if as_json:
-        document(plan_document(plan))
-        return
-    for line in plan.lines():
-        typer.echo(line)
-
-
 def budget(text: str) -> dict[str, Any]:
-    """Read ``1%``, ``0.01``, ``METRIC=VALUE`` (with a unit or without), or ``0.002m``.
-
-    Raises:
-        UsageError: for anything else.
-    """
+    """Read ``1%``, ``0.01``, ``METRIC=VALUE`` (with a unit or without), or ``0.002m``; raises UsageError otherwise."""
     named = re.fullmatch(r"\s*([A-Za-z_][\w.]*)\s*=\s*([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*(%?)\s*", text)
     if named:
         return {"metric": named[1], "max_metric": float(named[2]) / (100 if named[3] else 1)}
@@ -216,11 +220,7 @@ def budget(text: str) -> dict[str, Any]:
 
 
 def share(text: str, option: str = "--max-drop") -> float:
-    """Read ``1%`` or ``0.01`` as a share.
-
-    Raises:
-        UsageError: for anything else, or outside 0-100 %.
-    """
+    """Read ``1%`` or ``0.01`` as a share; raises UsageError for anything else, or outside 0-100 %."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*", text)
     value = float(match[1]) / (100 if match[2] else 1) if match else -1.0
     if not 0 <= value <= 1:
@@ -231,3 +231,30 @@ def share(text: str, option: str = "--max-drop") -> float:
             f"write it as {option} 1%",
         )
     return value
+
+
+def plan_document(plan: Plan) -> dict[str, Any]:
+    """Return what ``plan.lines()`` says, as values that JSON can say."""
+    effort, loop, pruning = plan.recipe.effort, plan.closed_loop, plan.recipe.pruning
+    plain = {
+        "source": {"policy": str(plan.source.policy) if plan.source.policy else None, **_stage(plan.source)},
+        "export": _stages(plan.export),
+        "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
+        "search": plan.recipe.search,
+        "pruning": {**pruning.model_dump(mode="json"), "study": mask_passwords(pruning.study)},
+        "benchmark": {"iterations": effort.iterations, "threads": effort.threads},
+        "evaluate": {"recorded": True, "episodes": loop.episodes if loop else 0},
+        "limits": plan.recipe.limits.model_dump(mode="json", exclude_none=True),
+        "profile": plan.profile.name if plan.profile else None,
+        "computes": plan.board_set.plan() or None,
+        "cache": str(plan.cache),
+    }
+    return {"plan": plain}
+
+
+def _stages(stages: Iterable[Stage]) -> list[dict[str, Any]]:
+    return [_stage(stage) for stage in stages]
+
+
+def _stage(stage: Stage) -> dict[str, Any]:
+    return {"stage": stage.name(), "options": stage.options()}

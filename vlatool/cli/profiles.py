@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from vlatool.cli import _complete
-from vlatool.cli._document import document
+from vlatool.cli._document import answer, document
 from vlatool.cli._options import AsJson, ProfileName
 
 app = typer.Typer(
@@ -24,12 +24,9 @@ def list_profiles(as_json: AsJson = False) -> None:
     from vlatool.hardware.profile import load_profile, profile_names
 
     profiles = [load_profile(name) for name in profile_names()]
-    if as_json:
-        document([profile.model_dump(mode="json") for profile in profiles])
-        return
     width = max((len(profile.name) for profile in profiles), default=0)
-    for profile in profiles:
-        typer.echo(f"{profile.name:{width}}  {profile.title}")
+    lines = [f"{profile.name:{width}}  {profile.title}" for profile in profiles]
+    answer(as_json, [profile.model_dump(mode="json") for profile in profiles], lines)
 
 
 @app.command("show")
@@ -38,15 +35,10 @@ def show_profile(name: ProfileName, as_json: AsJson = False) -> None:
     from vlatool.hardware.profile import load_profile
 
     profile = load_profile(name)
-    if as_json:
-        document(profile.model_dump(mode="json"))
-        return
-    typer.echo(f"{profile.title} ({profile.name})")
-    for line in _lines(profile.model_dump(mode="json", exclude={"name", "title", "sources"}, exclude_none=True), "  "):
-        typer.echo(line)
-    typer.echo("  sources")
-    for key, text in profile.sources.items():
-        typer.echo(f"    [{key}] {text}")
+    shown = profile.model_dump(mode="json", exclude={"name", "title", "sources"}, exclude_none=True)
+    sources = [f"    [{key}] {text}" for key, text in profile.sources.items()]
+    lines = [f"{profile.title} ({profile.name})", *_lines(shown, "  "), "  sources", *sources]
+    answer(as_json, profile.model_dump(mode="json"), lines)
 
 
 @app.command("diff")
@@ -64,13 +56,8 @@ def diff_profiles(
         for field in dict.fromkeys([*pair[0], *pair[1]])
         if pair[0].get(field) != pair[1].get(field)
     ]
-    if as_json:
-        document(rows)
-        return
-    for row in rows:
-        typer.echo(f"{row['field']:44} {_cell(row[first]):>24} {_cell(row[second]):>24}")
-    if not rows:
-        typer.echo("no difference")
+    lines = [f"{row['field']:44} {_cell(row[first]):>24} {_cell(row[second]):>24}" for row in rows]
+    answer(as_json, rows, lines or ["no difference"])
 
 
 @app.command("validate")
@@ -123,11 +110,9 @@ def new_profile(
 
     target = output or Path(f"{name}.yaml")
     copy_profile(like, name, target, force=force)
-    if as_json:
-        document({"written": [str(target)]})
-        return
-    typer.echo(f"{target}: correct its figures, then: vlatool profiles validate {target}")
-    typer.echo("put it into a directory named in VLATOOL_PROFILES to find it by name")
+    validate = f"{target}: correct its figures, then: vlatool profiles validate {target}"
+    advice = "put it into a directory named in VLATOOL_PROFILES to find it by name"
+    answer(as_json, {"written": [str(target)]}, [validate, advice])
 
 
 @app.command("calibrate")

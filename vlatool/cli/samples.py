@@ -10,7 +10,7 @@ import typer
 from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
-from vlatool.cli._document import document
+from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson, Force
 from vlatool.errors import MissingExtra, UsageError, VlatoolError, fix_for, suggest
 from vlatool.files.directory_writer import write_directory
@@ -22,11 +22,8 @@ app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_
 def list_samples(as_json: AsJson = False) -> None:
     """List the shapes that can be made."""
     descriptions = {name: registry.module("samples", name).DESCRIPTION for name in _complete.samples("")}
-    if as_json:
-        document([{"name": name, "description": text} for name, text in descriptions.items()])
-        return
-    for name, text in descriptions.items():
-        typer.echo(f"{name:16} {text}")
+    rows = [{"name": name, "description": text} for name, text in descriptions.items()]
+    answer(as_json, rows, [f"{name:16} {text}" for name, text in descriptions.items()])
 
 
 @app.command("make")
@@ -59,7 +56,5 @@ def make(
         pass  # counted where torch is installed
     except (VlatoolError, OSError) as error:
         typer.echo(f"warning: it has no count: {error}", err=True)
-    if as_json:
-        document({"policy": str(output), "sample": name.replace("_", "-"), "seed": seed})
-        return
-    typer.echo(f"{output}: {name}, seed {seed}")
+    value = {"policy": str(output), "sample": name.replace("_", "-"), "seed": seed}
+    answer(as_json, value, [f"{output}: {name}, seed {seed}"])

@@ -8,7 +8,7 @@ import typer
 
 from vlatool.cli import _complete
 from vlatool.cli._console import progress
-from vlatool.cli._document import document
+from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson, BundleOrSource
 
 
@@ -30,8 +30,4 @@ def simulate(
 
     with progress() as context:
         prediction = simulate(source, profile, mode, engine, precision, context)
-    if as_json:
-        document(prediction)
-        return
-    for line in simulation_lines(prediction):
-        typer.echo(line)
+    answer(as_json, prediction, simulation_lines(prediction))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vlatool.cli._document import document
+from vlatool.cli._document import answer
 from vlatool.errors import DataError, UsageError
 from vlatool.files.messages import to_json
 
@@ -38,12 +38,7 @@ def telemetry(
         raise DataError(f"No such directory: {root}.", "check the path; leave --root out to read this machine")
     with Recorder(open_all(root), period) as recorder:
         time.sleep(seconds)
-    recorded = recorder.summary
-    if as_json:
-        document(to_json(recorded))
-        return
-    for line in lines(recorded):
-        typer.echo(line)
+    answer(as_json, to_json(recorder.summary), lines(recorder.summary))
 
 
 def lines(recorded: Summary) -> Iterator[str]:

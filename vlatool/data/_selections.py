@@ -107,7 +107,7 @@ def carry_recording(
     named = recording if isinstance(recording, NamedRecording) else NamedRecording(recording)
     reader = reader_of(named.path)
     opened = reader.open(named.path, spec, named.names)
-    (out / "data").mkdir(exist_ok=True)
+    (out / "data").mkdir(parents=True, exist_ok=True)
     if not reader.carries_sample and not named.names:
         link_or_copy(named.path, out / "data" / f"{purpose}{reader.suffix}")
         return
@@ -154,10 +154,10 @@ def _reservation(held_out: Recording) -> str:
     if held_out.whole is not None:
         return (
             f"there is no evaluation recording: the errors are taken on {len(held_out)} of the {len(held_out.whole)} "
-            "observations for calibration, held out of it; to use others: evaluation: FILE.npz in policy.yaml"
+            "observations for calibration, held out of it; to use others: --evaluation, or evaluation: in policy.yaml"
         )
     return (
         f"there is no evaluation recording, and {len(held_out)} calibration observations are too few to hold out a "
         f"half: what calibrates is what evaluates, which flatters it; record {2 * MIN_HALF} or more, or name others: "
-        "evaluation: FILE.npz in policy.yaml"
+        "--evaluation, or evaluation: in policy.yaml"
     )

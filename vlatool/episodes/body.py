@@ -23,11 +23,7 @@ MAX_UNEVENNESS = 0.01
 
 
 class Body:
-    """Listens to one episode, and tells it as a track.
-
-    Args:
-        spec: spec of the policy: names, units and rate of its actions.
-    """
+    """Listens to an episode and tells it as a track; ``spec`` has names, units and rate of its actions."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self._hz = float(spec.rate)

@@ -86,11 +86,7 @@ class World:
             )
 
     def reset(self, seed: int) -> tuple[Mapping[str, Any], Any]:
-        """Begin an episode and return its first observation, and its info.
-
-        Raises:
-            DataError: when it does not give an observation and an info.
-        """
+        """Begin an episode; return its first observation and its info; raises DataError when it does not give both."""
         self._seed = seed
         with self._limited("reset()"):
             answer = self._environment.reset(seed=seed)
@@ -122,11 +118,7 @@ class World:
         return self._observation(observation), any(flags), info
 
     def disturbances(self) -> tuple[str, ...]:
-        """Return the disturbances that the environment offers.
-
-        Raises:
-            DataError: when it names them as something else than words, or has no ``disturb``.
-        """
+        """Return the disturbances that are offered; raises DataError unless they are words, with ``disturb``."""
         named = self._own("disturbances")
         if named is None:
             return ()
@@ -143,11 +135,7 @@ class World:
         return tuple(named)
 
     def disturb(self, kind: str, strength: float, seed: int) -> None:
-        """Disturb the episodes from the next reset on.
-
-        Raises:
-            DataError: when the environment does not offer that.
-        """
+        """Disturb the episodes from the next reset on; raises DataError when the environment does not offer that."""
         known = self.disturbances()
         if kind not in known:
             raise DataError.unknown(f"{self._name.capitalize()} offers no disturbance '{kind}'", kind, known)

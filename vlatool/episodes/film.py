@@ -42,11 +42,7 @@ class Filmed(World):
         self._roll = Roll(folder)
 
     def reset(self, seed: int) -> tuple[Mapping[str, Any], Any]:
-        """Begin an episode, as ``World.reset`` does, and take its first picture.
-
-        Raises:
-            DataError: when there is nothing to take a picture of.
-        """
+        """Begin an episode as ``World.reset`` does, and take its first picture; raises DataError without one."""
         observation, info = super().reset(seed)
         with self._limited("render()"):
             self._roll.take(self._camera, observation)
@@ -90,11 +86,7 @@ class Camera:
         self._why = ""
 
     def __call__(self, observation: Mapping[str, Any]) -> Picture:
-        """Return the picture of this moment, (H, W, 3), its longer side of at most ``MOST_SIDE`` pixels.
-
-        Raises:
-            DataError: when there is none.
-        """
+        """Return this moment's picture, (H, W, 3), no side above ``MOST_SIDE``; raises DataError when there is none."""
         if self._renders is None:
             self._renders = self._can_render()
         if self._renders:
@@ -138,11 +130,7 @@ class Camera:
 
 
 class Roll:
-    """Writes pictures into a folder, some at a time.
-
-    Args:
-        folder: folder of ``NUMBER.npy``; it is made when absent.
-    """
+    """Writes pictures, some at a time, into a folder of ``NUMBER.npy``, which is made when absent."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._kept = folder, list[Picture]()
@@ -150,11 +138,7 @@ class Roll:
         self._count = self._bytes = 0
 
     def take(self, camera: Camera, observation: Mapping[str, Any]) -> None:
-        """Take a picture; nothing where there are enough.
-
-        Raises:
-            DataError: when there is no picture, or one of another size than before.
-        """
+        """Take a picture unless there are enough; raises DataError when there is none, or it has another size."""
         if self._count >= MOST_PICTURES or self._bytes >= MOST_BYTES:
             return
         picture = camera(observation)
@@ -192,11 +176,7 @@ class Film:
 
     @classmethod
     def open(cls, folder: Path) -> Film:
-        """Return what was filmed into a folder.
-
-        Raises:
-            DataError: when there are no pictures, or what is there is something else.
-        """
+        """Return what was filmed into a folder; raises DataError when it holds no pictures, or something else."""
         files = tuple(sorted(folder.glob("*.npy")))
         shapes = [_read(file).shape for file in files]
         if not shapes or len({shape[1:] for shape in shapes}) != 1:

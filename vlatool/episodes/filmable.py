@@ -34,11 +34,7 @@ def check_filmable(bundles: Sequence[Bundle], job: EpisodesJob, context: Context
 
 
 def probe(request: Mapping[str, Any], _tell: OnProgress) -> None:
-    """Take the first picture of the first episode of a ``Request`` in this process.
-
-    Raises:
-        DataError: when there is none.
-    """
+    """Take the first picture of a ``Request``'s first episode in this process; raises DataError when there is none."""
     asked = from_json(Request, request)
     job, spec = asked.job, Bundle.open(Path(asked.bundle)).manifest.spec
     environment = call_factory(job.environment, Path(job.folder), {"task": job.task})

@@ -223,11 +223,7 @@ def play(request: Mapping[str, Any], tell: OnProgress) -> dict[str, Any]:
 
 
 def open_bundle(request: Mapping[str, Any], _tell: OnProgress) -> None:
-    """Open the bundle of a ``Request`` in this process, as its episodes would.
-
-    Raises:
-        BundleError, GraphError: when it cannot be.
-    """
+    """Open a ``Request``'s bundle here as its episodes would; raises BundleError, GraphError when it cannot be."""
     asked = from_json(Request, request)
     _open_policy(Bundle.open_lazily(asked.bundle), asked.engine)
 

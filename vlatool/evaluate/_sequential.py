@@ -76,11 +76,7 @@ def with_decision(row: Row, decision: Decision) -> Row:
 
 
 def sentence(decision: Decision, starts: int | None = None) -> str:
-    """Return what was decided, and after how many pairs.
-
-    Args:
-        starts: How many distinct ones there are; not told when None.
-    """
+    """Return what was decided, after how many pairs, and of how many distinct ``starts`` (not told when None)."""
     allowed = f"{100 * decision.limit:.3g} points"
     what = {"pass": f"is at most {allowed}", "fail": f"is more than {allowed}"}.get(decision.verdict)
     seen = f"{decision.pairs} of at most {decision.most} paired episodes"

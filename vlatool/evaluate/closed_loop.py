@@ -253,11 +253,7 @@ class ClosedLoop(Measure):
         return Report("evaluate", title, verdict, summary, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _disturbances(self, source: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
-        """Return the disturbances that are asked for.
-
-        Raises:
-            UsageError: when there is one that neither the evaluation nor the environment knows.
-        """
+        """Return the requested disturbances; raises UsageError for one that neither evaluation nor environment has."""
         if not self.disturb:
             return ()
         known = disturbances_of(source, job, context)
@@ -312,11 +308,7 @@ class ClosedLoop(Measure):
         return min(self.episodes, max(CONTROL_EPISODES, self.episodes // 10))
 
     def _may_run(self, job: EpisodesJob) -> None:
-        """Let the environment's code run where it was named in the options; what a bundle names must be trusted.
-
-        Raises:
-            SourceError: when it is not.
-        """
+        """Let the environment's code run if named in the options; raises SourceError for untrusted code of a bundle."""
         where, function = split_factory(job.environment)
         file = factory_file(job.environment, Path(job.folder))
         if self.environment and file is not None and not file.is_file():

@@ -137,11 +137,7 @@ def _error(got: Sequence[Any], reference: Sequence[Any]) -> float:
 
 
 def phase_sentences(effects: Sequence[Phases], again: str) -> list[str]:
-    """Return the sentences for a reader, the bad news first.
-
-    Args:
-        again: Command that makes the bundle again.
-    """
+    """Return the sentences, the bad news first; ``again`` is the command that makes the bundle again."""
     sentences = []
     for phase in sorted(effects, key=lambda item: not item.nodes):
         if phase.kept:

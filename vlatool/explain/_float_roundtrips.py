@@ -43,11 +43,7 @@ class RoundTrip:
 
 @dataclass(frozen=True)
 class Fallback:
-    """A layer that is int8 in the file but does not run as a fast int8 kernel, and its cost.
-
-    Args:
-        ms: Its time in one inference.
-    """
+    """A layer that is int8 in the file but runs as no fast int8 kernel, and its cost: ``ms`` in one inference."""
 
     graph: str
     layer: str

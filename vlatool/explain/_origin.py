@@ -123,11 +123,7 @@ def _cached_bundle(hashes: tuple[str, ...]) -> Bundle | None:
 
 
 def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, count: int) -> Observations:
-    """Return observations, preferably ones that calibration has not used.
-
-    Raises:
-        DataError: when the given data does not fit the policy.
-    """
+    """Return observations, preferably unused in calibration; raises DataError when the data does not fit the policy."""
     if data is not None:
         return Observations(recorded_observations(bundle, count, data), data.name)
     sources = [candidate for candidate in (bundle, baseline) if candidate is not None]

@@ -18,11 +18,7 @@ PRELOAD = ("numpy", "onnx", "onnxruntime", __name__)
 
 
 def explain_in_child(bundle: Bundle, options: Options, context: Context) -> Report:
-    """Return the report of ``explain``.
-
-    Raises:
-        VlatoolError: errors of ``explain``; GraphError when an engine crashes the child.
-    """
+    """Return the report of ``explain``; raises as it does, and GraphError when an engine crashes the child."""
     job = {"bundle": str(bundle.path.absolute()), "options": to_json(options)}
     return Report.from_json(_call("report", job, context))
 

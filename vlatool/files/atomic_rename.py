@@ -33,11 +33,7 @@ def rename_to_new(source: Path, target: Path) -> None:
 
 
 def exchange(one: Path, other: Path) -> bool:
-    """Exchange two directories atomically; return False when the file system does not support it.
-
-    Raises:
-        OSError: for any other failure.
-    """
+    """Exchange two directories atomically; False where the file system cannot; raises OSError for other failures."""
     return _rename(one, other, EXCHANGE)
 
 

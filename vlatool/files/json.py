@@ -41,11 +41,7 @@ def parse_json(content: bytes, *, strict: bool = False) -> Any:
 
 
 def read_json(content: bytes, where: str, error: type[VlatoolError], fix: str, *, strict: bool = False) -> Any:
-    """Parse a JSON text as ``parse_json`` does.
-
-    Raises:
-        VlatoolError: an ``error`` that says that ``where`` is not valid JSON.
-    """
+    """Parse a JSON text as ``parse_json`` does; raises ``error``, naming ``where``, when it is not valid JSON."""
     try:
         return parse_json(content, strict=strict)
     except ValueError as reason:

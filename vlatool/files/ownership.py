@@ -60,11 +60,7 @@ class Entry:
 
 
 def write_ledger(directory: Path) -> None:
-    """Write the ledger of all files below a directory into it.
-
-    Raises:
-        OSError: when a file cannot be read, or the ledger cannot be written.
-    """
+    """Write the ledger of all files below a directory into it; raises OSError when reading or writing fails."""
     known = _records(_read_json(directory / MANIFEST)[0])
     files, folders = {}, []
     for path in sorted(directory.rglob("*")):
@@ -170,11 +166,7 @@ def _foreign_file(path: Path, name: str, mode: int, listing: Listing) -> str:
 
 
 def cached_hash(path: Path) -> str:
-    """Return the SHA-256 of a file as hex; an unchanged file is hashed once in a process.
-
-    Raises:
-        OSError: when it cannot be read, or is a link.
-    """
+    """Return a file's SHA-256 as hex, hashed once while unchanged; raises OSError for a link or an unreadable file."""
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as stream:
         stamp = _stamp(os.fstat(stream.fileno()))
         if stamp not in _HASHES:

@@ -80,11 +80,7 @@ class Source(Protocol):
 
 
 class PlainSource:
-    """An uncompressed array in a file.
-
-    Args:
-        start: offset of its first element.
-    """
+    """An uncompressed array in a file, from the offset ``start`` on."""
 
     def __init__(self, file: OpenFile, start: int) -> None:
         self._file = file
@@ -227,11 +223,7 @@ class Rows:
         return row
 
     def read(self, first: int, count: int) -> Array:
-        """Return ``count`` rows from ``first`` on.
-
-        Raises:
-            DataError: when the file became shorter since it was opened.
-        """
+        """Return ``count`` rows from ``first`` on; raises DataError when the file became shorter since opening."""
         array = np.empty((count, *self.shape[1:]), self._stored)
         room = array.reshape(-1).view(np.uint8).data
         if array.nbytes and self._source.read_into(room, first * (array.nbytes // count)) < array.nbytes:
@@ -239,11 +231,7 @@ class Rows:
         return array.astype(self.dtype, copy=False)
 
     def select(self, chosen: NDArray[np.bool_]) -> Rows:
-        """Return the rows of a mask, which stay on the disk, too.
-
-        Args:
-            chosen: (N,) mask of the rows.
-        """
+        """Return the rows of a mask (N,), which stay on the disk, too."""
         indices = np.flatnonzero(chosen)
         row = math.prod(self.shape[1:]) * self._stored.itemsize
         return Rows(RowSubset(self._source, indices, row), (len(indices), *self.shape[1:]), self._stored, self.where)

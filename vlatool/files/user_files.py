@@ -121,11 +121,7 @@ def _digest(content: bytes) -> str:
 
 
 def refuse_file(path: Path, *, force: bool) -> None:
-    """Refuse to replace an existing file, unless ``force`` is set, vlatool wrote it, and it is unchanged.
-
-    Raises:
-        OutputError: with the reason.
-    """
+    """Refuse to replace a file, unless ``force`` is set and vlatool wrote it, unchanged; raises OutputError."""
     if path.is_symlink():
         raise OutputError(f"{path} is a link; nothing is replaced through it.", "name another file")
     if path.is_dir():

@@ -30,11 +30,7 @@ def short_repr(value: Any) -> str:
 
 
 def mapping(value: Any, where: str, error: Kind) -> dict[str, Any]:
-    """Return a mapping whose keys are strings.
-
-    Raises:
-        BundleError, SpecError: the class ``error``.
-    """
+    """Return a mapping whose keys are strings; raises ``error`` otherwise."""
     if not isinstance(value, Mapping):
         raise error(f"{where} must be a mapping; got {short_repr(value)}.")
     for key in value:

@@ -16,7 +16,7 @@ from vlatool.files.limits import limit
 
 DESKTOP_FILES = (".DS_Store", "Thumbs.db", "desktop.ini")
 """Files that desktop environments leave in directories."""
-FIX = "copy or export the bundle again"
+COPY_AGAIN = "copy or export the bundle again"
 BLOCK = 1 << 20
 TICK_NS = 20_000_000
 """Time stamps of files move in ticks of up to 10 ms: a second change within one tick cannot be detected."""
@@ -50,13 +50,13 @@ def check_size(root: Path, name: str, handle: int, size: int) -> None:
     """Refuse an open file whose size differs from the recorded one."""
     got = os.fstat(handle).st_size
     if got != size:
-        raise BundleError(f"{root / name} has {got} bytes; the manifest says {size}.", FIX)
+        raise BundleError(f"{root / name} has {got} bytes; the manifest says {size}.", COPY_AGAIN)
 
 
 def check_content(root: Path, name: str, got: str, recorded: str) -> None:
     """Refuse a SHA-256 that differs from the recorded one."""
     if got != recorded:
-        raise BundleError(f"{root / name} has changed: its SHA-256 is not the manifest's.", FIX)
+        raise BundleError(f"{root / name} has changed: its SHA-256 is not the manifest's.", COPY_AGAIN)
 
 
 def read_all(handle: int, size: int) -> bytes:
@@ -81,11 +81,7 @@ def hash_handle(handle: int) -> str:
 
 @contextlib.contextmanager
 def open_inside(root: Path, name: str) -> Iterator[int]:
-    """Open a regular file of a bundle as ``open_regular`` does.
-
-    Raises:
-        BundleError: when it is missing or not a regular file, or its path has a link.
-    """
+    """Open a regular file of a bundle as ``open_regular`` does; raises BundleError where that raises OSError."""
     try:
         with open_regular(root, name) as handle:
             yield handle
@@ -113,8 +109,8 @@ def open_regular(root: Path, name: str) -> Iterator[int]:
 
 def _unreadable(root: Path, name: str, error: OSError) -> BundleError:
     if error.errno in (errno.ENOENT, errno.ELOOP, errno.ENOTDIR, errno.ENXIO, errno.EMLINK):
-        return BundleError(f"The bundle {root} lacks the file {name} (missing, or a link).", FIX)
-    return BundleError(f"{root / name} cannot be read: {error.strerror}.", FIX)
+        return BundleError(f"The bundle {root} lacks the file {name} (missing, or a link).", COPY_AGAIN)
+    return BundleError(f"{root / name} cannot be read: {error.strerror}.", COPY_AGAIN)
 
 
 @contextlib.contextmanager
@@ -194,7 +190,7 @@ def verified_directory(root: Path, folder: str, files: dict[str, tuple[str, int]
         yield _descriptor_path(root, folder, directories[folder])
         same = before == [_file_stamp(handle) for handle in watched]
         if not same or not all(_still_there(name, handles, directories) for name in files):
-            raise BundleError(f"The bundle {root} was changed while {', '.join(files)} was opened.", FIX)
+            raise BundleError(f"The bundle {root} was changed while {', '.join(files)} was opened.", COPY_AGAIN)
 
 
 def _descriptor_path(root: Path, folder: str, handle: int) -> Path:

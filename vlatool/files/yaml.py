@@ -76,11 +76,7 @@ _parse_cached: Any = functools.lru_cache(32)(_parse)
 
 
 def read_mapping(path: Path, what: str, raised: type[InputError]) -> dict[str, Any]:
-    """Return the mapping in a YAML file, as ``read_yaml`` does.
-
-    Raises:
-        InputError: of the class ``raised``, when ``read_yaml`` raises, or the file has something else.
-    """
+    """Return the mapping in a YAML file; raises ``raised`` when ``read_yaml`` does, or the file has something else."""
     data = read_yaml(path, what, raised)
     if data is None:
         raise raised(f"{what} is empty; it must be a mapping.", WRITE_PAIRS)

@@ -60,11 +60,7 @@ class Claim(Numeric):
             )
 
     def examine(self, evidence: Evidence) -> Verdict:
-        """Return the verdict, as values.
-
-        Raises:
-            VlatoolError: when something cannot be measured.
-        """
+        """Return the verdict, as values; raises VlatoolError when something cannot be measured."""
         raise PluginError(f"The claim {self.name()} has no method examine().", "define examine(self, evidence)")
 
     def verdicts(self, evidence: Evidence) -> dict[str, Verdict]:

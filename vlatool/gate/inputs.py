@@ -37,11 +37,7 @@ class Inputs:
 
     @cached_property
     def recordings(self) -> tuple[Recording, ...]:
-        """All recordings that are drawn from.
-
-        Raises:
-            DataError: when one cannot be read or does not fit the spec.
-        """
+        """All recordings that are drawn from; raises DataError when one cannot be read or does not fit the spec."""
         spec = self.baseline.manifest.spec
         own = recordings_of(self.baseline).evaluation
         recordings = [read_recording(path, spec) for path in (self.data, own) if path is not None]

@@ -45,7 +45,8 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
                 f"{bundle.path} is made for the engine '{engine}'; {suggest(engine, known)}.", fix_for(engine, known)
             )
     mine, theirs = candidate.manifest, baseline.manifest
-    differs = _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs)
+    rates = [(name, getattr(mine.spec, of), getattr(theirs.spec, of)) for name, of in RATE.items()]
+    differs = _tensors(mine, theirs) or _differences(rates) or _program(mine, theirs)
     if gate.plan.episodes and gate.plan.policy is None:  # they are played in what the bundles name
         differs = differs or _scene(mine, theirs)
     if differs:
@@ -123,13 +124,7 @@ def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
     """Return in words how an input or output of the candidate differs from the baseline's; nothing when it does not."""
     if mine is None or theirs is None:
         return f"it is in the {'baseline' if mine is None else 'candidate'} alone"
-    pairs = [(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING]
-    return _differences(pairs)
-
-
-def _rates(mine: Manifest, theirs: Manifest) -> str:
-    pairs = [(name, getattr(mine.spec, of), getattr(theirs.spec, of)) for name, of in RATE.items()]
-    return _differences(pairs)
+    return _differences([(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING])
 
 
 def _program(mine: Manifest, theirs: Manifest) -> str:

@@ -61,11 +61,7 @@ def load(path: Path) -> Any:
 
 
 def read(path: Path, *, weights: bool = True) -> Any:
-    """Read an ONNX model with unique names for all nodes; outputs are never constants.
-
-    Raises:
-        GraphError: when a file of its weights is missing.
-    """
+    """Read an ONNX model; node names are unique, no output is constant; raises GraphError without its weight files."""
     onnx = require("onnx", "build")
     try:
         model = onnx.load(str(path), load_external_data=weights)

@@ -104,11 +104,7 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
 
 
 def check_opset(opset: int, method: str, lowest: int) -> None:
-    """Refuse a graph whose opset lacks the operators of a method; 0 is an unknown opset.
-
-    Raises:
-        GraphError: when the opset is too old.
-    """
+    """Refuse, with GraphError, an opset that lacks the operators of a method; 0 is an unknown opset."""
     if 0 < opset < lowest:
         raise GraphError(
             f"The graph has opset {opset}; {method} needs opset {lowest} or later.",
@@ -131,11 +127,7 @@ def _is_residual(node: Any, graph: OnnxGraph) -> bool:
 
 
 def check_weights(model: Any, layers: Iterable[Layer]) -> None:
-    """Check the weights and biases of layers before they are used.
-
-    Raises:
-        GraphError: when one holds NaN or infinity; names it and its layer.
-    """
+    """Check weights and biases of layers; raises GraphError, naming one and its layer, for NaN or infinity."""
     graph, names = OnnxGraph(model), {layer.name for layer in layers}
     for node in (node for node in model.graph.node if node.name in names):
         for name in filter(graph.is_weight, node.input):

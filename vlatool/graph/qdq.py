@@ -37,11 +37,7 @@ def insert_qdq(model: Any, layers: Iterable[Layer], ranges: Mapping[str, Range],
 
 
 class QdqWriter(OnnxGraph):
-    """A graph that is rebuilt node by node in int8; a subclass writes another type.
-
-    Args:
-        model: An ``onnx.ModelProto``, changed in place.
-    """
+    """An ``onnx.ModelProto`` that is rebuilt in place, node by node, in int8; a subclass writes another type."""
 
     codes: ClassVar[str] = "int8"
     """Suffix of the names of stored codes."""

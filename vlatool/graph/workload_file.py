@@ -32,11 +32,7 @@ def digest(bundle: Bundle) -> str:
 
 
 def read_workload(file: Path, of: str = "") -> Workload | None:
-    """Return the workload of a file; None when the file is missing, damaged or of another source.
-
-    Args:
-        of: Expected ``digest``.
-    """
+    """Return the workload of a file; None when it is missing, damaged or has another ``digest`` than ``of``."""
     data = _content(file)
     return from_values(data) if data.get("digest", "") == of else None
 
@@ -79,11 +75,7 @@ def from_values(data: Any) -> Workload | None:
 
 
 def refuse_foreign_file(file: Path) -> None:
-    """Refuse a file that ``write_workload`` did not write.
-
-    Raises:
-        OutputError: when there is one.
-    """
+    """Refuse, with OutputError, a file that ``write_workload`` did not write."""
     if not os.path.lexists(file):
         return
     if file.is_symlink() or set(_content(file)) != {"layout", "digest", "graphs", "runs"}:
@@ -91,11 +83,7 @@ def refuse_foreign_file(file: Path) -> None:
 
 
 def write_workload(file: Path, work: Workload, of: str = "") -> None:
-    """Write a workload for ``read_workload``.
-
-    Raises:
-        OSError: when the file cannot be written.
-    """
+    """Write a workload for ``read_workload``; raises OSError when the file cannot be written."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(file) as draft:
         data = {**to_values(work), "digest": of}

@@ -227,11 +227,7 @@ class Profile(Strict):
         return self.engines[self.engine].int8_layout
 
     def mode(self, name: str | None = None) -> PowerMode:
-        """Return a power mode, the default one for None.
-
-        Raises:
-            ProfileError: when the board has no such mode.
-        """
+        """Return a power mode, the default one for None; raises ProfileError when the board has no such mode."""
         chosen = self.default_mode if name is None else name
         if chosen not in self.modes:
             raise ProfileError(

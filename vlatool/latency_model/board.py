@@ -42,11 +42,7 @@ class Candidate:
 
     @property
     def figures(self) -> EngineFigures:
-        """Figures of the engine in the profile.
-
-        Raises:
-            ProfileError: when it has no such engine.
-        """
+        """Figures of the engine in the profile; raises ProfileError when it has no such engine."""
         engines = self.profile.engines
         if self.engine not in engines:
             raise ProfileError.unknown(f"{self.profile.name} has no engine '{self.engine}'", self.engine, engines)

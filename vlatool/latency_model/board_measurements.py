@@ -44,11 +44,7 @@ class BoardMeasurement:
     ms: float
 
     def question(self) -> Question:
-        """Return the corresponding question to the model.
-
-        Raises:
-            ProfileError: when the profile, its mode or its engine is gone.
-        """
+        """Return the corresponding question; raises ProfileError when the profile, its mode or its engine is gone."""
         candidate = Candidate(load_profile(self.profile), self.mode, self.engine, self.precision)
         macs, weights, activations, layers = (float(self.work[name]) for name in NUMBERS)
         work = Work(macs, weights, activations, layers, frozenset(self.work.get("traits", ())))

@@ -49,16 +49,13 @@ class Sample:
         row = {point.question: index for index, point in enumerate(known)}
         figures = np.array([row[point.question] for point in asked], np.int64)
         published = np.array([point.log_ms for point in asked])
-        models, devices = (_codes([getattr(point, name) for point in known]) for name in ("model", "group"))
+        models, devices = (
+            np.unique([getattr(point, name) for point in known], return_inverse=True)[1] for name in ("model", "group")
+        )
         units = np.array([UNITS.index(point.kind) for point in known])
         questions = tuple(point.question for point in known if point.question is not None)
         logs = np.array([point.log_ms for point in known])
         return Sample(questions, logs, models, devices, units, figures, published)
-
-
-def _codes(names: Sequence[str]) -> Array:
-    known = {name: code for code, name in enumerate(sorted(set(names)))}
-    return np.array([known[name] for name in names])
 
 
 class Folds:

@@ -63,11 +63,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Data of a process: figures and scales.
-
-    Args:
-        logs: (n,) natural logarithm of the ms.
-    """
+    """Data of a process: figures and scales, with the natural logarithms of the ms in ``logs``, (n,)."""
 
     rows: Rows
     logs: Array
@@ -206,11 +202,7 @@ def unknown_reason(question: Question, published: bool, device_known: bool) -> s
 
 
 def load_model() -> LatencyModel:
-    """Return the model of the package's data files, or of those in ``$VLATOOL_LATENCY``.
-
-    Raises:
-        DataError: when the files there cannot be read.
-    """
+    """Return the model of the package, or of ``$VLATOOL_LATENCY``; raises DataError when its files cannot be read."""
     own = os.environ.get(MODEL_ENV)
     try:
         return read_model(Path(own) if own else DATA)

@@ -76,11 +76,7 @@ class Point:
 
 
 def read_points(path: Path) -> list[Point]:
-    """Read a file of published latencies.
-
-    Raises:
-        DataError: when it cannot be read, lacks a column, or a value is not a number; names the line.
-    """
+    """Read a file of published latencies; raises DataError, with the line, when it is unreadable or malformed."""
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             reader = csv.DictReader(stream)
@@ -91,7 +87,9 @@ def read_points(path: Path) -> list[Point]:
                     f"{path} has no column '{missing[0]}'; its columns: {known[:300]}.",
                     f"add the column '{missing[0]}'; docs/concepts/latency-model.md names all of them",
                 )
-            rows = [(reader.line_num, _strip_row(row)) for row in reader]
+            rows = [
+                (reader.line_num, {key: (text or "").strip() for key, text in row.items() if key}) for row in reader
+            ]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(
             f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.",
@@ -189,10 +187,6 @@ def _estimate(
     constant, by_macs, by_weights, by_trait = known
     extra = sum(by_trait.get(trait, 0.0) for trait in traits)
     return math.exp(constant + by_macs * math.log(macs) + by_weights * math.log(weights) + extra)
-
-
-def _strip_row(row: Mapping[str | None, str | None]) -> dict[str, str]:
-    return {key: (text or "").strip() for key, text in row.items() if key}
 
 
 def _name(device: str) -> str:

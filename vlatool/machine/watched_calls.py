@@ -44,11 +44,7 @@ class Call:
 
 
 class Page:
-    """The page, as both processes see it.
-
-    Args:
-        fd: descriptor from ``new_page``, which stays open.
-    """
+    """The page at the descriptor of ``new_page``, which stays open, as both processes see it."""
 
     def __init__(self, fd: int) -> None:
         self._memory = mmap.mmap(fd, PAGE_BYTES)

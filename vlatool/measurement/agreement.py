@@ -76,12 +76,7 @@ class Agreement:
 
 
 def measure_agreement(job: PairJob, timeout: float | None = None) -> Agreement:
-    """Measure in a fresh process.
-
-    Raises:
-        VlatoolError: what a bundle raises when it is loaded or run; GraphError when the process ends or takes longer
-            than ``timeout`` seconds.
-    """
+    """Measure in a fresh process; raises what a bundle raises, or GraphError when it ends or exceeds ``timeout`` s."""
     return ask("vlatool.measurement.agreement", job, Agreement, job.about, timeout)
 
 

@@ -47,11 +47,7 @@ class AnswerCheck:
 
 
 class Answers:
-    """Compares outputs with those of an unhurried pass.
-
-    Args:
-        expected: expected outputs of each observation: output name -> array.
-    """
+    """Compares outputs with those of an unhurried pass: output name -> array of each observation."""
 
     def __init__(self, expected: Sequence[Mapping[str, NDArray[Any]]]) -> None:
         self._expected = [dict(outputs) for outputs in expected]

@@ -110,11 +110,7 @@ def ask(
 
 
 def result_of(message: Result, kind: type[T], about: str) -> T:
-    """Return the result of a process.
-
-    Raises:
-        GraphError: when it is not of the type.
-    """
+    """Return the result of a process; raises GraphError when it is not of the type."""
     try:
         return from_json(kind, message.value, "answer")
     except ValueError as error:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Any
 
 from vlatool.measurement.child import ask, serve
 from vlatool.measurement.jobs import NO_LIMITS, ColdStartJob, Limits
-from vlatool.measurement.memory import peak_rss_mb, resident_mb
 
 FURTHER_CALLS = 5
 """Inferences after the first: an engine's arena may grow with the second."""
@@ -62,7 +62,6 @@ def cold_start(
     """Probe a bundle in a fresh process, which may take ``timeout`` seconds.
 
     Args:
-        bundle, engine, threads: bundle to load, with which engine and threads.
         observations: file of observations (``save_drawn``) to infer on after the golden one.
 
     Raises:
@@ -142,6 +141,26 @@ def _import_engine(name: str) -> None:
 
     engine: Any = registry.load("engines", name)
     engine.version()
+
+
+def resident_mb(status: Path = Path("/proc/self/status")) -> float:
+    """Return the resident set of this process in MB (10^6 bytes)."""
+    resident = _line_mb(status, "VmRSS:")
+    return peak_rss_mb(status) if resident is None else resident
+
+
+def peak_rss_mb(status: Path = Path("/proc/self/status")) -> float:
+    """Return the largest resident set of this process so far in MB (10^6 bytes).
+
+    ``ru_maxrss`` would do, but Linux lets a child inherit its parent's value; ``VmHWM`` belongs to the process alone.
+    """
+    peak = _line_mb(status, "VmHWM:")
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6 if peak is None else peak
+
+
+def _line_mb(status: Path, name: str) -> float | None:
+    lines = status.read_text(encoding="utf-8").splitlines()
+    return next((int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith(name)), None)
 
 
 if __name__ == "__main__":

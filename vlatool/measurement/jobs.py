@@ -64,11 +64,7 @@ class LatencyJob:
 
 @dataclass(frozen=True)
 class WorkerJob:
-    """What the agent asks of the worker.
-
-    Args:
-        named: folders whose code the user lets run (``trust.named_folders``).
-    """
+    """What the agent asks of the worker; ``named`` are folders whose code may run (``trust.named_folders``)."""
 
     job: LatencyJob
     named: Any = field(default_factory=list)

@@ -107,9 +107,5 @@ def medians(taken: Sequence[float], indices: Sequence[int]) -> dict[int, float]:
 
 
 def measure_pairs(job: PairJob, timeout: float | None = None) -> Pairs:
-    """Measure in a fresh process.
-
-    Raises:
-        VlatoolError: what a bundle raises; GraphError when the process ends or takes longer than ``timeout`` seconds.
-    """
+    """Measure in a fresh process; raises what a bundle raises, or GraphError when it ends or exceeds ``timeout`` s."""
     return ask("vlatool.measurement.turns", job, Pairs, job.about, timeout)

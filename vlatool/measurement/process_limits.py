@@ -130,11 +130,7 @@ def choose_processors(limits: Limits) -> Limits:
 
 
 def limit_this_process(limits: Limits) -> None:
-    """Take the limits upon this process and all that it starts.
-
-    Raises:
-        OSError: when a processor is not there.
-    """
+    """Take the limits upon this process and all that it starts; raises OSError when a processor is not there."""
     if limits.cpus:
         os.sched_setaffinity(0, limits.cpus)
     if limits.cgroup:

@@ -69,11 +69,7 @@ class Product:
 
 
 def measure_reach(engine: str, dtype: str, threads: int | None) -> float:
-    """Return how many multiply-accumulates an engine does in a second in a dtype, in 10^9.
-
-    Raises:
-        GraphError: see ``Product``.
-    """
+    """Return how many 10^9 multiply-accumulates an engine does in a second in a dtype; raises as ``Product``."""
     opened = Product(engine, dtype, threads)
     opened.run()
     seconds = []

@@ -50,16 +50,13 @@ def measurements(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | 
     else:
         rate_of_calls = 1e3 / float(np.mean(samples))
         numbers.append(latency.THROUGHPUT.measurement(rate_of_calls, samples=len(samples), note="back to back"))
-    numbers.append(_jitter(samples))
+    spread = float(np.subtract(*np.percentile(samples, [75, 25])))
+    note = "between the quartiles of the latency"
+    numbers.append(latency.JITTER.measurement(spread, samples=len(samples), note=note))
     busy = measured.cpu_s / max(measured.wall_s, 1e-9)
     numbers.append(resources.CPU.measurement(busy, note="user and system time of the process over the run"))
     board = _board(measured, pace.inferences if pace else len(samples))
     return [*numbers, *board, *_golden(policy), *cold_rows(policy)]
-
-
-def _jitter(samples: Sequence[float]) -> Measurement:
-    value = float(np.subtract(*np.percentile(samples, [75, 25])))
-    return latency.JITTER.measurement(value, samples=len(samples), note="between the quartiles of the latency")
 
 
 def _board(measured: Benchmark, actions: int) -> list[Measurement]:

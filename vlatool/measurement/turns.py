@@ -56,11 +56,7 @@ class Call:
 
 
 class Turns:
-    """Both policies, open, and the observations of a process.
-
-    Raises:
-        VlatoolError: when one cannot be loaded.
-    """
+    """Both policies, open, and the observations of a process; raises VlatoolError when one cannot be loaded."""
 
     def __init__(self, job: PairJob) -> None:
         self.job = job

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -23,14 +24,14 @@ GROWTH_MB = 5.0
 GROWTH = 0.05
 BUSY, BUSY_SHARE = 0.15, 0.1
 """Processors that may be busy before the run: so many, and so many more for each that there is."""
+suspect = partial(Finding, "suspect")
 
 
 def findings(measured: Benchmark, job: LatencyJob, duration_is_sustained: bool = False) -> tuple[Finding, ...]:
     """Return what bears on the measurement, the worst first.
 
     Args:
-        measured: what ``agent.measure`` returned.
-        job: what it was asked to do.
+        measured: what ``agent.measure`` returned for the job.
         duration_is_sustained: whether the run was meant to heat the board up: then throttling is its result.
     """
     seen = [
@@ -80,8 +81,7 @@ def busy(host: Mapping[str, Any]) -> Iterator[Finding]:
     """Tell of other work right before the run."""
     taken, cores = host.get("processors_busy"), host.get("cores_online") or 1
     if taken is not None and taken > BUSY + BUSY_SHARE * cores:
-        yield Finding(
-            "suspect",
+        yield suspect(
             f"other work kept {taken:.1f} of {cores} processors busy: the latencies are those of a contended machine",
             "repeat on an idle machine; ratios within the run still compare, absolute values do not",
         )
@@ -91,8 +91,7 @@ def _golden_findings(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
     for policy in policies:
         error = policy.golden_error
         if error is not None and error > policy.golden_explained:
-            yield Finding(
-                "suspect",
+            yield suspect(
                 f"the golden action of {policy.name} is off by {error:.2g} (relative) on this machine; rounding "
                 f"explains {policy.golden_explained:.2g}",
                 "see what its engine and processor compute in: vlatool explain, vlatool doctor",
@@ -110,8 +109,7 @@ def _threads_and_processors(measured: Benchmark, job: LatencyJob) -> tuple[int, 
 def _threads(measured: Benchmark, job: LatencyJob) -> Iterator[Finding]:
     threads, processors = _threads_and_processors(measured, job)
     if threads > processors:
-        yield Finding(
-            "suspect",
+        yield suspect(
             f"{threads} threads share {processors} processor{'s' if processors > 1 else ''}: they wait for each other",
             f"--threads {processors}, or fewer",
         )
@@ -121,8 +119,7 @@ def _contention(measured: Benchmark, job: LatencyJob) -> Iterator[Finding]:
     switches = measured.switches / max(measured.wall_s, 1e-9)
     threads, processors = _threads_and_processors(measured, job)
     if switches > SWITCHES_A_SECOND * threads and threads <= processors:
-        yield Finding(
-            "suspect",
+        yield suspect(
             f"other work took the processor from the measurement {switches:.0f} times in a second",
             "stop it, or keep processors free for the run (taskset, or benchmark --pin); ratios within the "
             "run still compare",
@@ -130,8 +127,7 @@ def _contention(measured: Benchmark, job: LatencyJob) -> Iterator[Finding]:
     stolen = measured.telemetry.counters.get("process.machine_steal") if measured.telemetry else None
     seconds = stolen.seconds * (measured.host.get("cores") or 1) if stolen else 0.0
     if stolen and stolen.difference > MAX_STOLEN_SHARE * seconds:
-        yield Finding(
-            "suspect",
+        yield suspect(
             f"the host of this virtual machine took {stolen.difference / seconds:.1%} of its processors' time",
             "measure on the board itself, or on a machine that is not shared",
         )
@@ -171,8 +167,7 @@ def _later(measured: Benchmark, job: LatencyJob, sustained: bool) -> Iterator[Fi
     moved = median(samples[-quarter:]) / median(samples[:quarter]) - 1
     if abs(moved) > LATER:
         longer = "--duration" if job.rate else "--sustained"
-        yield Finding(
-            "suspect",
+        yield suspect(
             f"the last quarter of {policy.name} was {_slower(moved)} than the first",
             f"warm up longer (--warmup), or see how it goes on: {longer} 600",
         )
@@ -186,8 +181,7 @@ def _memory(measured: Benchmark) -> Iterator[Finding]:
         return
     before, after = median(values[third : 2 * third]), median(values[-third:])
     if after - before > max(GROWTH_MB, GROWTH * before):
-        yield Finding(
-            "suspect",
+        yield suspect(
             f"the process grew from {before:.0f} to {after:.0f} MB while it was measured",
             "see whether it goes on: --duration 600",
         )

@@ -12,9 +12,11 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.module_bundle import export_command
@@ -27,10 +29,10 @@ from vlatool.measurement.clock_drift import canary_ms
 from vlatool.measurement.interleaved import BLOCKS, Contestant, OnProgress, run_interleaved, unique_names
 from vlatool.measurement.jobs import LatencyJob, WorkerJob
 from vlatool.measurement.paced import run_paced
-from vlatool.measurement.phases import time_phases
 from vlatool.measurement.reach import reach_by_dtype
 from vlatool.measurement.results import Benchmark, GraphEngine, Pace, Phase, PolicyRun
 from vlatool.runtime.policy import Policy
+from vlatool.runtime.program import Program, Session
 from vlatool.user_code import trust
 
 OBSERVATIONS = 32
@@ -38,6 +40,9 @@ FIRST_RUN_S = 900.0
 """A benchmark is also for what no robot would wait for."""
 EXTRA_S = 3.0
 """Seconds at most for the phases, and for the look at repeated observations."""
+ACTIONS = 60
+FEWEST = 5
+ENCODE, REST = "encode observation", "decode action and the rest"
 
 
 def main(stream: IO[str]) -> Benchmark:
@@ -125,11 +130,7 @@ def measure(
 
 
 def open_policy(path: str, job: LatencyJob) -> Contestant:
-    """Open a bundle through the runtime, or a torch source in eager torch.
-
-    Raises:
-        BundleError: when there is nothing to run.
-    """
+    """Open a bundle in the runtime, or a torch source in eager torch; raises BundleError when it is neither."""
     bundle = Bundle.open(Path(path))
     manifest = bundle.manifest
     if manifest.graphs:
@@ -198,6 +199,57 @@ def _engines(policy: Policy) -> Iterator[GraphEngine]:
             computes_in=getattr(session, "precision", graph.compute or "float32"),
             macs_in=", ".join(f"{kind} {share:.1%}" for kind, share in shares),
         )
+
+
+class _Timed:
+    """A session that notes how long each run takes."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.taken: list[float] = []
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        start = time.perf_counter_ns()
+        outputs = self._session.run(feeds)
+        self.taken.append((time.perf_counter_ns() - start) / 1e6)
+        return outputs
+
+
+def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], seconds: float) -> list[Phase]:
+    """Return the parts of an inference, in their order.
+
+    Args:
+        policy: left as it was.
+        observations: observations, used in turns.
+        seconds: time after which no further action begins, once ``FEWEST`` are timed.
+    """
+    sessions = {name: _Timed(session) for name, session in policy.program.sessions.items()}
+    timed = Policy(policy.bundle, Program(policy.program.steps, sessions, seed=0), policy.engine)
+    encoded: list[float] = []
+    whole: list[float] = []
+    end = time.monotonic() + seconds
+    for number in range(ACTIONS):
+        if number >= FEWEST and time.monotonic() > end:
+            break
+        start = time.perf_counter_ns()
+        values = timed.encode(observations[number % len(observations)])
+        encoded.append((time.perf_counter_ns() - start) / 1e6)
+        timed.infer(values)
+        whole.append((time.perf_counter_ns() - start) / 1e6)
+    return _phases(whole, encoded, {name: session.taken for name, session in sessions.items()})
+
+
+def _phases(whole: Sequence[float], encoded: Sequence[float], graphs: Mapping[str, Sequence[float]]) -> list[Phase]:
+    actions = len(whole)
+    sums = {ENCODE: np.array(encoded)}
+    sums |= {name: np.array(taken).reshape(actions, -1).sum(1) for name, taken in graphs.items() if taken}
+    sums[REST] = np.array(whole) - sum(sums.values())
+    total = float(np.median(whole))
+    phases = []
+    for name, taken_ms in sums.items():
+        calls, middle = len(graphs.get(name, whole)) // actions, float(np.median(taken_ms))
+        phases.append(Phase(name, calls, round(middle / calls, 5), round(100 * middle / total, 1)))
+    return phases
 
 
 if __name__ == "__main__":

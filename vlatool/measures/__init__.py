@@ -176,11 +176,7 @@ def quantities() -> dict[str, Quantity]:
 
 @cache
 def families() -> tuple[Family, ...]:
-    """Return the families, those whose names begin alike for longest first.
-
-    Raises:
-        PluginError: as ``quantities``.
-    """
+    """Return the families, those whose names begin alike for longest first; raises PluginError as ``quantities``."""
     found = [value for value in registry.values("measures", Quantity, Family) if isinstance(value, Family)]
     return tuple(sorted(found, key=lambda family: -family.each.name.index("{")))
 

@@ -77,11 +77,7 @@ class Values:
         return any(node is None or self._silent(node) for node in nodes)
 
     def multiply(self, axes: Shape, widths: Sequence[Axis] = ()) -> None:
-        """Note a product.
-
-        Args:
-            widths: those of its weights, without those of a kernel.
-        """
+        """Note a product; ``widths`` are those of its weights, without those of a kernel."""
         self.products.append(axes)
         self.widths.append(list(widths))
 

@@ -20,11 +20,7 @@ SIZE_ARGUMENTS = {
 
 
 class Resizer:
-    """Writes the new sizes into operators that state some.
-
-    Args:
-        keep: factor -> its elements that stay.
-    """
+    """Writes the new sizes into operators that state some; ``keep`` maps factors to elements that stay."""
 
     def __init__(self, walk: Walk, keep: Mapping[int, Sequence[int]]) -> None:
         self._walk, self._keep = walk, keep

@@ -292,11 +292,7 @@ def _remedy_of_casting(error: Exception) -> str:
 
 
 def draw_noise(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.random.Generator) -> dict[str, Tensor]:
-    """Draw a batch of what a program draws.
-
-    Args:
-        noise: value name -> shape and distribution, as the program has them.
-    """
+    """Draw a batch of a program's ``noise``: value name -> shape and distribution, as the program has them."""
     torch = require("torch", "build")
     batches = {name: {**wanted, "shape": (size, *wanted["shape"][1:])} for name, wanted in noise.items()}
     return {

@@ -267,11 +267,7 @@ def write_location(out: Path, folder: Path) -> None:
 
 
 def read_location(bundle: Path) -> Path:
-    """Return the folder of the policy's code.
-
-    Raises:
-        SourceError: when the bundle has no note, or the folder is gone.
-    """
+    """Return the folder of the policy's code; raises SourceError when the bundle has no note, or the folder is gone."""
     try:
         folder = Path(json.loads((bundle / LOCATION).read_text(encoding="utf-8"))["folder"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -317,12 +313,11 @@ def _map(file: Path, data: Mapping[str, Any], key: str) -> dict[str, str]:
 
 
 def copy_assets(described: Description, out: Path) -> None:
-    """Copy tokenizers and statistics to ``assets/``, recorded data to ``data/``.
+    """Copy tokenizers and statistics to ``assets/``.
 
     Raises:
         SourceError: when a file that the spec names is missing.
         SpecError: when statistics or a vocabulary do not fit the spec; names the user's file, not the copy.
-        DataError: when a recording cannot be read or does not fit the spec; names the user's file.
     """
     for file in described.assets():
         name = file.relative_to(described.folder)
@@ -335,6 +330,14 @@ def copy_assets(described: Description, out: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
     check_assets(described, out / "assets")
+
+
+def carry_recordings(described: Description, out: Path) -> None:
+    """Put recorded data into ``data/`` of a bundle.
+
+    Raises:
+        DataError: when a recording cannot be read or does not fit the spec; names the user's file.
+    """
     keeps = keeps_values(described.program)
     for purpose, path in described.recordings().items():
         recording = NamedRecording(path, described.maps.get(purpose, {}))

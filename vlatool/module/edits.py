@@ -60,11 +60,7 @@ def holds_weights(bundle: Bundle) -> bool:
 
 
 def read_edits(bundle: Bundle) -> tuple[Edit, ...]:
-    """Return the structural edits of a bundle.
-
-    Raises:
-        SourceError: when the file is invalid.
-    """
+    """Return the structural edits of a bundle; raises SourceError when the file is invalid."""
     if EDITS not in bundle.manifest.files:
         return ()
     path = bundle.file(EDITS)
@@ -72,11 +68,7 @@ def read_edits(bundle: Bundle) -> tuple[Edit, ...]:
 
 
 def edits_from(text: str | bytes, where: str) -> tuple[Edit, ...]:
-    """Return the edits of a JSON list.
-
-    Raises:
-        SourceError: when it is not one.
-    """
+    """Return the edits of a JSON list; raises SourceError when it is not one."""
     content = text.encode() if isinstance(text, str) else text
     listed = read_json(content, where, SourceError, REMAKE, strict=True)
     if not isinstance(listed, list):
@@ -237,11 +229,7 @@ def _keep_blocks(module: Any, edit: Edit) -> None:
 
 
 def read_tensors(path: Path) -> dict[str, Any]:
-    """Return the tensors of a safetensors file: name -> tensor.
-
-    Raises:
-        SourceError: when the file cannot be read, or is not safetensors.
-    """
+    """Return name -> tensor of a safetensors file; raises SourceError when it is unreadable or another format."""
     safetensors = require("safetensors.torch", "build")
     try:
         return dict(safetensors.load_file(str(path)))

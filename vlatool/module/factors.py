@@ -110,11 +110,7 @@ class Factors:
         return np.tile(np.repeat(found, after), before)
 
     def elements(self, axis: Iterable[int], keep: Mapping[int, Sequence[int]]) -> NDArray[Any]:
-        """Return the elements of an axis that stay.
-
-        Args:
-            keep: factor -> its elements that stay; all of the others stay.
-        """
+        """Return the elements of an axis that stay; ``keep`` maps factors to theirs, and all of the others stay."""
         found = np.zeros(1, dtype=np.int64)
         for leaf in self.leaves(axis):
             chosen = np.asarray(keep.get(leaf, range(self.sizes[leaf])), dtype=np.int64)

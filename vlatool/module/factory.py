@@ -27,11 +27,7 @@ _END = object()
 
 
 def split_factory(factory: str) -> tuple[str, str]:
-    """Split ``WHERE:FUNCTION``.
-
-    Raises:
-        SourceError: when it is not of that form.
-    """
+    """Split ``WHERE:FUNCTION``; raises SourceError when it is not of that form."""
     where, _, function = factory.rpartition(":")
     if not where or not function.isidentifier():
         raise _no_function(factory)
@@ -96,11 +92,7 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
 
 
 def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
-    """Import the factory and call it.
-
-    Raises:
-        SourceError: when the call raises.
-    """
+    """Import the factory and call it; raises SourceError when the call raises."""
     make = import_factory(factory, folder)
     with _name_function(factory, folder, f"the factory '{factory}'"):
         return make(**arguments)

@@ -131,11 +131,7 @@ CAUSES = (
 
 
 def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
-    """Return the error for an export that failed.
-
-    Args:
-        error: what ``torch.onnx.export`` raised.
-    """
+    """Return the error for an export in which ``torch.onnx.export`` raised ``error``."""
     chain = list(_chain(error))
     cause = _cause(chain, module)
     parts = [f"torch cannot export the graph '{graph}'"]

@@ -40,11 +40,7 @@ def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
 
 
 def outputs_of(result: Any, step: ProgramStep) -> list[Any]:
-    """Return what a module gave as a list, one value for each output of its step.
-
-    Raises:
-        SourceError: for another number of outputs.
-    """
+    """Return what a module gave as a list, an entry per output of its step; raises SourceError for another number."""
     outputs = list(result) if isinstance(result, tuple | list) else [result]
     if len(outputs) != len(step.gives):
         raise SourceError(

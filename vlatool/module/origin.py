@@ -45,11 +45,7 @@ class Origin:
     training: str = ""
 
     def check(self, endings: tuple[str, ...] = ()) -> None:
-        """Raise when a file is not what it was: every one, or those with these endings.
-
-        Raises:
-            SourceError: naming the file.
-        """
+        """Check every file, or those with these endings; raises SourceError naming one that is not what it was."""
         path = factory_file(self.factory, self.folder)
         for name, digest in self.code.items():
             file = (path.parent if path else self.folder) / name
@@ -59,11 +55,7 @@ class Origin:
                 raise SourceError(f"{file} has changed since the source bundle was made.", RESTART)
 
     def build(self) -> Any:
-        """Call the factory.
-
-        Raises:
-            SourceError: when it fails, or imports a file of its folder that was not recorded.
-        """
+        """Call the factory; raises SourceError when it fails, or imports a file of its folder that was not recorded."""
         before = set(sys.modules)
         product = call_factory(self.factory, self.folder, dict(self.arguments))
         self._check_imports({name: module for name, module in sys.modules.items() if name not in before})

@@ -31,11 +31,7 @@ Locations = dict[str, dict[str, StoredTensor]]
 
 @dataclass(frozen=True)
 class StoredModules:
-    """Modules without weights, and where these are.
-
-    Args:
-        modules: graph name -> module, parameters on torch's meta device.
-    """
+    """Modules, graph name -> module with parameters on torch's meta device, and where their weights are."""
 
     modules: dict[str, nn.Module]
     locations: Locations

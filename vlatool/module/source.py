@@ -6,19 +6,45 @@ A source yields one ``Description``, however the policy was written down. Code o
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from pydantic import Field
+
 from vlatool import registry
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
+from vlatool.data import MAP_HELP, PURPOSES, named_recording, reader_of
 from vlatool.errors import SourceError
 from vlatool.module.description import Description, file_source
 from vlatool.module.foreign_files import foreign, foreign_format
 from vlatool.registry import Claim
 from vlatool.stage.base import Stage, Transform
+from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+RECORDING_OPTIONS = (*PURPOSES, "map")
+"""Options of every source that name recordings."""
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Recordings that a user names beside a policy.
+
+    Args:
+        calibration, evaluation: a file or a directory each; empty for what the policy itself names.
+        map: ``NAME=RECORDED`` of the names that they have for those of the spec.
+    """
+
+    calibration: str = ""
+    evaluation: str = ""
+    map: tuple[str, ...] = ()
+
+
+OWN_RECORDINGS = RecordingOptions()
+"""What the policy itself names."""
 
 
 class Source(Transform):
@@ -28,6 +54,9 @@ class Source(Transform):
     """What it reads, for messages: ``a .onnx file``."""
     policy: Path | None = None
     """What holds the description of the policy; None where only its graphs say what it is."""
+    calibration: Path | None = Field(None, description="recordings to calibrate with; those of policy.yaml if unset")
+    evaluation: Path | None = Field(None, description="recordings to evaluate on; those of policy.yaml if unset")
+    map: tuple[str, ...] = Field((), description=MAP_HELP)
 
     @classmethod
     def claims(cls, typed: str) -> Claim:
@@ -36,11 +65,7 @@ class Source(Transform):
 
     @classmethod
     def of(cls, typed: str) -> Self:
-        """Return the stage for what a person types as SOURCE, which this source claims.
-
-        Raises:
-            SourceError: when it is wrong.
-        """
+        """Return the stage for a typed SOURCE that this source claims; raises SourceError when it is wrong."""
         return cls.model_validate({"policy": Path(typed)})
 
     def describe(self) -> Description | None:
@@ -64,6 +89,32 @@ class Source(Transform):
     def described_by(self, description: Path) -> Self:
         """Return the same source with the ``policy.yaml`` that names it."""
         return self.model_copy(update={"policy": description})
+
+    def with_recordings(self, recordings: RecordingOptions) -> Self:
+        """Return the same source with recordings in the place of those that its description names.
+
+        Raises:
+            DataError: when one does not exist, or is of an unknown format.
+            UsageError: when a name is mapped in a wrong way, or there is no recording that it could be of.
+        """
+        paths = {purpose: Path(named) for purpose in PURPOSES if (named := getattr(recordings, purpose))}
+        for path in paths.values():
+            reader_of(path)
+        named_recording(next(iter(paths.values()), None), recordings.map)
+        return self.model_copy(update={**paths, "map": recordings.map})
+
+    def with_given(self, described: Description) -> Description:
+        """Return a description with the recordings that the options name in the place of its own."""
+        paths = {purpose: path for purpose in PURPOSES if (path := getattr(self, purpose))}
+        named = {purpose: named_recording(path, self.map) for purpose, path in paths.items()}
+        maps = {purpose: recording.names for purpose, recording in named.items() if recording}
+        return replace(described, **paths, maps={**described.maps, **maps})
+
+    def record(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the entry of the build record, with options and those that name recordings."""
+        entry = made_by(self)
+        recordings = {name: value for name, value in entry["options"].items() if name in RECORDING_OPTIONS}
+        return {**entry, "options": {**options, **recordings}}
 
     def trust_code(self) -> Self:
         """Allow the policy's code to run in this process: the user typed its folder."""
@@ -124,11 +175,7 @@ def source_of_policy(typed: str | Path) -> Source:
 
 
 def describe(policy: Path) -> Description:
-    """Return the description of a policy, read by the source that claims it.
-
-    Raises:
-        SourceError: when there is none.
-    """
+    """Return the description of a policy, read by the source that claims it; raises SourceError when there is none."""
     described = source_of_policy(policy).describe()
     if described is None:
         raise SourceError(f"{policy} has no description.", "write a policy.yaml beside it")

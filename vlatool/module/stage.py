@@ -83,11 +83,7 @@ class ModuleStage(Transform):
             )
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
-        """Change weights in place, and return what else is to be changed.
-
-        Args:
-            source: bundle with the recordings.
-        """
+        """Change weights in place, and return further changes; ``source`` is the bundle with the recordings."""
         raise NotImplementedError(self.name())
 
     def in_parts(self) -> bool:

@@ -41,11 +41,7 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
 
 
 def unedited_modules(source: Bundle) -> dict[str, nn.Module]:
-    """Build the modules that the factory makes, whatever the bundle changes in them: graph name -> module.
-
-    Raises:
-        SourceError: as ``load_modules`` does.
-    """
+    """Build the factory's modules without the bundle's changes: graph name -> module; raises as ``load_modules``."""
     require("torch", "build")
     origin = origin_of(source)
     origin.check()
@@ -94,11 +90,7 @@ class TorchSession:
         self.last_feeds: deque[Mapping[str, Any]] = deque(maxlen=2)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run the module on numpy arrays.
-
-        Raises:
-            SourceError: as ``run_module`` does.
-        """
+        """Run the module on numpy arrays; raises SourceError as ``run_module`` does."""
         torch = require("torch", "build")
         if self.first_feeds is None:
             self.first_feeds = dict(feeds)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vlatool import registry
 from vlatool.motion.metric import Metric
 from vlatool.motion.track import Track
+from vlatool.stats.bootstrap import resampled_sums
 
 KIND = "motion"
 RESAMPLES = 2000
@@ -56,9 +57,7 @@ def ratio_of(
     value = float(own.mean()) / mean
     if len(base) < MIN_PAIRS:
         return value, 0.0, float("inf")
-    random = np.random.default_rng(len(base))
-    weights = random.multinomial(len(base), np.full(len(base), 1 / len(base)), RESAMPLES)
-    over, under = weights @ own, weights @ base
+    over, under = resampled_sums((own, base), RESAMPLES, np.random.default_rng(len(base)))
     ratios = np.divide(over, under, out=np.full(RESAMPLES, np.inf), where=under > 0)
     low, high = np.quantile(ratios, [(1 - confidence) / 2, (1 + confidence) / 2], method="nearest")
     return value, float(low), float(high)

@@ -41,11 +41,7 @@ class Budget:
         return row.get(quantity_of(self.name)) or row.get(ERROR_BASELINE_OF.quantity(self.name))
 
     def require(self, row: Row) -> Measurement:
-        """Return the measurement of a row that the budget is about.
-
-        Raises:
-            RecipeError: when the row has none of that name; names those that it has.
-        """
+        """Return the row's measurement for the budget; raises RecipeError, naming those it has, when it lacks that."""
         measurement = self.of(row)
         if measurement is not None:
             return measurement

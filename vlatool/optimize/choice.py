@@ -107,10 +107,6 @@ def _best(
     return best, f"{reason} ({origin}); {best.row.reason}"
 
 
-def _medians(row: Row, base: Row) -> str:
-    return f"{p50(row):.4g} ms instead of {p50(base):.4g} ms, measured on this host"
-
-
 def foretold(row: Row, base: Row, elsewhere: str) -> str:
     """Return a sentence on what a row is predicted to need on a board, with its range; empty without a board."""
     latency = row.get(LATENCY_P50, "predicted")
@@ -138,7 +134,8 @@ def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
     known = speedup is not None and speedup.low is not None and speedup.high is not None
     span = f"; {speedup.low:.2f} to {speedup.high:.2f}" if speedup and known else ""
     times = ratio(row, base)
-    here = "measured on this host" if elsewhere else _medians(row, base)
+    medians = "" if elsewhere else f"{p50(row):.4g} ms instead of {p50(base):.4g} ms, "
+    here = f"{medians}measured on this host"
     if is_faster(row, base):
         return f"{times:.2f}x as fast as {base.name} ({span[2:] + '; ' if elsewhere and span else ''}{here})"
     return f"not shown to be faster than {base.name} ({times:.3g}x{span}; {here})"

@@ -26,6 +26,7 @@ from vlatool.files.directory_writer import write_directory
 from vlatool.files.messages import from_json, to_json
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import MAX_CPU_ISA
+from vlatool.module.source import OWN_RECORDINGS, RecordingOptions
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.build_candidates import build, chain
 from vlatool.optimize.decision import Tables, decide, enough_for
@@ -58,6 +59,7 @@ class OptimizeJob:
     workers: int
     command: str
     launcher: str = "processes"
+    recordings: RecordingOptions = OWN_RECORDINGS
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ def _confined(plan: Plan, profile: Profile, confine: str, draft: Path, context: 
     job = OptimizeJob(
         plan.typed, profile.model_dump(mode="json"), plan.recipe.model_dump(mode="json", by_alias=True),
         str(plan.cache), str(draft), plan.fresh, context.workers, context.command, context.launcher,
+        plan.recordings,
     )  # fmt: skip
     about = f"optimize, confined to {confine},"
     here = "vlatool.optimize.pipeline:optimize_here"
@@ -110,7 +113,7 @@ def optimize_here(request: Mapping[str, Any], tell: OnProgress) -> None:
     """Run an ``OptimizeJob`` in this process; its report is in the draft."""
     job = from_json(OptimizeJob, request)
     profile, recipe = Profile.model_validate(job.profile), Recipe.model_validate(job.recipe)
-    plan = make_plan(job.source, profile, recipe, Path(job.cache), fresh=job.fresh)
+    plan = make_plan(job.source, profile, recipe, Path(job.cache), job.recordings, fresh=job.fresh)
     _optimized(plan, Path(job.draft), Context(tell, job.workers, job.command, launcher=job.launcher))
 
 

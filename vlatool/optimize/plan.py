@@ -12,6 +12,7 @@ from vlatool.files.printable import mask_passwords
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import fingerprint, matches
 from vlatool.machine.instruction_sets import BoardSet, board_set
+from vlatool.module.source import OWN_RECORDINGS, RecordingOptions
 from vlatool.optimize.recipe import Limits, Pruning, Recipe, StageList, stage_entries
 from vlatool.optimize.study_storage import check_storage
 from vlatool.sources import Source, source_stage
@@ -33,6 +34,7 @@ class Plan:
         profile: The board; None for this host.
         fresh: Measure again, even what was measured before.
         typed: The source as the user named it.
+        recordings: Recordings that the user named.
     """
 
     source: Source
@@ -43,6 +45,7 @@ class Plan:
     cache: Path
     fresh: bool = False
     typed: str = ""
+    recordings: RecordingOptions = OWN_RECORDINGS
 
     @property
     def board_set(self) -> BoardSet:
@@ -94,13 +97,24 @@ class Plan:
         yield f"cache       {self.cache}"
 
 
-def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
+def make_plan(
+    source: str,
+    profile: Profile | None,
+    recipe: Recipe,
+    cache: Path,
+    recordings: RecordingOptions = OWN_RECORDINGS,
+    *,
+    fresh: bool = False,
+) -> Plan:
     """Build and check every stage; nothing has run when this returns.
+
+    Args:
+        recordings: recordings in the place of those that the policy names.
 
     Raises:
         VlatoolError: for the first thing that cannot work.
     """
-    stage = source_stage(source)
+    stage = source_stage(source).with_recordings(recordings)
     stage.check(None, profile)
     export = () if stage.has_graphs else transforms(recipe.export)
     candidates = {name: transforms(stages) for name, stages in recipe.candidates.items()}
@@ -121,7 +135,7 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
             check_storage(recipe.pruning.study)
     elif study := recipe.pruning.study:
         raise RecipeError(f"The study {mask_passwords(study)} keeps trials; none are asked for.", "add --trials 8")
-    plan = Plan(stage, export, candidates, recipe, profile, cache, fresh, source)
+    plan = Plan(stage, export, candidates, recipe, profile, cache, fresh, source, recordings)
     asked = {"--max-motion": recipe.limits.max_motion, "--worst-task": recipe.limits.worst_task}
     if plan.closed_loop is None and (named := [name for name, limit in asked.items() if limit is not None]):
         raise RecipeError(

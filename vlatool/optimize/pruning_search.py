@@ -84,10 +84,9 @@ class PrunedSearch:
             study.tell(number, self._try(shape, space))
         tried = study.ended_trials()
         chosen = self._finalists(tried, space)
-        return (
-            {space.name(each.shape): space.stages(each.shape) for each in chosen},
-            {_titled(study.under_way()): self._table(tried, space)},
-        )
+        more = f"; {elsewhere} under way in other processes" if (elsewhere := study.under_way()) else ""
+        plans = {space.name(each.shape): space.stages(each.shape) for each in chosen}
+        return plans, {f"Pruned policies, by trials{more}": self._table(tried, space)}
 
     def _name(self) -> str:
         """Return what trials share that may be compared: the policy, how it is trained and judged, limits and board."""
@@ -231,8 +230,3 @@ def front_of(tried: list[Tried]) -> list[Tried]:
 def _training_s(made: tuple[Bundle, ...]) -> float:
     """Return the seconds that the trainings of a policy took when it was trained."""
     return sum(item.value for row in training_rows(made) for item in TRAINING_TIME.members(row).values())
-
-
-def _titled(elsewhere: int) -> str:
-    more = f"; {elsewhere} under way in other processes" if elsewhere else ""
-    return f"Pruned policies, by trials{more}"

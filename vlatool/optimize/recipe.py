@@ -136,11 +136,7 @@ def default_recipe(
 
 
 def read_recipe(path: Path) -> Recipe:
-    """Read a recipe file.
-
-    Raises:
-        RecipeError: when the file is missing, is not YAML, or says something impossible; lists every problem.
-    """
+    """Read a recipe file; raises RecipeError with every problem: missing, not YAML, impossible values."""
     if not path.exists():
         raise RecipeError(
             f"There is no recipe {path}.", "check the path; the output of vlatool optimize holds a recipe.yaml"
@@ -154,11 +150,7 @@ def read_recipe(path: Path) -> Recipe:
 
 
 def stage_entries(stages: StageList) -> list[tuple[str, dict[str, Any]]]:
-    """Return (name, options) of each stage.
-
-    Raises:
-        RecipeError: when an entry is not a mapping of one name to options.
-    """
+    """Return (name, options) of each stage; raises RecipeError for an entry that does not map one name to options."""
     entries: list[tuple[str, dict[str, Any]]] = []
     for entry in stages:
         if len(entry) != 1:

@@ -119,6 +119,7 @@ class Search:
             self._try(name, stages)
         for base in list(self.trials):
             self._combine(base)
+        self._try_methods()
         self._repair()
         chosen = self._finalists()
         return {trial.name: trial.stages for trial in chosen if trial.name not in candidates}
@@ -212,15 +213,33 @@ class Search:
                 found.append((trial, extra))
         return found
 
+    def _try_methods(self) -> None:
+        """Choose the ranges of fast plans outside the budget in the other ways that were tried of slower ones.
+
+        Which way is the most accurate depends on what is int8: one that loses on products of weights may win once the
+        products of attention are int8, too.
+        """
+        left = MAX_COMBINATIONS
+        for base in sorted(self.trials, key=lambda trial: -trial.speedup):
+            ((name, given),) = base.stages[-1].items()
+            tried = [trial.stages[-1][name] for trial in self.trials if name in trial.stages[-1]]
+            for method in dict.fromkeys(options["method"] for options in tried if "method" in options):
+                options = {**given, "method": method}
+                if left and options not in tried and self._is_worth_mending(base):
+                    self._try(f"{base.name}_{method}", (*base.stages[:-1], {name: options}))
+                    left -= 1
+
+    def _is_worth_mending(self, trial: Trial) -> bool:
+        """Return whether a plan is outside the budget, and faster than what is inside."""
+        rivals = [other for other in self.trials if other.within and other.engine == trial.engine]
+        best = max((other.speedup for other in rivals), default=0.0)
+        return not trial.within and trial.speedup > 1.05 * best and math.isfinite(trial.error)
+
     def _repair(self) -> None:
         """Leave sensitive layers in float where a plan is fast enough to be worth it, but outside the budget."""
         for trial in sorted(self.trials, key=lambda trial: -trial.speedup):
-            rivals = [other for other in self.trials if other.within and other.engine == trial.engine]
-            best = max((other.speedup for other in rivals), default=0.0)
-            if trial.within or trial.speedup <= 1.05 * best or not math.isfinite(trial.error):
-                continue
             stage = transforms(trial.stages)[-1]
-            if isinstance(stage, StaticInt8):
+            if self._is_worth_mending(trial) and isinstance(stage, StaticInt8):
                 self._mix(trial, stage)
 
     def _mix(self, trial: Trial, stage: StaticInt8) -> None:

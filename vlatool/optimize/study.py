@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 STARTUP = 6
 """Trials after which what was found says what is tried next; before, the first shapes, then random ones."""
+REMEDY = "take a study that vlatool made, or a new one: another --study"
 QUANTIZED_KEY = "quantized"
 NOTE_KEY, AGAIN_KEY, WORKER_KEY, TRAINING_KEY, REFUSED_KEY = "note", "again", "worker", "training_s", "refused"
 REPEATS = 10
@@ -82,11 +83,7 @@ class Study:
             )
 
     def agree_on(self, quantized: Mapping[str, StageList]) -> dict[str, StageList]:
-        """Return how all who share the study quantize: what the first of them found.
-
-        Raises:
-            DataError: when the study holds something else.
-        """
+        """Return how all who share the study quantize, as the first of them found; raises DataError for other data."""
         with storage_errors(self._url):
             if QUANTIZED_KEY not in self._study.user_attrs:
                 self._study.set_user_attr(QUANTIZED_KEY, [[name, list(stages)] for name, stages in quantized.items()])
@@ -95,10 +92,7 @@ class Study:
             agreed = {str(name): tuple(stages) for name, stages in held}
             known = quantizations(agreed)
         except (AttributeError, TypeError, ValueError, VlatoolError) as error:
-            raise DataError(
-                f"The study says of quantization what vlatool cannot read: {error}.",
-                "take a study that vlatool made, or a new one: another --study",
-            ) from error
+            raise DataError(f"The study says of quantization what vlatool cannot read: {error}.", REMEDY) from error
         if known != agreed or FLOAT32 in agreed:
             raise DataError("The study names stages that do not quantize.", "name another study")
         return {**agreed, FLOAT32: ()}
@@ -163,11 +157,7 @@ class Study:
         self._study.tell(number, state=self._optuna.trial.TrialState.FAIL, skip_if_finished=True)
 
     def tell(self, number: int, tried: Tried) -> None:
-        """Keep what a trial found; one that could not be made is kept with the reason.
-
-        Raises:
-            UsageError: when the study cannot be written any more.
-        """
+        """Keep what a trial found, or why it could not be made; raises UsageError when the study cannot be written."""
         if tried.note or not (math.isfinite(tried.speedup) and math.isfinite(tried.drop)):
             note = tried.note[:LONGEST] or "its accuracy could not be measured"
             tried = Tried(tried.shape, training_s=tried.training_s, note=note)
@@ -243,10 +233,7 @@ class Study:
             seconds = float(trial.user_attrs.get(TRAINING_KEY, 0.0))
             note, refused = (str(trial.user_attrs.get(name, ""))[:LONGEST] for name in (NOTE_KEY, REFUSED_KEY))
         except (TypeError, ValueError) as error:
-            raise DataError(
-                f"Trial {trial.number} of the study is not a trial of vlatool: {error}.",
-                "take a study that vlatool made, or a new one: another --study",
-            ) from error
+            raise DataError(f"Trial {trial.number} of the study is not a trial of vlatool: {error}.", REMEDY) from error
         if not self._space.holds(shape) or not speedup >= 0 or math.isnan(drop):
             raise DataError(
                 f"Trial {trial.number} of the study is not of this policy: {trial.params}, {trial.values}.",

@@ -164,11 +164,7 @@ class FileLock:
         self._handle = -1
 
     def acquire(self) -> bool:
-        """Wait for the lock.
-
-        Raises:
-            UsageError: when another process has it for longer than the limit ``study_seconds``, or it cannot be made.
-        """
+        """Wait for the lock; raises UsageError when others hold it for ``study_seconds``, or it cannot be made."""
         try:
             handle = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         except OSError as error:

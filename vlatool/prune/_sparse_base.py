@@ -134,8 +134,7 @@ def smallest_mask(score: Tensor, pattern: Pattern, share: float, *, rows: bool) 
     flat = score if rows else score.reshape(1, -1)
     count = round(flat.shape[1] * share)
     ranks = flat.argsort(dim=1, stable=True).argsort(dim=1)
-    smallest: Tensor = (ranks < count).reshape(score.shape)
-    return smallest
+    return (ranks < count).reshape(score.shape)
 
 
 def describe_zeros(pruned: Bundle, pattern: Pattern) -> tuple[str, str]:

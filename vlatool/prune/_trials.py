@@ -19,11 +19,7 @@ NUDGE, NUDGES = 0.01, 5
 
 
 class Trials:
-    """Measurements of each choice, over all of its runs.
-
-    Args:
-        wholes: Milliseconds of the unpruned policy in earlier runs.
-    """
+    """Measurements of each choice, over all of its runs; ``wholes`` are ms of the unpruned policy in earlier runs."""
 
     def __init__(self, meter: LatencyMeter, wholes: list[float]) -> None:
         self._meter, self._wholes = meter, wholes

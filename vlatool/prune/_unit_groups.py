@@ -153,11 +153,7 @@ def rank_units(
 
 
 class Macs:
-    """Counter of the multiply-accumulates of one inference.
-
-    Args:
-        runs: Graph name -> number of runs.
-    """
+    """Counter of the multiply-accumulates of one inference; ``runs`` maps graph names to numbers of runs."""
 
     def __init__(self, walks: Mapping[str, Walk], runs: Mapping[str, int], groups: Sequence[UnitGroup]) -> None:
         self._group_indices = {(group.graph, group.leaf): number for number, group in enumerate(groups)}

@@ -247,11 +247,7 @@ class _Candidate:
 
 
 class _Selector:
-    """Selects units and blocks to remove by their measured costs.
-
-    Args:
-        prices: Role of a group -> milliseconds for a multiply-accumulate.
-    """
+    """Selects units and blocks by their costs; ``prices`` maps roles of groups to ms for a multiply-accumulate."""
 
     def __init__(
         self,

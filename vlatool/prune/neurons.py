@@ -39,11 +39,7 @@ class Neurons(ModuleStage):
     exclude: tuple[str, ...] = Field((), description="globs of module names to leave as they are")
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
-        """Choose the neurons to keep.
-
-        Raises:
-            RecipeError: when no hidden layer can be pruned, or a pattern matches none.
-        """
+        """Choose the neurons to keep; raises RecipeError when none can be pruned, or a pattern matches nothing."""
         layers = [(graph, *layer) for graph, module in modules.items() for layer in hidden_layers(module)]
         if not layers:
             refuse_traced(source, "hidden layers of an nn.Sequential", "vlatool prune neurons")

@@ -160,11 +160,7 @@ class Quantization(Transform):
         return self.matching_graphs(bundle.manifest.graphs)
 
     def matching_graphs(self, names: Collection[str]) -> list[str]:
-        """Return which of some graphs to quantize.
-
-        Raises:
-            RecipeError: when a pattern matches none.
-        """
+        """Return which of some graphs to quantize; raises RecipeError when a pattern matches none."""
         for pattern in self.graphs:
             if not fnmatch.filter(names, pattern):
                 raise RecipeError.unknown(f"No graph matches '{pattern}'", pattern, names)

@@ -6,7 +6,7 @@ import itertools
 import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import Field
 
@@ -85,15 +85,12 @@ class CalibratedQuantization(Quantization):
         recording, numbers = self.calibration_samples(bundle)
         recorded = recorded_moments(bundle, recording, numbers, samples)
         played = (moment for _ in range(uses_played) for moment in played_moments(bundle, samples))  # after the others
-        non_finite = (Moment(each, 0, begins=True) for each in self._non_finite_observations(bundle))
+        non_finite: list[Moment] = []
+        if takes_not_finite(bundle.manifest.spec):  # so that ranges cover what becomes of NaN and infinity
+            observations = observations_for(bundle, NON_FINITE_SAMPLES, self.recording)
+            non_finite = [Moment(each, 0, begins=True) for each in observations]
         moments = itertools.chain(recorded, played, non_finite)
         return calibrate(bundle, values, moments, context, numbers=numbers, exempt=exempt)
-
-    def _non_finite_observations(self, bundle: Bundle) -> list[dict[str, Any]]:
-        """Return observations with NaN and infinity where an input takes them, so that ranges cover their results."""
-        if not takes_not_finite(bundle.manifest.spec):
-            return []
-        return observations_for(bundle, NON_FINITE_SAMPLES, self.recording)
 
     def _no_calibration_data(self, bundle: Bundle) -> DataError:
         trainable = self.alternative and bundle.manifest.environment

@@ -190,11 +190,7 @@ class StaticInt8(CalibratedQuantization):
         return name_float_layers(result, layers)
 
     def ranges(self, statistics: Mapping[str, Statistics], unsigned: Collection[str] = ()) -> dict[str, Range]:
-        """Return value -> quantization range (low, high).
-
-        Args:
-            unsigned: Names of values that are uint8 when others are symmetric.
-        """
+        """Return value -> quantization range (low, high); ``unsigned`` values are uint8 where others are symmetric."""
         kind = self.style.activations
         symmetric = {name: kind in ("int8", "symmetric") and name not in unsigned for name in statistics}
         return {

@@ -17,6 +17,7 @@ from vlatool.files.ownership import LEDGER
 from vlatool.files.scratch import scratch_directory
 from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
+from vlatool.module.source import RECORDING_OPTIONS
 from vlatool.optimize.result import ROBOT_FOLDERS
 from vlatool.rebuild.differences import FileMatch, compare_bundles
 from vlatool.runtime.engine import identities
@@ -124,17 +125,13 @@ class _FileSearch:
 
 
 def build_record(bundle: Bundle) -> tuple[Entry, ...]:
-    """Return the entries of a bundle's build record, checked.
-
-    Raises:
-        BundleError: when there is none (made by an older vlatool), or an entry is invalid.
-    """
+    """Return the checked build record; raises BundleError when there is none (older vlatool), or it is invalid."""
     entries = history(bundle)
     if not entries:
         version = bundle.manifest.made_by.get("vlatool", "an unknown version")
         raise BundleError(
             f"{bundle.path} has no build record; vlatool {version} did not write one yet, or no stage made it.",
-            "make the bundle again, with the command that made it",
+            UNUSABLE,
         )
     for number, entry in enumerate(entries):
         where, stage = f"Entry {number} of the build record of {bundle.path}", entry.get("stage")
@@ -229,7 +226,7 @@ def _start(
         )
     else:
         begin = None
-        first, source = _recorded_source(bundle, entries, source, cache)
+        first, source = _recorded_source(bundle, entries, source, cache, search)
         later = entries[1:]
         policy = getattr(first, "model", None) or getattr(first, "policy", None)
         if policy is not None:
@@ -253,15 +250,8 @@ def _from_bundle(begin: Bundle, entries: tuple[Entry, ...], bundle: Bundle) -> t
 
 def _stage(entry: Entry, search: _FileSearch) -> Transform:
     """Build the stage of an entry, its files found and checked."""
-    name, options = entry["stage"], dict(entry.get("options", {}))
-    fields = stage_class(name).model_fields
-    for key, value in options.items():
-        if key in fields and Path in (fields[key].annotation, *get_args(fields[key].annotation)) and value is not None:
-            match = RECORDED_FILE.fullmatch(str(value))
-            if match is None:
-                raise BundleError(f"The build record names the file '{value}' of {name} without its hash.", UNUSABLE)
-            options[key] = search.find(match["name"], match["hash"], name)
-    stage = build_stage(name, options)
+    name = entry["stage"]
+    stage = build_stage(name, _with_files(name, entry.get("options", {}), search))
     if not isinstance(stage, Transform):
         raise BundleError(
             f"The build record names {name}, which measures; it may only name stages that make bundles.", UNUSABLE
@@ -269,14 +259,26 @@ def _stage(entry: Entry, search: _FileSearch) -> Transform:
     return stage
 
 
+def _with_files(stage: str, recorded: Mapping[str, Any], search: _FileSearch) -> dict[str, Any]:
+    """Return recorded options of a stage, with the paths of the files that they name."""
+    fields, options = stage_class(stage).model_fields, dict(recorded)
+    for key, value in options.items():
+        if key in fields and Path in (fields[key].annotation, *get_args(fields[key].annotation)) and value is not None:
+            match = RECORDED_FILE.fullmatch(str(value))
+            if match is None:
+                raise BundleError(f"The build record names the file '{value}' of {stage} without its hash.", UNUSABLE)
+            options[key] = search.find(match["name"], match["hash"], stage)
+    return options
+
+
 def _recorded_source(
-    bundle: Bundle, entries: tuple[Entry, ...], source: str | None, cache: Path
+    bundle: Bundle, entries: tuple[Entry, ...], source: str | None, cache: Path, search: _FileSearch
 ) -> tuple[Transform, str]:
     """Return the source stage and where its policy is; its files have the recorded hashes."""
     problem: VlatoolError | None = None
     for folder in [source] if source is not None else _noted_folders(bundle, entries, cache):
         try:
-            return _checked_source(folder, entries[0], bundle), folder
+            return _checked_source(folder, entries[0], bundle, search), folder
         except VlatoolError as error:
             problem = problem or error
     raise problem or SourceError(
@@ -285,7 +287,7 @@ def _recorded_source(
     )
 
 
-def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
+def _checked_source(source: str, entry: Entry, bundle: Bundle, search: _FileSearch) -> Transform:
     """Return the stage of a source whose files have the recorded hashes."""
     stage = source_stage(source)
     if stage.name() != entry["stage"]:
@@ -293,7 +295,9 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
             f"{source} is read by {stage.name()}; {bundle.path} was made by {entry['stage']}.",
             f"pass what {entry['stage']} reads: --source",
         )
-    stage = stage.as_recorded(entry, bundle)
+    named = {name: value for name, value in entry.get("options", {}).items() if name in RECORDING_OPTIONS}
+    found = _with_files(stage.name(), named, search)
+    stage = stage.model_copy(update={**found, "map": tuple(found.get("map", ()))}).as_recorded(entry, bundle)
     stage.check(None, None)
     got, recorded = input_hashes(stage), entry.get("files", {})
     wrong = [

@@ -33,38 +33,21 @@ MAX_STDERR_BYTES = 1 << 16
 
 RUN_AGAIN = "run it again; the target removes what was sent when the connection ends"
 REFUSALS = (
-    (
-        r"Could not resolve hostname",
-        "its name does not resolve",
-        "check the name, or give it a Host entry in ~/.ssh/config",
-    ),
-    (
-        r"REMOTE HOST IDENTIFICATION HAS CHANGED",
-        "its host key is not the one that is known",
-        "if the machine was set up anew, remove the old key with ssh-keygen -R HOST, and log in once by hand",
-    ),
-    (
-        r"Host key verification failed|host key is known",
-        "its host key is not known here",
-        "log in once by hand and compare the fingerprint: ssh {target}",
-    ),
-    (
-        r"Permission denied|Too many authentication failures",
-        "it does not let this user in without a password",
-        "copy your key there: ssh-copy-id {target}",
-    ),
-    (
-        r"Connection refused",
-        "nothing answers at that address and port",
-        "check that sshd runs there, and on which port (Port in ~/.ssh/config)",
-    ),
-    (r"timed out|Timeout", "it does not answer in time", "check that it is on and in this network: ssh {target} true"),
-    (
-        r"No route to host|Network is unreachable",
-        "there is no way to its network",
-        "check the network: ssh {target} true",
-    ),
-)
+    (r"Could not resolve hostname", "its name does not resolve",
+     "check the name, or give it a Host entry in ~/.ssh/config"),
+    (r"REMOTE HOST IDENTIFICATION HAS CHANGED", "its host key is not the one that is known",
+     "if the machine was set up anew, remove the old key with ssh-keygen -R HOST, and log in once by hand"),
+    (r"Host key verification failed|host key is known", "its host key is not known here",
+     "log in once by hand and compare the fingerprint: ssh {target}"),
+    (r"Permission denied|Too many authentication failures", "it does not let this user in without a password",
+     "copy your key there: ssh-copy-id {target}"),
+    (r"Connection refused", "nothing answers at that address and port",
+     "check that sshd runs there, and on which port (Port in ~/.ssh/config)"),
+    (r"timed out|Timeout", "it does not answer in time",
+     "check that it is on and in this network: ssh {target} true"),
+    (r"No route to host|Network is unreachable", "there is no way to its network",
+     "check the network: ssh {target} true"),
+)  # fmt: skip
 """What ssh says, what it means, and what to do; the first that matches."""
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle, digest_of, manifest_bytes
 from vlatool.errors import BundleError
+from vlatool.files.verified_read import COPY_AGAIN
 
 PIECE = 8 << 20
 """Bytes of content in one tar: it is held in memory on both sides, so that nothing unverified is written."""
@@ -52,18 +53,12 @@ class Item:
         except OSError as error:
             raise BundleError(f"{self.path} cannot be read: {error.strerror}.", "copy or export it again") from error
         if longer or (self.sha256 and digest.hexdigest() != self.sha256):
-            raise BundleError(
-                f"{self.path} has changed: its SHA-256 is not the manifest's.", "copy or export the bundle again"
-            )
+            raise BundleError(f"{self.path} has changed: its SHA-256 is not the manifest's.", COPY_AGAIN)
 
 
 @dataclass(frozen=True)
 class Payload:
-    """All that is pushed for one run.
-
-    Args:
-        bundles: directory of each bundle on the target, in order.
-    """
+    """All that is pushed for one run; ``bundles`` are the directories on the target, in order."""
 
     items: tuple[Item, ...]
     bundles: tuple[str, ...]
@@ -122,15 +117,9 @@ def _bundle(bundle: Bundle, folder: str) -> Iterator[Item]:
     for name, record in bundle.manifest.files.items():
         path = bundle.path / name
         if path.is_symlink() or not path.is_file():
-            raise BundleError(
-                f"The bundle {bundle.path} lacks the file {name} (missing, or a link).",
-                "copy or export the bundle again",
-            )
+            raise BundleError(f"The bundle {bundle.path} lacks the file {name} (missing, or a link).", COPY_AGAIN)
         if path.stat().st_size != record.bytes:
-            raise BundleError(
-                f"{path} has {path.stat().st_size} bytes; the manifest says {record.bytes}.",
-                "copy or export the bundle again",
-            )
+            raise BundleError(f"{path} has {path.stat().st_size} bytes; the manifest says {record.bytes}.", COPY_AGAIN)
         yield Item(f"{folder}/{name}", record.bytes, path, sha256=record.sha256)
     content = manifest_bytes(bundle.manifest)
     for name, text in ((MANIFEST, content), (DIGEST, digest_of(content))):

@@ -272,11 +272,7 @@ class Document:
 
 
 def build(report: Report) -> Document:
-    """Return the document of a report.
-
-    Raises:
-        PluginError: when a section of another package fails.
-    """
+    """Return the document of a report; raises PluginError when a section of another package fails."""
     builders: list[Builder] = [registry.load("sections", name)() for name in registry.names("sections")]
     sections = [
         replace(section, where=section.where or (measured_where(report) if section.origin == "measured" else ""))

@@ -50,11 +50,7 @@ class Format(Protocol):
     """What a file of ``videos`` defines."""
 
     def check(self) -> None:
-        """Refuse to begin where a package or a program is missing.
-
-        Raises:
-            MissingExtra: naming it, and the extra that provides it.
-        """
+        """Refuse to begin without a package or a program; raises MissingExtra naming it and its extra."""
         ...
 
     def write(self, video: Video, draft: Path) -> str:
@@ -66,11 +62,7 @@ class Format(Protocol):
 
 
 def format_of(path: Path) -> Format:
-    """Return the format that the suffix of a file names.
-
-    Raises:
-        UsageError: when it names none.
-    """
+    """Return the format that the suffix of a file names; raises UsageError when it names none."""
     known = registry.names("videos")
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in known:

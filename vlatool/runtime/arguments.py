@@ -13,11 +13,7 @@ MOST_THREADS = 1024
 
 
 def check_path(path: Any) -> None:
-    """Refuse anything but a path.
-
-    Raises:
-        UsageError: naming what it is.
-    """
+    """Refuse anything but a path; raises UsageError naming what it is."""
     if not isinstance(path, str | os.PathLike):
         raise UsageError(
             f"The path of the bundle is a {type(path).__name__}; allowed: text or a Path.",
@@ -61,11 +57,7 @@ def _refused(name: str, value: Any, allowed: str, optional: bool) -> UsageError:
 def check_load(
     path: Any, threads: Any, seed: Any, warmup: Any, tolerance: Any, first_run_s: Any, memory_mb: Any
 ) -> None:
-    """Check all arguments of ``load``.
-
-    Raises:
-        UsageError: for the first invalid one.
-    """
+    """Check all arguments of ``load``; raises UsageError for the first invalid one."""
     check_path(path)
     check_whole("threads", threads, 1, MOST_THREADS, optional=True)
     check_whole("seed", seed, 0, optional=True)

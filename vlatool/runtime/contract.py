@@ -245,11 +245,7 @@ class Outputs:
         return not self._checked
 
     def __call__(self, values: Mapping[str, Any], who: str = "The policy") -> dict[str, Array]:
-        """Return the outputs by name.
-
-        Raises:
-            GraphError: naming the output, what it is and what is declared.
-        """
+        """Return the outputs by name; raises GraphError naming the output, what it is and what is declared."""
         for name, shape, dtype, floating, tensor in self._checked:
             array = values[name]
             if array.dtype != dtype or (array.shape != shape and (shape or not _fits(array, tensor))):

@@ -26,11 +26,7 @@ class Decoder:
         self._half = spec.action.dtype == "float16"
 
     def __call__(self, raw: Array) -> tuple[Array, tuple[str, ...]]:
-        """Return the chunk and its labels.
-
-        Raises:
-            GraphError: when a value is not finite.
-        """
+        """Return the chunk and its labels; raises GraphError when a value is not finite."""
         tensor = self.tensor
         physical = raw.astype(np.float32) if self._half else raw
         if self.normaliser is not None:

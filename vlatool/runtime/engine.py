@@ -99,11 +99,7 @@ class Engine:
 
     @classmethod
     def library(cls) -> Any:
-        """Import the library.
-
-        Raises:
-            MissingExtra: when it is not installed.
-        """
+        """Import the library; raises MissingExtra when it is not installed."""
         if not cls.extra and importlib.util.find_spec(cls.package) is None:
             raise MissingExtra(f"This needs the package '{cls.package}'.", cls.installation())
         return require(cls.package, cls.extra)
@@ -127,11 +123,7 @@ class Engine:
 
     @classmethod
     def version(cls) -> str:
-        """Return the release of the library, without its build; empty where it does not tell.
-
-        Raises:
-            MissingExtra: when it is not installed.
-        """
+        """Return the library's release without its build, or empty where unknown; raises MissingExtra without it."""
         return str(getattr(cls.library(), "__version__", "")).partition("-")[0]
 
     @classmethod
@@ -146,11 +138,7 @@ class Engine:
 
     @classmethod
     def execution_providers(cls) -> list[str] | None:
-        """Return what the installed library runs on, None where it does not tell.
-
-        Raises:
-            MissingExtra: when it cannot be imported.
-        """
+        """Return what the library runs on, None where it does not tell; raises MissingExtra when it is absent."""
         cls.library()
         return None
 
@@ -165,20 +153,12 @@ class Engine:
 
     @classmethod
     def variants(cls, target: Target, calibrated: bool) -> dict[str, Stages]:
-        """Return the plans that a search begins with: name -> stages.
-
-        Args:
-            target: The board, or this host.
-        """
+        """Return the plans that a search for the board, or this host, begins with: name -> stages."""
         return {}
 
     @classmethod
     def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
-        """Open a graph so that the time of its nodes is noted.
-
-        Raises:
-            GraphError: when the engine cannot be profiled, or refuses the graph.
-        """
+        """Open a graph with timed nodes; raises GraphError when the engine refuses it, or cannot be profiled."""
         raise GraphError(
             f"The engine {cls.title} cannot be profiled.", "see which layers are quantized instead: vlatool explain"
         )
@@ -200,11 +180,7 @@ class Engine:
 
 
 def engine_class(name: str = "") -> Any:
-    """Return the class of an engine, of the default one when empty.
-
-    Raises:
-        UsageError: for an unknown engine.
-    """
+    """Return the class of an engine, of the default one when empty; raises UsageError for an unknown engine."""
     return registry.load("engines", name or DEFAULT_ENGINE)
 
 
@@ -243,11 +219,7 @@ def layouts() -> dict[str, tuple[Int8Layout, str]]:
 
 
 def computing(dtype: str) -> str:
-    """Return the first engine that computes in a dtype.
-
-    Raises:
-        GraphError: when none does.
-    """
+    """Return the first engine that computes in a dtype; raises GraphError when none does."""
     for name, library in usable_engines().items():
         if dtype in library.computes:
             return name

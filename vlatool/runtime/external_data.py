@@ -40,11 +40,7 @@ SEARCH_BYTES = 16 * 1024
 
 
 class OpenFile:
-    """The bytes of an open file, read where they are looked at.
-
-    Args:
-        handle: Descriptor of a file open for reading; it stays open.
-    """
+    """The bytes of an open file, read where they are looked at; the descriptor ``handle`` stays open."""
 
     def __init__(self, handle: int) -> None:
         self._handle = handle

@@ -38,11 +38,7 @@ def load_goldens(bundle: Bundle) -> list[Golden]:
 
 
 def golden_arrays(bundle: Bundle) -> Mapping[str, Array]:
-    """Return the arrays of the golden file; none when there is no such file.
-
-    Raises:
-        BundleError: when the file is not the one that the manifest records.
-    """
+    """Return the arrays of the golden file, if any; raises BundleError when it is not the one in the manifest."""
     name = bundle.manifest.golden
     if not name:
         return {}

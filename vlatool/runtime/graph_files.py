@@ -57,11 +57,7 @@ def _opened(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: i
 
 
 def recorded_files(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
-    """Return the files of a bundle that a graph's locations mean.
-
-    Raises:
-        BundleError: when one is not inside, or not recorded.
-    """
+    """Return a bundle's files that a graph's locations mean; raises BundleError when one is outside or unrecorded."""
     folder = file.rpartition("/")[0]
     files = []
     for location in sorted(locations):

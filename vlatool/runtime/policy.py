@@ -91,7 +91,8 @@ class BundlePolicy:
             name: open_graph(bundle, graph, session, threads) for name, graph in manifest.graphs.items()
         }
         check_graphs(manifest, sessions, limit_mb)
-        return cls(bundle, Program(manifest.program, sessions, seed), engine)
+        outputs = [tensor.name for tensor in manifest.spec.outputs]
+        return cls(bundle, Program(manifest.program, sessions, seed, outputs), engine)
 
     @functools.cached_property
     def identity(self) -> str:
@@ -200,11 +201,7 @@ class BundlePolicy:
 
     @contextlib.contextmanager
     def _stopped_after(self, seconds: float) -> Iterator[None]:
-        """Stop the engine if the inference in this block takes longer.
-
-        Raises:
-            GraphError: when it was stopped.
-        """
+        """Stop the engine if the inference in this block takes longer; raises GraphError when it was stopped."""
         limited = [session for session in self.program.sessions.values() if hasattr(session, "deadline")]
         for session in limited:
             session.deadline = time.monotonic() + seconds

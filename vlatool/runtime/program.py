@@ -35,11 +35,21 @@ class Program:
 
     Args:
         seed: Seed of the noise; fresh entropy when None.
+        outputs: Values that the caller takes from ``run``; what only one graph gives another then stays in the memory
+            of their engine, where that can do so (``leave_on_device``). All values are arrays when None.
     """
 
-    def __init__(self, steps: Iterable[ProgramStep], sessions: Mapping[str, Session], seed: int | None = None) -> None:
+    def __init__(
+        self,
+        steps: Iterable[ProgramStep],
+        sessions: Mapping[str, Session],
+        seed: int | None = None,
+        outputs: Iterable[str] | None = None,
+    ) -> None:
         self.steps = tuple(steps)
         self.sessions = sessions
+        if outputs is not None:
+            leave_between_graphs(self.steps, sessions, outputs)
         self._seed = seed
         self._schedules = [schedule_arrays(step) for step in self.steps]
         self._plain = self._plain_step()
@@ -163,6 +173,26 @@ class Program:
                 )
             arrays[name] = array.astype(np.float32, copy=False)
         return arrays
+
+
+def leave_between_graphs(steps: Iterable[ProgramStep], sessions: Mapping[str, Session], outputs: Iterable[str]) -> None:
+    """Tell each session which of its outputs only other graphs take, and which of its inputs may be such ones."""
+    steps = tuple(steps)
+    needed = {*outputs, *(name for step in steps for name in step.keep)}
+    carried = [pair for step in steps for pair in step.carry.items()]
+    while more := {source for source, target in carried if target in needed} - needed:
+        needed |= more
+    fed = {value for step in steps for value in step.feeds.values()}
+    fed |= {source for source, target in carried if target in fed}
+    given = {value for step in steps for value in step.gives.values()} & fed - needed
+    passed = given | {target for source, target in carried if source in given}
+    for graph, session in sessions.items():
+        mine = [step for step in steps if step.graph == graph]
+        gives = [pair for step in mine for pair in step.gives.items()]
+        stay = {name for name, _ in gives} - {name for name, value in gives if value not in given}
+        arrive = {name for step in mine for name, value in step.feeds.items() if value in passed}
+        if (stay or arrive) and hasattr(session, "leave_on_device"):
+            session.leave_on_device(stay, arrive)
 
 
 def draw(noise: Mapping[str, Any], random: np.random.Generator) -> Array:

@@ -97,11 +97,7 @@ def load_normaliser(tensor: TensorSpec, assets: Assets) -> Normaliser | None:
 
 
 def _normaliser(offset: Array, scale: Array, epsilon: np.float32, deviations: bool) -> Normaliser:
-    """Return a normaliser with an epsilon.
-
-    Args:
-        deviations: whether scales are standard deviations, not halves of ranges.
-    """
+    """Return a normaliser with an epsilon, from standard ``deviations`` or else from halves of ranges."""
     if not epsilon:
         return Normaliser(offset, scale)
     if deviations:

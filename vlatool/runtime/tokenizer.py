@@ -87,11 +87,7 @@ class Tokenizer:
 
 
 def tokenizer_content(assets: Assets, file: str, name: str) -> bytes:
-    """Return the content of the tokenizer of an input.
-
-    Raises:
-        SpecError: when it cannot be read.
-    """
+    """Return the content of the tokenizer of an input; raises SpecError when it cannot be read."""
     try:
         return read_asset(assets, file, "tokenizer_bytes")
     except OSError as error:

@@ -64,11 +64,7 @@ def sinusoid(time: Tensor, width: int, shortest: float = 4e-3, longest: float = 
 
 
 class Feedforward(nn.Module):
-    """Linear, GELU, linear.
-
-    Args:
-        approximate: ``"none"`` (exact) or ``"tanh"``.
-    """
+    """Linear, GELU (``approximate``: ``"none"``, exact, or ``"tanh"``), linear."""
 
     def __init__(self, width: int, hidden: int, approximate: str = "none") -> None:
         super().__init__()
@@ -126,11 +122,7 @@ class Gain(nn.Module):
 
 
 class EncoderBlock(nn.Module):
-    """Pre-norm transformer block: self-attention and a GELU feed-forward, each with a residual.
-
-    Args:
-        gains: Whether each branch ends in a learned gain, as in DINOv2.
-    """
+    """Pre-norm self-attention and GELU feed-forward, each with a residual and, as in DINOv2, a gain if ``gains``."""
 
     def __init__(self, width: int, heads: int, hidden: int, approximate: str = "none", gains: bool = False) -> None:
         super().__init__()

@@ -13,11 +13,7 @@ from vlatool.samples._blocks import GatedFeedforward, SelfAttention, attend, sin
 
 @dataclass(frozen=True)
 class ExpertShape:
-    """Shape of the expert.
-
-    Args:
-        width: Width of the action tokens.
-    """
+    """Shape of the expert; ``width`` is that of the action tokens."""
 
     width: int = 768
     depth: int = 12

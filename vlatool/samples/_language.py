@@ -34,11 +34,7 @@ LLAMA2_7B = DecoderShape(width=4096, layers=32, heads=32, shared_heads=32, head_
 
 
 class Rotary(Constants):
-    """Rotary position table (Su et al., arXiv 2104.09864), in the half-split layout of Llama.
-
-    Args:
-        base: Base of the geometric series of wave lengths.
-    """
+    """Rotary positions (Su et al., arXiv 2104.09864), half-split as in Llama; wave lengths are a series of ``base``."""
 
     cosines: Tensor
     sines: Tensor
@@ -156,11 +152,7 @@ class DecoderLayer(nn.Module):
 
 
 class Decoder(nn.Module):
-    """A stack of layers with one position table.
-
-    Args:
-        length: Largest number of positions.
-    """
+    """A stack of layers with one position table for ``length`` positions."""
 
     def __init__(self, shape: DecoderShape, length: int) -> None:
         super().__init__()

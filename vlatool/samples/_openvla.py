@@ -118,11 +118,7 @@ class OpenPrefill(nn.Module):
 
 
 class OpenDecode(nn.Module):
-    """One more action token.
-
-    Args:
-        language: Shared with the prefill.
-    """
+    """One more action token; ``language`` is shared with the prefill."""
 
     def __init__(self, shape: OpenShape, language: Language) -> None:
         super().__init__()

@@ -16,11 +16,7 @@ Colours = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 class Pixels(Constants):
-    """Raw RGB to normalised planes.
-
-    Args:
-        colours: Mean and deviation of each channel on the scale from 0 to 1.
-    """
+    """Raw RGB to normalised planes; ``colours`` are mean and deviation of each channel, on the scale from 0 to 1."""
 
     scale: Tensor
     shift: Tensor
@@ -73,11 +69,7 @@ VIT_B = VisionShape(224, 16, 768, 12, 12, 3072)
 
 
 class VisionEncoder(nn.Module):
-    """Patches, learned positions and blocks.
-
-    Args:
-        final_norm: Whether the tokens are normalised at the end.
-    """
+    """Patches, learned positions and blocks; ``final_norm`` normalises the tokens at the end."""
 
     def __init__(self, shape: VisionShape, final_norm: bool = True) -> None:
         super().__init__()
@@ -104,11 +96,7 @@ class VisionEncoder(nn.Module):
 
 
 class VisionFeatures(nn.Module):
-    """A vision transformer with a linear head on the class token.
-
-    Args:
-        shape: Sizes; at least one register.
-    """
+    """A vision transformer with a linear head on the class token; ``shape`` has at least one register."""
 
     def __init__(self, shape: VisionShape, features: int = 1000) -> None:
         super().__init__()

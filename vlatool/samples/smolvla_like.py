@@ -43,8 +43,7 @@ RANGES = {"state": (-1.0, 1.0)}
 def make(seed: int = 0, device: str | None = None) -> dict[str, nn.Module]:
     """Return the policy in eval mode; the arguments are those of ``build``."""
     from vlatool.samples._build import build
-    from vlatool.samples._smolvla import Prefix, SmolShape
-    from vlatool.samples._smolvla_step import Step
+    from vlatool.samples._smolvla import Prefix, SmolShape, Step
 
     shape = SmolShape()
     return {

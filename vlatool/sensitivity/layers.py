@@ -147,11 +147,7 @@ class _SwitchableSession:
 
 
 class Switchboard:
-    """A float32 policy in which any combination of layers can be computed in int8; a context manager.
-
-    Args:
-        ranges: Ranges from ``ranges_of``.
-    """
+    """A float32 policy that computes any of its layers in int8, in ``ranges`` of ``ranges_of``; a context manager."""
 
     def __init__(self, bundle: Bundle, stage: StaticInt8, ranges: Mapping[str, Mapping[str, Range]]) -> None:
         self._opened = contextlib.ExitStack()
@@ -216,11 +212,7 @@ class Switchboard:
         self, groups: Sequence[Sequence[LayerId]], observations: Sequence[Mapping[str, Any]], context: Context, *,
         seconds: float = math.inf,
     ) -> list[LayerError]:  # fmt: skip
-        """Return the error of each group of layers, the worst first; see ``sensitivities``.
-
-        Raises:
-            DataError: when there is no observation.
-        """
+        """Return each group's error, the worst first, as ``sensitivities``; raises DataError without an observation."""
         if not observations:
             raise DataError(
                 "No observations to measure the layers on.",

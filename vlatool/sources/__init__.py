@@ -39,7 +39,9 @@ def source_bundle(source: Bundle | Source, cache: Path, context: Context) -> Res
     return cached_transform(source, None, cache, context)
 
 
-def brings_calibration(typed: str) -> bool:
+def brings_calibration(source: Source) -> bool:
     """Return whether a policy has calibration data, which static quantization needs."""
-    described = source_stage(typed).describe()
+    if source.calibration is not None:
+        return True
+    described = source.describe()
     return described is not None and described.calibration is not None

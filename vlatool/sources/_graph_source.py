@@ -15,7 +15,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Graph, Manifest
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.data import observations_for
+from vlatool.data import PURPOSES, observations_for
 from vlatool.errors import GraphError, InputError, SourceError, suggest
 from vlatool.graph.files import save
 from vlatool.graph.float32_conversion import ROUNDING, as_float32, describe_conversion
@@ -23,7 +23,7 @@ from vlatool.graph.layers import MIN_OPSET
 from vlatool.graph.onnx_graph import type_name
 from vlatool.graph.random_ops import refuse_random_file
 from vlatool.machine.engine_calls import REMEDY, engine_call
-from vlatool.module.description import FILE, Description, copy_assets, read_description
+from vlatool.module.description import FILE, Description, carry_recordings, copy_assets, read_description
 from vlatool.module.source import Source
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
@@ -37,7 +37,6 @@ from vlatool.sources._onnx_plain import plain
 from vlatool.stage.base import Context, Result
 from vlatool.stage.finish import SEED, finish
 from vlatool.stage.precision_shares import count_shares
-from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -86,7 +85,9 @@ class GraphSource(Source):
 
     def describe(self) -> Description | None:
         """Read the ``policy.yaml``, if there is one."""
-        return replace(read_description(self.policy), graphs={"main": self.model}) if self.policy else None
+        if self.policy is None:
+            return None
+        return self.with_given(replace(read_description(self.policy), graphs={"main": self.model}))
 
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Convert to the opset of the record and take its shapes, where it has them."""
@@ -99,7 +100,7 @@ class GraphSource(Source):
         """The policy, external data beside it and what the description names."""
         beside = [self.model] if self.model.is_dir() else sorted(self.model.parent.glob(self.model.name + "*"))
         if (described := self.describe()) is None:
-            return tuple(beside)
+            return (*beside, *(path for purpose in PURPOSES if (path := getattr(self, purpose))))
         return (*beside, *described.recordings().values(), *described.read_from, *described.assets())
 
     def shapes(self) -> dict[str, tuple[int | str, ...]]:
@@ -111,7 +112,7 @@ class GraphSource(Source):
         return self.model
 
     def write_assets(self, described: Description, out: Path) -> None:
-        """Write tokenizers and statistics to ``assets/``, and recorded data to ``data/``."""
+        """Write tokenizers and statistics to ``assets/``."""
         copy_assets(described, out)
 
     def read(self, description: Description | None, context: Context) -> tuple[Any, Any]:
@@ -137,14 +138,14 @@ class GraphSource(Source):
         if description is None:
             with _named_after(self, file):
                 complete_outputs(model, file, _tensors(model.graph.input))
-        described = description or self.description_of(model)
+        described = description or self.with_given(self.description_of(model))
         _check_names(model, described.spec)
         refuse_random_file(model, self.model)
         self.write_assets(described, out)
+        carry_recordings(described, out)
         manifest = described.manifest()
         options = {"opset": self.opset, "shape": list(self.shape)}
-        given = {name: value for name, value in options.items() if value}
-        recorded = {**made_by(self), "options": {"model": self.model.name, **given}}
+        recorded = self.record({"model": self.model.name, **{name: value for name, value in options.items() if value}})
         with _named_after(self, file):
             opset, stored = self._store(model, out, manifest, changes)
             observations = observations_for(Bundle(out, manifest), 2)

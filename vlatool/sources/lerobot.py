@@ -52,7 +52,7 @@ class LerobotCheckpoint(TorchModule):
             SourceError: when the checkpoint is incomplete or of an unknown kind, LeRobot is not found, or cannot trace
                 it.
         """
-        return read_description(self.converted_directory())
+        return self.with_given(read_description(self.converted_directory()))
 
     def converted_directory(self) -> Path:
         """Return the policy directory that the checkpoint is traced into, made when it is not in the cache.

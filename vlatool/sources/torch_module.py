@@ -10,14 +10,20 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle, hash_file, seal
 from vlatool.errors import SourceError
-from vlatool.module.description import FILE, Description, copy_assets, read_description, write_location
+from vlatool.module.description import (
+    FILE,
+    Description,
+    carry_recordings,
+    copy_assets,
+    read_description,
+    write_location,
+)
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.module.imports import imported_files
 from vlatool.module.source import Source
 from vlatool.registry import Claim
 from vlatool.sources._onnx_files import refuse_bare
 from vlatool.stage.base import Context, Result
-from vlatool.stage.record import made_by
 from vlatool.user_code import trust
 from vlatool.weights.shards import fingerprint, sampled_hash, shard_files
 
@@ -64,7 +70,7 @@ class TorchModule(Source):
 
     def describe(self) -> Description:
         """Read ``policy.yaml``."""
-        return read_description(self.policy)
+        return self.with_given(read_description(self.policy))
 
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Take the factory of the record: a function in the policy's own files, or what its description names."""
@@ -103,13 +109,13 @@ class TorchModule(Source):
         described = self.describe()
         self.trust_code()
         copy_assets(described, out)
+        carry_recordings(described, out)
         factory = self._factory(described)
         root = self._root(described)
         code = {path.relative_to(root).as_posix(): hash_file(path) for path in self._code(described)}
         write_location(out, described.folder)
         source_record = {"factory": factory, "arguments": described.arguments, "code": code, **_weights(described)}
-        recorded = {**made_by(self), "options": {}}
-        return Result(seal(out, described.manifest(made_by=recorded, source=source_record)))
+        return Result(seal(out, described.manifest(made_by=self.record({}), source=source_record)))
 
     def trust_code(self) -> Self:
         """Allow the policy's code to run in this process: the user named its folder."""

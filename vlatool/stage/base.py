@@ -186,11 +186,7 @@ class Transform(Stage):
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 
     def chain(self) -> Chain:
-        """Return the stages that run before and after this one; none where it stands for itself alone.
-
-        Raises:
-            RecipeError: when an option cannot be read.
-        """
+        """Return the stages before and after this one, if any; raises RecipeError when an option cannot be read."""
         return Chain()
 
     def summarize(self, bundle: Bundle) -> tuple[str, ...]:
@@ -222,11 +218,7 @@ class Measure(Stage):
 
 
 def source_of(source: Bundle | None, stage: str) -> Bundle:
-    """Return the source, which only the stages that start a chain may lack.
-
-    Raises:
-        RecipeError: when there is none.
-    """
+    """Return the source, which only the stages that start a chain may lack; raises RecipeError when there is none."""
     if source is None:
         raise RecipeError(
             f"{stage} needs a bundle to start from; begin the recipe with a sources stage.",

@@ -17,17 +17,12 @@ ENDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
 
 def stage_class(name: str) -> type[Stage]:
-    """Return the class of a stage by its recipe name.
-
-    Raises:
-        RecipeError: for a name that is not ``kind.name`` of a known stage.
-    """
+    """Return the class of a stage by its recipe name; raises RecipeError unless it is ``kind.name`` of a stage."""
     kind, _, entry = name.partition(".")
     known = [f"{folder}.{method}" for folder in stage_kinds() for method in registry.names(folder)]
     if name.replace("-", "_") not in known:
         raise RecipeError(f"Unknown stage '{name}'; {suggest(name, known)}.", fix_for(name, known))
-    stage: type[Stage] = registry.load(kind, entry)
-    return stage
+    return registry.load(kind, entry)
 
 
 def stage_kinds() -> tuple[str, ...]:
@@ -36,11 +31,7 @@ def stage_kinds() -> tuple[str, ...]:
 
 
 def build_stage(name: str, options: Mapping[str, Any]) -> Stage:
-    """Build a stage from its recipe name and options.
-
-    Raises:
-        RecipeError: listing each option that is unknown or has an impossible value.
-    """
+    """Build a stage from recipe name and options; raises RecipeError naming each unknown or impossible one."""
     return stage_from(stage_class(name), options, f"stage {name}")
 
 

@@ -115,11 +115,7 @@ def looks_like_cache(directory: Path) -> bool:
 
 
 def contents(cache: Path) -> Contents:
-    """Return what a cache holds; nothing for one that is not there yet.
-
-    Raises:
-        OSError: when it cannot be read.
-    """
+    """Return what a cache holds; nothing for one that is not there yet; raises OSError when it cannot be read."""
     entries, unknown = [], []
     for folder in NAMES:
         for path in _children(cache / folder):

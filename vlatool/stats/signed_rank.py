@@ -55,11 +55,7 @@ def upper_bound(differences: Sequence[float] | Array, alpha: float) -> float:
 
 
 def min_differences(alpha: float) -> int:
-    """Return the smallest number of pairs that has a bound at all: 2^-n <= alpha.
-
-    Raises:
-        ValueError: unless 0 < alpha < 1.
-    """
+    """Return the smallest number of pairs with a bound: 2^-n <= alpha; raises ValueError unless 0 < alpha < 1."""
     if not 0 < alpha < 1:
         raise ValueError(f"alpha is {alpha}; allowed: above 0 and below 1")
     count = max(1, math.ceil(-math.log2(alpha)))

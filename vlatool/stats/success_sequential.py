@@ -330,6 +330,7 @@ def _restricted_estimate(lost: int | NDArray[np.int64], won: int | NDArray[np.in
     return np.asarray(np.maximum((root - linear) / (4 * pairs), max(0.0, -drop)))
 
 
+@functools.lru_cache(maxsize=256)
 def _lower_bound(lost: int, won: int, pairs: int, level: float, limit: float) -> float:
     """Return what the drop exceeds with confidence ``1 - level``: the test is turned round, by bisection.
 

@@ -56,11 +56,7 @@ class Batches:
 
 
 def mean_loss(frames: Frames, indices: NDArray[Any], loss: Loss, rows: int, device: Device) -> float:
-    """Return the mean loss of rows, without gradients.
-
-    Args:
-        indices: those of the rows, as ``Frames.sample`` gives.
-    """
+    """Return the mean loss of rows, without gradients; ``indices`` are as ``Frames.sample`` gives them."""
     total, count = 0.0, frames.row_count(indices)
     with require("torch", "build").no_grad(), device.computing(), device.casting():
         for part in np.array_split(indices, min(len(indices), -(-count // rows))):

@@ -20,11 +20,7 @@ class Constraint:
 
     @contextlib.contextmanager
     def step(self, number: int) -> Iterator[None]:
-        """Surround an update of the weights.
-
-        Args:
-            number: number of the step, from 1 on.
-        """
+        """Surround an update of the weights; ``number`` counts from 1 on."""
         yield
 
     def average(self, weight: Tensor, average: Tensor) -> None:

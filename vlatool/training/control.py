@@ -38,11 +38,7 @@ def exchange_labels(frames: Path, labels: Sequence[str], seed: Sequence[int]) ->
 
 
 def other_rows(count: int, seed: Sequence[int]) -> Array:
-    """Return for each of so many rows another one, each once: (count,).
-
-    Raises:
-        DataError: when there are fewer than two.
-    """
+    """Return another row for each of so many, each once: (count,); raises DataError when there are fewer than two."""
     if count < 2:
         raise DataError(
             f"--control noise gives an observation what the teacher said of another one; there is {count}.",

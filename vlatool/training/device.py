@@ -41,11 +41,7 @@ class Device:
 
     @contextlib.contextmanager
     def computing(self) -> Iterator[None]:
-        """Let tensors that are made within the block be made on the device.
-
-        Raises:
-            RecipeError: when the memory of a GPU is full.
-        """
+        """Make the tensors of the block on the device; raises RecipeError when the memory of a GPU is full."""
         if self.name == "cpu":
             yield
             return

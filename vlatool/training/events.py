@@ -40,11 +40,7 @@ class Events:
 
 
 def check_events(folder: str) -> None:
-    """Refuse before the work a folder that cannot be written, or when tensorboard is absent.
-
-    Raises:
-        MissingExtra, OutputError: see ``Events``.
-    """
+    """Refuse a folder that cannot be written, or a lack of tensorboard, before the work; raises as ``Events``."""
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path} is a file; events are written into a directory.", "name another one: --events DIR")

@@ -122,11 +122,7 @@ def new_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> Array:
 
 
 def concatenate(parts: Iterable[Path], target: Path) -> int:
-    """Join the arrays of several folders, ``NAME.npy`` each; return the number of rows.
-
-    Raises:
-        DataError: when there are none.
-    """
+    """Join the ``NAME.npy`` of several folders; return the number of rows; raises DataError when there are none."""
     folders = [part for part in parts if part.is_dir() and any(part.iterdir())]
     if not folders:
         raise DataError(

@@ -29,11 +29,7 @@ BACKENDS = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
 
 @dataclass(frozen=True)
 class Group:
-    """Which of the processes this one is.
-
-    Args:
-        rank: its number; the first one, 0, plays, labels and writes.
-    """
+    """Which of the processes this one is; ``rank`` 0, the first one, plays, labels and writes."""
 
     rank: int = 0
     size: int = 1
@@ -52,11 +48,7 @@ class Group:
             return _sum_gradients(loss, weights)
 
     def total(self, number: float) -> float:
-        """Return the sum of a number over all processes; the same bits in each.
-
-        Raises:
-            SourceError: when another process is gone.
-        """
+        """Return the sum of a number over all processes, the same bits in each; raises SourceError when one is gone."""
         return self.sum_gradients(number, ())
 
 

@@ -40,11 +40,7 @@ class Lanes:
 
 
 def side_by_side(begins: Array, count: int) -> Iterator[Lanes]:
-    """Yield all episodes, so many at a time.
-
-    Args:
-        begins: (N,) whether an episode begins with a row.
-    """
+    """Yield all episodes, so many at a time; ``begins`` (N,) says with which rows one begins."""
     firsts = np.flatnonzero(begins)
     ends = np.array([*firsts[1:], len(begins)])
     for start in range(0, len(firsts), count):

@@ -34,11 +34,7 @@ class RankProcesses:
 
     @contextlib.contextmanager
     def calling(self, function: str, job: Mapping[str, Any]) -> Iterator[None]:
-        """Call a function of ``rank_process`` in all others while the block runs.
-
-        Raises:
-            VlatoolError: the error of one of them, or how it ended.
-        """
+        """Call a function of ``rank_process`` in all others during the block; raises the error, or end, of one."""
         calls = [self._submit(child, function, {**job, "rank": rank}) for rank, child in enumerate(self._children, 1)]
         try:
             yield
@@ -118,11 +114,7 @@ def launch_processes(
 
 
 def check_launch(launch: Launch | None, size: int) -> None:
-    """Refuse a number of processes that is not torchrun's, and another process than its first one.
-
-    Raises:
-        RecipeError: saying so.
-    """
+    """Refuse, with RecipeError, a number of processes that is not torchrun's, and other processes than the first."""
     if launch is not None and (launch.size != size or launch.rank):
         raise RecipeError(
             f"torchrun started {launch.size} processes, of which this is number {launch.rank + 1}; the training was "

@@ -243,11 +243,7 @@ class Trainer:
         self._shards.gather(keep=self._group.rank == 0)
 
     def save(self) -> None:
-        """Write a checkpoint atomically; the first process writes it, with the parts of all.
-
-        Raises:
-            OSError: when it cannot be written.
-        """
+        """Write a checkpoint atomically, in the first process with the parts of all; raises OSError when that fails."""
         shards, tensors = self._shards, sorted(self._checkpoint_tensors(), key=lambda each: -each[2].dtype.itemsize)
         if self._group.rank:
             for _, name, held in tensors if shards.several else ():

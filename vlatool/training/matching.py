@@ -22,11 +22,7 @@ Stack = tuple[str, str]
 
 @dataclass(frozen=True)
 class Pair:
-    """A block of the student, and the teacher's that it is compared with.
-
-    Args:
-        numbers: numbers of the blocks in it, the student's and the teacher's.
-    """
+    """A block of the student and the teacher's that it is compared with, and the numbers of both."""
 
     stack: Stack
     numbers: tuple[int, int]
@@ -35,11 +31,7 @@ class Pair:
 
 
 def pairs_of(modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> list[Pair]:
-    """Return the pairs of all stacks that student and teacher have under the same name.
-
-    Args:
-        modules: the student's, graph name -> module.
-    """
+    """Return the pairs of all stacks of the same name in the student's ``modules`` and the teacher's."""
     edits, found = read_edits(source), list[Pair]()
     same_factory = teacher.bundle.manifest.source == source.manifest.source
     for graph, name in _stacks_of(teacher, edits):

@@ -17,11 +17,7 @@ Draw = Callable[[np.random.Generator], Iterable[Part]]
 
 
 class Mixture:
-    """Draws the parts of all terms, one term after the other.
-
-    Args:
-        terms: share of the loss, and what draws the batch of that term.
-    """
+    """Draws the parts of all terms, one after the other; a term has a share of the loss and draws its batch."""
 
     def __init__(self, terms: Sequence[tuple[float, Draw]]) -> None:
         self.terms: tuple[Draw, ...] = tuple(_Term(share, draw) for share, draw in terms)

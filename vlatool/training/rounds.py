@@ -166,11 +166,7 @@ def tensors(rows: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
 
 
 def next_round(frames: Frames, number: int, fill: Any) -> None:
-    """Use a round, writing it first unless an earlier run did.
-
-    Args:
-        fill: function called with the folder to write into.
-    """
+    """Use a round; ``fill`` writes it into a folder first, unless an earlier run did."""
     if not frames.has(number):
         draft = frames.draft(number)
         fill(draft)

@@ -28,11 +28,7 @@ LEAVE = "leave --shard out: every process then holds all weights"
 
 
 class Shards:
-    """What a process holds of each weight: all of it here.
-
-    Args:
-        parameters: name -> weight, as the modules have it.
-    """
+    """What a process holds of each weight (name -> weight, as the modules have it): all of it here."""
 
     def __init__(self, parameters: Mapping[str, nn.Parameter]) -> None:
         self.held: dict[str, Tensor] = dict(parameters)
@@ -148,8 +144,7 @@ class Parts(Shards):
             return whole
         mesh, value = self._cut[name].device_mesh, self._cut[name]
         rows = -(-len(value) // mesh.size())
-        part: Tensor = whole[mesh.get_local_rank() * rows :][:rows]
-        return part
+        return whole[mesh.get_local_rank() * rows :][:rows]
 
     def whole(self, name: str, part: Tensor) -> Tensor:
         """Return all rows."""

@@ -34,7 +34,7 @@ from vlatool.training.rounds import scene_of
 from vlatool.training.session import Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
 from vlatool.training.teacher import Teacher, check_teacher
-from vlatool.training.torchrun import current_launch
+from vlatool.training.torchrun import OPTIMIZER, current_launch
 from vlatool.training.user_batches import requested_rows
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ class TrainingStage(ModuleStage):
     changed_first: ClassVar[bool] = True
     """Whether an unchanged policy has nothing to learn."""
     trains: ClassVar[bool] = True
+    imports: ClassVar[tuple[str, ...]] = (OPTIMIZER,)
     policies: ClassVar[tuple[str, ...]] = ("teacher",)
     keeps: ClassVar[int] = 0
     """Number of observations that are stored in the bundle, for the ranges of activations."""

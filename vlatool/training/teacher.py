@@ -68,11 +68,7 @@ def _checked_source(path: Path) -> Source | None:
 
 @dataclass(frozen=True)
 class Teacher:
-    """A policy in torch that fits the student's.
-
-    Args:
-        edits: what was done to its structure.
-    """
+    """A policy in torch that fits the student's; ``edits`` were done to its structure."""
 
     bundle: Bundle
     edits: tuple[Edit, ...]

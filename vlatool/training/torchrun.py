@@ -33,7 +33,9 @@ AGENT = "TORCHELASTIC_USE_AGENT_STORE"
 RENDEZVOUS = "meeting"
 """File in the folder of the training through which processes of one machine find each other; under torchrun it holds
 what shows that a process sees that folder."""
-PRELOAD = ("torch", "vlatool.training.rank_process")
+OPTIMIZER = "torch._dynamo"
+"""What the first optimizer of a process imports, for a second of its time."""
+PRELOAD = ("torch", OPTIMIZER, "vlatool.training.rank_process")
 LEAVE_CALL = "leave"
 """Call after which a process discards the training."""
 START_S, LEFT_S, POLL_S = 300.0, 5.0, 0.05
@@ -126,11 +128,7 @@ def write_token(folder: Path) -> dict[str, Any]:
 
 
 def check_shared(job: Mapping[str, Any]) -> None:
-    """Refuse to train where the first process's folder is not visible, or versions differ.
-
-    Raises:
-        RecipeError: saying so.
-    """
+    """Refuse, with RecipeError, to train where the first process's folder is not visible, or versions differ."""
     if "token" not in job:
         return
     who, seen = f"Process {job['rank'] + 1} of {job['size']} on {platform.node()}", Path(job["place"], RENDEZVOUS)
@@ -177,11 +175,7 @@ class Follower:
             self._send_call(LEAVE_CALL, {})
 
     def call(self, function: str, job: Mapping[str, Any], _tell: Any) -> None:
-        """Call a function in the process, and wait until it returns.
-
-        Raises:
-            VlatoolError: what it raised; SourceError when the process is gone.
-        """
+        """Call a function in the process, and wait; raises what it raises, or SourceError when the process is gone."""
         self._wait(f"answer/{self._send_call(function, job)}")
 
     def end(self) -> None:

@@ -131,11 +131,7 @@ class _Rows:
         )
 
     def encode(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what the policy is given of the row that came last.
-
-        Raises:
-            DataError: when it is not what the policy takes.
-        """
+        """Return what the policy is given of the last row; raises DataError when it is not what the policy takes."""
         try:
             return self.encoder(observation)
         except DataError as error:

@@ -81,11 +81,7 @@ def stored_array(name: str, array: Array, file: Path) -> StoredTensor:
 
 
 def shard_files(folder: Path, pattern: str) -> list[Path]:
-    """Return the files of a glob below the policy's folder, sorted.
-
-    Raises:
-        SourceError: when there is none.
-    """
+    """Return the files of a glob below the policy's folder, sorted; raises SourceError when there is none."""
     files = sorted(path for path in folder.glob(pattern) if path.is_file())
     if not files:
         raise SourceError(f"No file in {folder} matches 'weights: {pattern}'.", DOWNLOAD_FIX)
@@ -130,11 +126,7 @@ def _check_indexes(files: list[Path]) -> None:
 
 
 def read_header(file: Path) -> list[StoredTensor]:
-    """Return the tensors of a safetensors file from its header.
-
-    Raises:
-        SourceError: with the fault of the file.
-    """
+    """Return the tensors of a safetensors file from its header; raises SourceError with the fault of the file."""
     header, start, size = _header_bytes(file)
     try:
         entries = json.loads(header)

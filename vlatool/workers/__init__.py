@@ -57,11 +57,7 @@ class Work:
 
 
 class Workers:
-    """Base of every launcher.
-
-    Args:
-        count: how many workers at most; 0 for as many as there is place for.
-    """
+    """Base of every launcher of ``count`` workers at most; 0 for as many as there is place for."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -83,11 +79,7 @@ class Workers:
 
 
 def launcher(name: str, count: int) -> Workers:
-    """Return the launcher of a name.
-
-    Raises:
-        UsageError: when there is none.
-    """
+    """Return the launcher of a name; raises UsageError when there is none."""
     made: Workers = registry.load(KIND, name)(count)
     return made
 

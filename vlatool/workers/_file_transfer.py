@@ -178,11 +178,7 @@ class IncomingParcel:
 
 
 class PathTranslation:
-    """The names of folders here and there: each path in a text is that of the other side.
-
-    Args:
-        pairs: here -> there.
-    """
+    """The names of folders, here -> there: each path in a text is that of the other side."""
 
     def __init__(self, pairs: Sequence[tuple[str, str]]) -> None:
         self._pairs = sorted(pairs, key=lambda pair: -len(pair[0]))  # a folder in another one first

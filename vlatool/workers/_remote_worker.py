@@ -68,11 +68,7 @@ def this_machine() -> dict[str, str]:
 
 
 class RemoteWorker:
-    """A worker.
-
-    Args:
-        order: an ``Order`` as JSON values.
-    """
+    """A worker that is given an ``Order`` as JSON values."""
 
     def __init__(self, order: Mapping[str, Any]) -> None:
         self._order = from_json(Order, order)

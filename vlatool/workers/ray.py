@@ -30,6 +30,7 @@ WAIT_S = 5.0
 LOOPBACK = ("localhost", "127.0.0.1", "::1", "[::1]")
 HELLO = -1
 """In the place of a job's number: a worker that has just been asked for, or is being sent what it lacks."""
+INSTALL = "install vlatool with its extras, the same version, where ray runs on each machine"
 START = "start one: ray start --head (on each other machine: ray start --address=HOST:PORT), or name it: RAY_ADDRESS"
 
 
@@ -263,19 +264,13 @@ class _RayWorkers:
         if number == HELLO:
             self._attempts[HELLO] += 1
             if self._attempts[HELLO] >= MAX_ATTEMPTS and not self._begun:
-                raise TargetError(
-                    f"No worker of the Ray cluster can begin: {why}.",
-                    "install vlatool with its extras, the same version, where ray runs on each machine",
-                )
+                raise TargetError(f"No worker of the Ray cluster can begin: {why}.", INSTALL)
         else:
             self._retry(number, f"{self._work.about}: the worker that ran it was lost: {why}.", "")
         if self._attempts[HELLO] < MAX_ATTEMPTS * MAX_ATTEMPTS:
             self._hire()
         elif not self._busy and not self._idle:
-            raise TargetError(
-                f"The workers of the Ray cluster end before they begin: {why}.",
-                "install vlatool with its extras, the same version, where ray runs on each machine",
-            )
+            raise TargetError(f"The workers of the Ray cluster end before they begin: {why}.", INSTALL)
 
     def _retry(self, number: int, why: str, fix: str) -> None:
         """Let a job be done again, unless it took so many workers with it that the fault is its own."""

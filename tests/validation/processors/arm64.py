@@ -12,18 +12,20 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
 
-from _asked import Answer, ask
+import numpy as np
+from _asked import CRASHED, ROOT, Answer, ask
 from _emulation import RUNTIME, EmulationError, Emulators, Unreachable
 from _planted import plant
 from _rungs import CPUINFO, model
 from _variants import FLOAT, FOR_ARM, SAMPLES, Made, VariantError, make
-from _verdicts import Row, difference, exit_code, summed_up, table
+from _verdicts import Difference, Row, difference, exit_code, summed_up, table
 
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.stage.finish import MAX_ROUNDING
@@ -33,6 +35,9 @@ CORES = ("cortex-a76", "cortex-a72")
 OLDEST = "1.23.2"
 """The oldest ONNX Runtime that vlatool takes, and the newest for Python 3.10."""
 PLANTED = "planted"
+PREPARATION = Path(__file__).with_name("preparation.py")
+PIXEL = 1e-5
+"""Largest difference of a normalised pixel: 600 times less than a step of 1/255 makes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -92,19 +97,45 @@ def rows_of(source: str, given: argparse.Namespace, cache: Emulators) -> list[Ro
     with ThreadPoolExecutor(given.jobs) as pool:
         there = pool.map(lambda board: asked(*board, made, bundles, cache), boards)
     answers = zip(boards, there, strict=True)
-    return unmade(made) + [row for board, each in answers for row in compared((*board, name), here, each)]
+    rows = unmade(made) + [row for board, each in answers for row in compared((*board, name), here, each)]
+    return rows + prepared(boards[0], name, list(made.bundles.values()), cache)
+
+
+def prepared(board: tuple[str, str], name: str, bundles: list[Path], cache: Emulators) -> list[Row]:
+    """Return a row for what becomes of camera frames, and one for the identities of bundles: the same as here."""
+    folder = cache.folder / "answers" / name
+    here, there = folder / "prepared-here.npz", folder / "prepared-there.npz"
+    python, path = emulated(board, cache)
+    for words, file, more in (([sys.executable], here, {}), (python, there, path)):
+        place = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1", **more}
+        done = subprocess.run([*words, PREPARATION, "-o", file, *bundles], env=place, check=False, cwd=ROOT)
+        if done.returncode:
+            return [Row((*board, name), "camera frames", None, 0.0, CRASHED, note=f"left with {done.returncode}")]
+    with np.load(here) as ours, np.load(there) as theirs:
+        names = [each for each in ours.files if not each.startswith("identity")]
+        apart = max(float(np.abs(ours[each] - theirs[each]).max()) for each in names)
+        others = [each for each in ours.files if each not in names and str(ours[each]) != str(theirs[each])]
+        frames = Row((*board, name), f"{len(names)} camera frames", Difference(apart, apart), PIXEL)
+        differ = float(bool(others))
+        return [frames, Row((*board, name), "identity", Difference(differ, differ), 0.0, note=", ".join(others))]
 
 
 def asked(core: str, version: str, made: Made, bundles: dict[str, Path], cache: Emulators) -> dict[str, Answer]:
     """Ask every bundle on an emulated board."""
-    python = [*cache.emulated("aarch64", core), str(cache.python())]
-    path = {"PYTHONPATH": f"{cache.wheels(version)}:{cache.folder / RUNTIME}"}
+    python, path = emulated((core, version), cache)
     out = cache.folder / "answers" / made.name / f"{core}-{version}"
 
     def tell(line: str) -> None:
         print(f"{made.name} on {core}, onnxruntime {version}: {line.strip()}", flush=True)
 
     return ask(python, bundles, made.observations, out, variables=path, tell=tell)
+
+
+def emulated(board: tuple[str, str], cache: Emulators) -> tuple[list[str], dict[str, str]]:
+    """Return the words that start Python on an emulated board, and the variables that it needs."""
+    core, version = board
+    path = {"PYTHONPATH": f"{cache.wheels(version)}:{cache.folder / RUNTIME}"}
+    return [*cache.emulated("aarch64", core), str(cache.python())], path
 
 
 def unmade(made: Made) -> list[Row]:

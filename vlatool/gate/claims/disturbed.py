@@ -37,10 +37,6 @@ class Disturbed(Drops):
         return replace(super().extend_plan(plan), disturb=self.kinds, strength=self.strength)
 
     def examine(self, evidence: Evidence) -> Verdict:
-        """Examine each disturbance.
-
-        Raises:
-            UsageError: when neither the evaluation nor the environment knows a disturbance that is named.
-        """
+        """Examine each disturbance; raises UsageError for one that neither evaluation nor environment knows."""
         baseline, candidate = evidence.episodes
         return self.judge(drops_by_disturbance(candidate, CONFIDENCE), few_starts(baseline))

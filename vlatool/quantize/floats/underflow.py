@@ -116,11 +116,7 @@ class _SizesTap(ActivationTap):
 def measure_sizes(
     bundle: Bundle, graphs: Iterable[str], observations: Iterable[Mapping[str, Any] | Moment], context: Context
 ) -> dict[str, GraphSizes]:
-    """Return graph -> the sizes of its values.
-
-    Raises:
-        DataError: when an observation does not fit the spec; names the sample.
-    """
+    """Return graph -> sizes of its values; raises DataError, naming the sample, when one does not fit the spec."""
     taps = run_with_taps(bundle, graphs, _SizesTap, observations, context, "looking for small values in")
     return {graph: tap.measured for graph, tap in taps.items()}
 

@@ -40,11 +40,7 @@ def padded_rows(rows: int) -> int:
 
 
 class ValueForms(OnnxGraph):
-    """A graph that is rebuilt node by node, and the forms of its values that exist so far.
-
-    Args:
-        model: An ``onnx.ModelProto``.
-    """
+    """An ``onnx.ModelProto`` that is rebuilt node by node, and the forms of its values that exist so far."""
 
     def __init__(self, model: Any) -> None:
         super().__init__(model)

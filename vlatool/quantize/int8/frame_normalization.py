@@ -60,7 +60,8 @@ class _NormalizationFolder(OnnxGraph):
         zero = int(np.clip(np.rint(np.mean(-shift / scale)), 0, 255))
         self._write_weights(convolution, weight, scale, shift + scale * zero)
         for node in arithmetic:
-            self._bypass(node)
+            self.replace_reads(node.output[0], self._varying(node))  # by its only reader
+            self.graph.node.remove(node)
         pixels, centred = chain[0].output[0], f"{convolution.name}.frame"
         self.replace_reads(pixels, centred)
         level = self.add(f"{convolution.name}.pixels.level", [zero], np.float32)
@@ -143,17 +144,8 @@ class _NormalizationFolder(OnnxGraph):
         convolution.input[1] = self.add(f"{name}.weight", weight * scale.reshape(spread), np.float32)
         convolution.input[2:] = [self.add(f"{name}.bias", bias, np.float32)]
 
-    def _bypass(self, node: Any) -> None:
-        """Connect the only reader of a node to the input of the node."""
-        self.replace_reads(node.output[0], self._varying(node))
-        self.graph.node.remove(node)
-
     def _add_border(self, chain: list[Any], pads: list[int], border: Array, convolution: Any) -> None:
-        """Add a border of pixels to a frame, instead of the padding of the convolution.
-
-        Args:
-            border: A pixel, (C,).
-        """
+        """Add a border of the pixel ``border``, (C,), to a frame, instead of the padding of the convolution."""
         axes = np.arange(4)  # axis of the frame for each axis of the convolution's input
         for node in (node for node in chain if node.op_type == "Transpose"):
             axes = axes[self.attributes(node).get("perm", [3, 2, 1, 0])]

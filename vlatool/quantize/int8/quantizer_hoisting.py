@@ -22,11 +22,7 @@ SMALLEST_NORMAL = np.finfo(np.float32).tiny
 
 
 def hoist_quantizers(model: Any) -> None:
-    """Hoist quantizers with a single scale, in place.
-
-    Args:
-        model: An ``onnx.ModelProto`` with quantizers (``insert_qdq``).
-    """
+    """Hoist quantizers (``insert_qdq``) with a single scale in an ``onnx.ModelProto``, in place."""
     name_nodes(model)
     _QuantizerHoister(model).run()
 

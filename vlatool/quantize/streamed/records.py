@@ -22,11 +22,7 @@ O_DIRECT = getattr(os, "O_DIRECT", 0)
 
 @dataclass
 class Tools:
-    """Resources of one process, reused from record to record.
-
-    Args:
-        buffer: Page-aligned memory for a record.
-    """
+    """Resources of one process, reused from record to record: ``buffer`` is page-aligned memory for one."""
 
     reader: Reader = field(default_factory=Reader)
     scratch: Scratch = field(default_factory=Scratch)

@@ -94,11 +94,7 @@ def records_for(task: Task, form: BlockFormat, choose: str, tolerance: float) ->
 def quantize_tensor(
     task: Task, form: BlockFormat, choose: ParameterChoice, tolerance: float, tools: Tools, data: Array
 ) -> dict[str, Any]:
-    """Quantize one weight into its record and return its figures.
-
-    Raises:
-        GraphError: when a weight is not finite, or the error exceeds the tolerance.
-    """
+    """Quantize a weight into its record; return figures; raises GraphError if not finite, or beyond the tolerance."""
     shape = (task.columns, -(-task.rows // form.block))
     stored = piece_bytes(task, 0, data) if task.kind == "blocks" else np.empty((*shape, form.code_bytes), np.uint8)
     stored = stored.reshape(-1, form.code_bytes)

@@ -31,12 +31,7 @@ class Curve:
 
 
 def curves(groups: Sequence[tuple[str, Sequence[Curve]]], title: str, width: int) -> Canvas:
-    """Return the drawing: a disturbance a panel, all on the same axes.
-
-    Args:
-        groups: Disturbance -> the curves of the variants, the worst first.
-        width: Width in pixels.
-    """
+    """Return the drawing: a panel for each disturbance (and its curves), the worst first, all on the same axes."""
     columns = min(len(groups), 3 if width > 500 else 2)
     wide = (width - GAP * (columns - 1)) / columns
     named = {curve.variant: curve.css for _, group in groups for curve in group}

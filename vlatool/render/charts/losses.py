@@ -39,12 +39,7 @@ class Curve:
 
 
 def loss_curve(curve: Curve, key: str, width: int) -> Canvas:
-    """Return the drawing of one training.
-
-    Args:
-        key: Unique key in the page.
-        width: Width in pixels.
-    """
+    """Return the drawing of one training, with a unique key in the page, so many pixels wide."""
     first, last = curve.ends
     words = f"Loss {significant(first)} in the first steps, {significant(last)} in the last."
     canvas = Canvas(f"loss-{key}-{width}", width, HEIGHT, f"Loss of {curve.name}", words)

@@ -66,13 +66,7 @@ class Band:
 
 
 def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> list[Band]:
-    """Return a band for each stretch of time that has samples; the stretches are equally long.
-
-    Args:
-        times: When each sample was taken, ascending.
-        samples: One sample for each time.
-        bins: Number of stretches.
-    """
+    """Return a band for each of ``bins`` equal stretches of time that has samples; ``times`` ascend."""
     first, last = times[0], times[-1]
     wide = (last - first) / bins
     stretches: list[list[float]] = [[] for _ in range(bins)]

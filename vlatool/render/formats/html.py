@@ -28,11 +28,7 @@ class HtmlRenderer:
     """Writes one self-contained page, with charts as inline SVG."""
 
     def render(self, report: Report) -> str:
-        """Return the page.
-
-        Raises:
-            MissingExtra: when jinja2 is not installed.
-        """
+        """Return the page; raises MissingExtra when jinja2 is not installed."""
         where = measured_where(report)
         return template().render(document=build(report), where=where[:1].lower() + where[1:]) + "\n"
 

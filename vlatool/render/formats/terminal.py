@@ -10,8 +10,7 @@ from rich.text import Text as Words
 
 from vlatool.render._format import plain
 from vlatool.render.document import Block, Code, Document, Line, Notes, Pairs, Section, Table, Text, build
-from vlatool.render.formats._grid import grid
-from vlatool.render.formats._layout import SHARED_ROLE, layout
+from vlatool.render.formats._layout import SHARED_ROLE, grid, layout
 from vlatool.report import Report
 
 STYLES = {"pass": "bold green", "fail": "bold red", "inconclusive": "bold yellow", "info": "bold cyan"}

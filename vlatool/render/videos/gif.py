@@ -32,11 +32,7 @@ class Gif:
     """Writes an animated GIF that is shown again and again."""
 
     def check(self) -> None:
-        """Refuse to begin without Pillow.
-
-        Raises:
-            MissingExtra: when it is not installed.
-        """
+        """Refuse to begin without Pillow; raises MissingExtra when it is not installed."""
         require_present("PIL", EXTRA)
 
     def write(self, video: Video, draft: Path) -> str:

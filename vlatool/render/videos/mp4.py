@@ -28,20 +28,12 @@ class Mp4:
     """Writes H.264 in an MP4 file."""
 
     def check(self) -> None:
-        """Refuse to begin without ffmpeg.
-
-        Raises:
-            MissingExtra: when there is none, or no Pillow, which writes on the pictures.
-        """
+        """Refuse to begin without ffmpeg, or Pillow, which writes on the pictures; raises MissingExtra."""
         require_present("PIL", EXTRA)
         program()
 
     def write(self, video: Video, draft: Path) -> str:
-        """Write a video into a new file.
-
-        Raises:
-            OutputError: when ffmpeg fails.
-        """
+        """Write a video into a new file; raises OutputError when ffmpeg fails."""
         for codec in CODECS:
             said = _encoded(video, draft, codec)
             if not said:
@@ -56,11 +48,7 @@ class Mp4:
 
 
 def program() -> str:
-    """Return the path of ffmpeg.
-
-    Raises:
-        MissingExtra: when there is none.
-    """
+    """Return the path of ffmpeg; raises MissingExtra when there is none."""
     if found := shutil.which("ffmpeg"):
         return found
     with contextlib.suppress(MissingExtra, RuntimeError):

@@ -11,9 +11,8 @@ from vlatool.runtime.engines._onnx_runtime import open_session, profiling_sessio
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vlatool.runtime.engines._branches import BranchesSession
     from vlatool.runtime.engines._ort_profile import OrtProfiled
-    from vlatool.runtime.engines._reference import ReferenceSession
+    from vlatool.runtime.engines._reference import BranchesSession, ReferenceSession
 
 
 def reference() -> type[ReferenceSession]:
@@ -33,7 +32,7 @@ def of_branches() -> type[BranchesSession]:
     Raises:
         MissingExtra: when the library is not installed.
     """
-    from vlatool.runtime.engines._branches import BranchesSession
+    from vlatool.runtime.engines._reference import BranchesSession
 
     return BranchesSession
 

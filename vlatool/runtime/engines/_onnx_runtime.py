@@ -7,7 +7,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +19,7 @@ from vlatool.machine.host import gpu_driver, gpus, versions
 from vlatool.runtime import arithmetic
 from vlatool.runtime.engine import Engine, Node, Profiled, computing
 from vlatool.runtime.engines._bound_buffers import HOST, BoundBuffers, port_of
+from vlatool.runtime.engines._device_tensors import on_host, run_bound
 from vlatool.runtime.engines._ort_profile import OrtProfiled, precision
 from vlatool.runtime.stored_types import has_float8
 
@@ -83,6 +84,8 @@ class OnnxRuntimeSession(Engine):
         self.gives = {node.name: port_of(node) for node in self._session.get_outputs()}
         self._bound = BoundBuffers.of(self._session, ort, self.memory)
         self.bound = self._bound is not None
+        self._stays: dict[str, bool] = {}
+        self._passed: frozenset[str] = frozenset()
 
     @classmethod
     def onnxruntime(cls) -> Any:
@@ -149,11 +152,7 @@ class OnnxRuntimeSession(Engine):
 
     @classmethod
     def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
-        """Open a graph with ONNX Runtime's trace of every node on.
-
-        Raises:
-            GraphError: when ONNX Runtime refuses it.
-        """
+        """Open a graph with ONNX Runtime's trace of every node on; raises GraphError when ONNX Runtime refuses it."""
         ort = cls.onnxruntime()
         return profiling_session(ort, path, session_options(ort, threads), scratch, cls.providers)
 
@@ -172,15 +171,35 @@ class OnnxRuntimeSession(Engine):
         try:
             if self.deadline is not None:
                 return self._run_until(self.deadline, feeds)
-            if self._bound is not None and self._bound.takes(feeds):
-                return self._bound.run()
-            return dict(zip(self.outputs, self._run(self.outputs, feeds), strict=True))
+            return self._call(feeds)
         except TimeoutError:
             raise
         except Exception as error:
             raise GraphError(
                 f"ONNX Runtime failed in {self.path.name}: {_first_line(error)}", REMEDY.format(package="onnxruntime")
             ) from error
+
+    def leave_on_device(self, outputs: Collection[str], inputs: Collection[str]) -> None:
+        """Leave outputs in this session's memory from now on, and expect inputs that others left there.
+
+        A graph whose tensors are small copies them through its bound buffers all the same, which is faster.
+
+        Args:
+            outputs: outputs that only other sessions of this engine take.
+            inputs: inputs that may be such outputs.
+        """
+        self._passed = frozenset(inputs)
+        if self._bound is None and (outputs or inputs):
+            self._stays = {name: name in outputs for name in self.outputs}
+
+    def _call(self, feeds: Mapping[str, Any], options: Any = None) -> Mapping[str, Any]:
+        if self._stays:
+            return run_bound(self._session, feeds, self._stays, self.memory, options)
+        if self._passed:
+            feeds = on_host(feeds, self._passed)
+        if self._bound is not None and self._bound.takes(feeds):
+            return self._bound.run(options)
+        return dict(zip(self.outputs, self._run(self.outputs, feeds, options), strict=True))
 
     def _run_until(self, deadline: float, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run, and let another thread tell ONNX Runtime to stop before its next node at the deadline."""
@@ -193,9 +212,7 @@ class OnnxRuntimeSession(Engine):
         timer.daemon = True
         timer.start()
         try:
-            if self._bound is not None and self._bound.takes(feeds):
-                return self._bound.run(options)
-            return dict(zip(self.outputs, self._run(self.outputs, feeds, options), strict=True))
+            return self._call(feeds, options)
         except Exception:
             if options.terminate:
                 raise TimeoutError from None

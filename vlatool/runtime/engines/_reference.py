@@ -15,7 +15,7 @@ from typing import Any
 
 from vlatool.errors import require
 from vlatool.runtime import arithmetic
-from vlatool.runtime.engines._onnx_runtime import is_true_of, session_options
+from vlatool.runtime.engines._onnx_runtime import is_true_of, open_session, session_options
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
 
@@ -35,9 +35,22 @@ class ReferenceSession(OrtCpuSession):
 
     @staticmethod
     def arithmetic() -> str:
-        """Return whether integer products of the reference are exact on this machine, or saturate.
-
-        Raises:
-            MissingExtra: when onnxruntime is not installed.
-        """
+        """Return whether the reference's integer products are exact here; raises MissingExtra without onnxruntime."""
         return arithmetic.ort_exactness(require("onnxruntime", "ort"), written=True)
+
+
+class BranchesSession(OrtCpuSession):
+    """One ONNX file whose quantize/dequantize pairs are in the branches of ``If``, open in ONNX Runtime on the CPU.
+
+    Where int8 products saturate, the option that makes them exact rewrites weights, but none that a branch reads from
+    the graph around it (1.32): fused products would silently saturate there. Pairs that stay pairs are float products
+    of rounded values, which are exact.
+    """
+
+    @classmethod
+    def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
+        if arithmetic.ort_product(ort) >= arithmetic.EXACT_SUM:
+            return super()._open(ort, model, threads)
+        options = session_options(ort, threads)
+        options.add_session_config_entry(*arithmetic.UNFUSED_OPTION)
+        return open_session(ort, model, options)

@@ -239,11 +239,7 @@ class OpenvinoSession(Engine):
 
     @classmethod
     def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
-        """Open a graph with OpenVINO's counters of every node on.
-
-        Raises:
-            GraphError: when OpenVINO refuses it.
-        """
+        """Open a graph with OpenVINO's counters of every node on; raises GraphError when OpenVINO refuses it."""
         settings = {**settings_for(threads, compute), "PERF_COUNT": True}
         return OpenvinoProfiled(cls.library(), path, lambda core, model: compile_for_cpu(core, model, settings))
 
@@ -308,11 +304,7 @@ def compile_for_cpu(core: Any, model: Any, settings: dict[str, Any]) -> Any:
 
 
 def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
-    """Return what a model is compiled with.
-
-    Raises:
-        GraphError: when OpenVINO does not compute in that dtype.
-    """
+    """Return what a model is compiled with; raises GraphError when OpenVINO does not compute in that dtype."""
     if compute not in HINTS:
         raise GraphError(
             f"OpenVINO on the CPU does not compute in {compute}; {suggest(compute, filter(None, HINTS))}.",

@@ -60,11 +60,7 @@ class OrtCpuSession(OnnxRuntimeSession):
 
     @staticmethod
     def arithmetic() -> str:
-        """Return whether integer products are exact on this machine, or saturate.
-
-        Raises:
-            MissingExtra: when onnxruntime is not installed.
-        """
+        """Return whether integer products are exact here, or saturate; raises MissingExtra without onnxruntime."""
         return arithmetic.ort_exactness(require("onnxruntime", "ort"))
 
     @classmethod
