@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vlatool.stats.intervals import student
 from vlatool.verify._reading import Names
@@ -24,10 +25,11 @@ from vlatool.verify._search import (
     tables,
 )
 from vlatool.verify._series import Array, Series
-from vlatool.verify._views import PLACES, Prediction, fit_all, leads_of, views_of
+from vlatool.verify._views import PLACES, Prediction, fit_all, folds, leads_of, views_of
 
-MAX_NULL = 40
-"""Episodes of the reference that are judged as if they were logs."""
+MAX_FOLDS = 16
+MIN_LOG = 50
+"""Rows of the reference, of whole episodes, that are judged as if they were a log: in fewer, nothing is found."""
 ALARM = 1e-3
 """Share of right logs in which a kind of change of a signal may be found."""
 MIN_EVIDENCE = float(np.log(1 / ALARM))
@@ -75,9 +77,10 @@ class Model:
 
     def tables(self, series: Series, name: str) -> Tables:
         """Return what speaks for each change of a signal of a log."""
-        return tables(
+        found = tables(
             self.predictions.get(name, ()), self.levels.get(name), series, name, only_delay=name in self.names.images
         )
+        return found.without_signs() if self.discrete and name == self.names.commands else found
 
     def finding(self, series: Series, name: str, needed: Mapping[str, float]) -> Finding:
         """Return the best change of a signal."""
@@ -96,9 +99,9 @@ class Model:
         """
         clean: Nulls = {name: {kind: [] for kind in KINDS} for name in self.signals}
         rough: Nulls = {name: {kind: [] for kind in KINDS} for name in self.signals}
-        for group, episodes in _parts(series).items():
-            other = Model.of(self.names, series.part(series.groups != group), self.discrete, self.leads)
-            for log, found in ((each.part(each.episodes == number), found) for number in episodes
+        for out, logs in _parts(series):
+            other = Model.of(self.names, series.part(~out), self.discrete, self.leads)
+            for log, found in ((each.part(np.isin(each.episodes, numbers)), found) for numbers in logs
                                for each, found in ((series, clean), (shifted, clean), (noisy, rough))):  # fmt: skip
                 for name in self.signals:
                     components = other.finding(log, name, dict.fromkeys(KINDS, 0.0)).components
@@ -106,7 +109,7 @@ class Model:
                         found[name][kind].append(max((e.evidence for e in components if e.kind == kind), default=0.0))
         parts = [series.part(series.episodes == number) for number in np.unique(series.episodes)]
         usual = {name: upper_bound([roughness(part, name) for part in parts], 0.0) for name in self.signals}
-        rows = float(np.mean([len(part) for part in parts]))
+        rows = max(MIN_LOG, float(np.mean([len(part) for part in parts])))
         return replace(self, usual=usual, rows=rows, needed=_bounds(clean), needed_rough=_bounds(clean, rough))
 
     def for_log(self, series: Series) -> Model:
@@ -142,13 +145,17 @@ def roughness(series: Series, name: str) -> float:
     return float(np.sqrt(change[moves] / square[moves]).mean()) if moves.any() else 0.0
 
 
-def _parts(series: Series) -> dict[int, list[int]]:
-    """Return the episodes that are judged, by their group; none where there is a single group."""
-    numbers = np.unique(series.episodes)
-    parts: dict[int, list[int]] = {}
-    for number in numbers[np.unique(np.linspace(0, len(numbers) - 1, MAX_NULL).astype(int))]:
-        parts.setdefault(int(series.groups[series.episodes == number][0]), []).append(int(number))
-    return parts if len(np.unique(series.groups)) > 1 else {}
+def _parts(series: Series) -> Iterator[tuple[NDArray[np.bool_], list[list[int]]]]:
+    """Yield which rows are left out together, and logs made of their episodes, of ``MIN_LOG`` rows or more each."""
+    for out in folds(series.groups, MAX_FOLDS):
+        if out.all():
+            return
+        logs: list[list[int]] = [[]]
+        for number in np.unique(series.episodes[out]).tolist():
+            logs[-1].append(number)
+            if np.isin(series.episodes, logs[-1]).sum() >= MIN_LOG:
+                logs.append([])
+        yield out, [each for each in logs if each]
 
 
 def upper_bound(values: Sequence[float], least: float = MIN_EVIDENCE) -> float:

@@ -184,6 +184,10 @@ class Tables:
 
     by_delay: Mapping[int, Array]
 
+    def without_signs(self) -> Tables:
+        """Return the same for indices, which have neither sign nor unit."""
+        return Tables({delay: np.where(COSTS == 0, table, -1e6) for delay, table in self.by_delay.items()})
+
     @property
     def right(self) -> float:
         """What speaks for right wiring."""

@@ -180,14 +180,14 @@ def _distinct(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
 
 
 def _same_episodes(signals: Signals) -> bool:
-    """Return whether at least half of what can be compared says that the rows are of the same moments."""
+    """Return whether more than half of what can be compared says that the rows are of the same moments."""
     if 0 not in signals.pairings:
         return False
     shares = [match.cost for match in signals.matches.values()]
     shares += [unlike for _, unlike in signals.explained_images.values()]
     near = sum(share < SAME_MOMENT for share in shares)
     near += sum(signals.matches[name].cost >= MAX_UNLIKE for name in _exchanged(signals))
-    return near > 0 and 2 * near >= len(shares)
+    return 2 * near > len(shares)
 
 
 def _of_pairs(signals: Signals) -> Iterator[Explanation]:
