@@ -42,7 +42,8 @@ def verify(
     With --against: FUNCTION takes an observation (a dict of physical values, without a batch axis) and returns the
     action in physical units; the stage that differs is named. With --log: each input of the log is compared with a
     reference recording, and commands with what the policy gives; what is permuted, negated, of another unit, late,
-    swapped, normalised wrong or BGR is named. Exits 1 when something differs.
+    swapped, normalised wrong or BGR is named. Exits 1 when something differs, and 5 when that
+    may be right.
     """
     from vlatool.data import named_recording
     from vlatool.verify import Options, check

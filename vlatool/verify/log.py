@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,14 +22,19 @@ from vlatool.runtime.statistics import Normaliser, load_normaliser
 from vlatool.stage.base import Context
 from vlatool.stage.identity import with_identity
 from vlatool.verify._actions import explain_actions, in_memory
-from vlatool.verify._distributions import explain_moments, explain_statistics
+from vlatool.verify._distributions import explain_statistics, scales_of
 from vlatool.verify._explanation import Explanation
 from vlatool.verify._images import explain_images, is_image
+from vlatool.verify._model import Scales
+from vlatool.verify._other_episodes import Judge, Outcome
 from vlatool.verify._pairing import Pairs, pair_rows
+from vlatool.verify._reading import names_of
 from vlatool.verify._vectors import BETTER, MAX_UNLIKE, Match, explain_vector, match_vectors
 
 Array = NDArray[np.float64]
 EXPLANATIONS = "explanations"
+SAME_MOMENT = 0.3
+"""Share of a signal's spread by which two recordings of the same moment differ at most, after a known change."""
 MAX_WIDTH = 256
 """Elements of a signal that is compared element by element; images, and what is larger, are not."""
 
@@ -125,11 +130,12 @@ def verify_log(bundle: Bundle, options: LogOptions, context: Context) -> Report:
     log = read_recording(options.log, spec)
     context.progress("comparing inputs", None)
     references = [read_recording(path, spec) for path in _references(bundle, options)]
-    found, paired = explain_inputs(bundle, log, references, own=options.reference is None)
-    if bundle.manifest.graphs and not _shifts_actions(spec, found):
+    outcome, paired = explain_inputs(bundle, log, references, own=options.reference is None)
+    if bundle.manifest.graphs and not _shifts_actions(spec, outcome.explanations):
         context.progress("comparing commands", None)
-        found += explain_actions(Policy.open(bundle, threads=1, seed=0), log, options.samples)
-    return _report(bundle, options, log, found, paired)
+        commands = explain_actions(Policy.open(bundle, threads=1, seed=0), log, options.samples)
+        outcome = replace(outcome, explanations=_distinct([*outcome.explanations, *commands]))
+    return _report(bundle, options, log, outcome, paired)
 
 
 def _shifts_actions(spec: PolicySpec, found: Sequence[Explanation]) -> bool:
@@ -138,22 +144,31 @@ def _shifts_actions(spec: PolicySpec, found: Sequence[Explanation]) -> bool:
 
 
 def explain_inputs(
-    bundle: Bundle, log: Recording, references: Sequence[Recording], *, own: bool
-) -> tuple[list[Explanation], bool]:
+    bundle: Bundle, log: Recording, references: Sequence[Recording], *, own: bool, judge: Judge | None = None
+) -> tuple[Outcome, bool]:
     """Return what is wrong with the inputs of a log, and whether its rows are of the same moments as the reference's.
 
     Args:
         references: recordings of right wiring, of which one may be of the episodes of the log.
         own: whether they are the policy's own.
+        judge: what other episodes are compared with, if it was fitted already to one of them.
     """
-    found: list[Explanation] = []
+    spec, wrong = bundle.manifest.spec, list[Explanation]()
     for reference in references:
-        pairings = pair_rows(log, reference, bundle.manifest.spec.control_hz)
-        signals = Signals(bundle, log, reference, pairings, own)
+        signals = Signals(bundle, log, reference, pair_rows(log, reference, spec.control_hz), own)
         if _same_episodes(signals):
-            return _distinct([*_of_pairs(signals), *_of_statistics(signals)]), True
-        found += [*_of_distributions(signals), *_of_statistics(signals)]
-    return _distinct(found), False
+            return Outcome(_distinct([*_of_pairs(signals), *_of_statistics(signals)])), True
+        wrong += _of_statistics(signals)
+    longest = max(references, key=len)
+    judge = judge or Judge.of(spec, names_of(spec, log, longest, MAX_WIDTH), longest)
+    outcome = judge.explain(log, _scales(signals))
+    return replace(outcome, explanations=_distinct([*outcome.explanations, *wrong])), False
+
+
+def _scales(signals: Signals) -> Scales:
+    """Return offset and scale of each vector that is normalised."""
+    known = {tensor.name: signals.normaliser(tensor) for tensor in signals.vectors()}
+    return {name: scales_of(each) for name, each in known.items() if each is not None}
 
 
 def _references(bundle: Bundle, options: LogOptions) -> list[Path]:
@@ -164,20 +179,20 @@ def _references(bundle: Bundle, options: LogOptions) -> list[Path]:
     return known
 
 
-def _distinct(found: Sequence[Explanation]) -> list[Explanation]:
+def _distinct(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
     """Return one explanation of each signal and kind."""
-    return list({(each.signal, each.kind, each.where): each for each in found}.values())
+    return tuple({(each.signal, each.kind, each.where): each for each in found}.values())
 
 
 def _same_episodes(signals: Signals) -> bool:
-    """Return whether at least half of what can be compared says that the rows are of the same moments."""
+    """Return whether more than half of what can be compared says that the rows are of the same moments."""
     if 0 not in signals.pairings:
         return False
     shares = [match.cost for match in signals.matches.values()]
     shares += [unlike for _, unlike in signals.explained_images.values()]
-    near = sum(share < MAX_UNLIKE for share in shares)
+    near = sum(share < SAME_MOMENT for share in shares)
     near += sum(signals.matches[name].cost >= MAX_UNLIKE for name in _exchanged(signals))
-    return near > 0 and 2 * near >= len(shares)
+    return 2 * near > len(shares)
 
 
 def _of_pairs(signals: Signals) -> Iterator[Explanation]:
@@ -222,42 +237,37 @@ def _exchanged(signals: Signals) -> dict[str, Explanation]:
     return found
 
 
-def _of_distributions(signals: Signals) -> Iterator[Explanation]:
-    """Yield what means and spreads alone tell, where the episodes are others."""
-    for tensor in signals.vectors():
-        mine, right = (signals.values(each, tensor.name) for each in (signals.log, signals.reference))
-        labels = signals.labels(tensor, mine.shape[1])
-        explanation = explain_moments(tensor.name, labels, mine, right, signals.normaliser(tensor))
-        if explanation is not None and np.dtype(tensor.dtype).kind == "f":
-            yield explanation
-
-
 def _of_statistics(signals: Signals) -> Iterator[Explanation]:
     """Yield inputs whose statistics are not of the data that the policy was trained on."""
     for tensor in signals.vectors():
         normaliser = signals.normaliser(tensor)
-        if normaliser is not None and tensor.normalisation == "mean_std":
+        if normaliser is not None:
             right = signals.values(signals.reference, tensor.name)
             labels = signals.labels(tensor, right.shape[1])
-            explanation = explain_statistics(tensor.name, labels, right, normaliser, whole=signals.own)
+            kind = tensor.normalisation
+            explanation = explain_statistics(tensor.name, labels, right, normaliser, kind, whole=signals.own)
             if explanation is not None:
                 yield explanation
 
 
-def _report(bundle: Bundle, options: LogOptions, log: Recording, found: Sequence[Explanation], paired: bool) -> Report:
-    """Return what was found as a report: ``fail`` when a signal is wrong, ``pass`` otherwise."""
-    name = bundle.manifest.name
-    how = "row by row" if paired else "by means and spreads, since the episodes are others"
+def _report(bundle: Bundle, options: LogOptions, log: Recording, outcome: Outcome, paired: bool) -> Report:
+    """Return what was found as a report.
+
+    Its verdict is ``fail`` when a signal is wrong, ``inconclusive`` when something differs that no wrong wiring
+    explains, and ``pass`` otherwise.
+    """
+    name, found = bundle.manifest.name, outcome.explanations
+    how = "row by row" if paired else "by what holds in each right episode, since the episodes are others"
     result = f"{len(found)} signals are wired wrong" if len(found) != 1 else "1 signal is wired wrong"
-    first = f"{options.log.name} fits {name}" if not found else f"In {options.log.name}, {result}"
-    sentences = (f"{first}: compared {how}, on {len(log)} rows.", *(each.sentence() for each in found))
-    unseen = () if paired else (
-        "delays, and most signs and orders, are seen only in a log of episodes that the reference holds, too: replay "
-        "one on the robot, and pass it with --reference",
-    )  # fmt: skip
-    worst = max((min(each.before, 1e9) for each in found), default=0.0)
+    if outcome.suspicious and not found:
+        result = "nothing is proven wrong, but something differs"
+    first = f"In {options.log.name}, {result}" if found or outcome.suspicious else f"{options.log.name} fits {name}"
+    sentences = (f"{first}: compared {how}, on {len(log)} rows.", *(each.sentence() for each in found),
+                 *(f"Suspicious: {each}." for each in outcome.suspicious))  # fmt: skip
+    worst = max((min(each.before, 1e9) for each in found if each.evidence is None), default=0.0)
     measured = [RELATIVE_ERROR_MAX.measurement(worst, samples=len(log), note="of signals that are wrong")]
     details = {EXPLANATIONS: [each.record() for each in found]} if found else {}
     row = with_identity(Row(name, measurements=tuple(measured), details=details), bundle)
-    return Report("verify", f"Wiring of {name} in {options.log.name}", "fail" if found else "pass", sentences, (row,),
-                  environment=fingerprint(), warnings=unseen)  # fmt: skip
+    verdict = "fail" if found else "inconclusive" if outcome.suspicious else "pass"
+    return Report("verify", f"Wiring of {name} in {options.log.name}", verdict, sentences, (row,),
+                  environment=fingerprint(), warnings=outcome.unseen)  # fmt: skip

@@ -1,9 +1,11 @@
 """Wrong wirings, planted in logs of five policies: each must be found and named, and nothing in logs of right ones.
 
     python tests/validation/soak/wiring_trials.py --wrong 500 --right 100
+    python tests/validation/soak/wiring_trials.py --wrong 500 --right 110 --episodes other --recordings FOLDER
 
-The logs are streams between recorded observations of the four sample policies and of the tiny policy of the tests with
-a second camera: four control steps from one observation to the next, with noise of a sensor. A wrong wiring counts as
+With ``--episodes other`` the logs are of episodes that the reference does not hold: see ``wiring_elsewhere.py``. Else
+they are streams between recorded observations of the four sample policies and of the tiny policy of the tests with a
+second camera: four control steps from one observation to the next, with noise of a sensor. A wrong wiring counts as
 found when it is the only explanation, of the right signal, of the right kind and with the right elements, factor or
 delay. Right logs are of the same episodes with more noise, of other episodes, and of a part of the episodes.
 """
@@ -27,6 +29,8 @@ import numpy as np
 ROOT = Path(__file__).parents[3]
 sys.path[:0] = [str(ROOT / "tests")]
 
+import wiring_elsewhere  # noqa: E402
+import wiring_recordings  # noqa: E402
 from _tiny import observations, write_policy  # noqa: E402
 
 from vlatool.bundle.bundle import Bundle, seal  # noqa: E402
@@ -252,12 +256,23 @@ def trials(wrong: int, right_logs: int, seed: int, folder: Path) -> tuple[Counte
     return planted, found, misses
 
 
-def _explain(subject: Subject, log: Recording) -> list[Explanation]:
-    return explain_inputs(subject.bundle, log, [subject.recording(subject.stream)], own=True)[0]
+def _explain(subject: Subject, log: Recording) -> Sequence[Explanation]:
+    return explain_inputs(subject.bundle, log, [subject.recording(subject.stream)], own=True)[0].explanations
 
 
 def _line(subject: Subject, what: str, found: Sequence[Explanation]) -> str:
     return f"{subject.bundle.manifest.name}: {what}: " + ("; ".join(each.sentence() for each in found) or "nothing")
+
+
+def _elsewhere(asked: Any) -> int:
+    """Print the tables and every miss of logs of other episodes."""
+    with tempfile.TemporaryDirectory() as folder:
+        recordings = asked.recordings or Path(folder) / "recordings"
+        policies = wiring_elsewhere.subjects(recordings, Path(folder), asked.policies)
+        table, lines = wiring_elsewhere.trials(policies, asked.wrong, asked.right, asked.seed)
+    text, enough = wiring_elsewhere.summary(table)
+    print("\n".join([*lines, text]))
+    return int(not enough)
 
 
 def main() -> int:
@@ -266,7 +281,12 @@ def main() -> int:
     parser.add_argument("--wrong", type=int, default=500)
     parser.add_argument("--right", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--episodes", choices=("same", "other"), default="same")
+    parser.add_argument("--recordings", type=Path, help="folder that keeps the simulated recordings of other episodes")
+    parser.add_argument("--policies", nargs="*", default=list(wiring_recordings.SEEDS), help="of other episodes")
     asked: Any = parser.parse_args()
+    if asked.episodes == "other":
+        return _elsewhere(asked)
     with tempfile.TemporaryDirectory() as folder:
         planted, found, misses = trials(asked.wrong, asked.right, asked.seed, Path(folder))
     print("\n".join(misses))
