@@ -42,6 +42,9 @@ QUICK = "--iterations 20 --duration 0"
 LINES = {
     "optimize": "{policy} -o {out} --episodes 0 --no-search --iterations 20",
     "export onnx": "{policy} -o {out}",
+    "export opset": "{bundle} -o {out} --opset 20",
+    "export openvino": "{bundle} -o {out}",
+    "export tensorrt": "{bundle} -o {out}",
     "prune": "{policy} -o {out} --samples 2",
     "prune neurons": "{policy} -o {out}",
     "prune structured": "{policy} -o {out} --samples 2 --multiple 1",
