@@ -12,6 +12,7 @@ import numpy as np
 from vlatool.errors import require
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import read, save
+from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.policy import relative_error
 
@@ -89,7 +90,8 @@ def _node_outputs(file: Path, feeds: Mapping[str, Any]) -> dict[str, tuple[str, 
     with scratch_directory() as folder:
         save(model, folder / "all.onnx")
         taken = {value.name: feeds[value.name] for value in model.graph.input}
-        values = engine_class()(folder / "all.onnx", threads=1).run(taken)
+        with engine_call(engine_class(), f"ran {file.name} with every value as an output"):
+            values = engine_class()(folder / "all.onnx", threads=1).run(taken)
     return {name: (node, values[name]) for name, node in nodes.items() if np.asarray(values[name]).dtype.kind == "f"}
 
 

@@ -16,6 +16,7 @@ from vlatool.files.printable import message_of, one_line
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.float32_conversion import ROUNDING, rewrite_as_float32
 from vlatool.graph.random_ops import refuse_random_ops
+from vlatool.machine.engine_calls import engine_call
 from vlatool.module.batched_program import run_module
 from vlatool.module.changed_buffers import refuse_changed_buffers
 from vlatool.module.decisions import decisions_of
@@ -185,13 +186,15 @@ def _compare(model: Any, session: CalledSession, tolerance: float) -> None:
 
 def _outputs(file: Path, session: CalledSession) -> list[Mapping[str, Any]]:
     """Return what ONNX Runtime gives for each call."""
+    graph = session.step.graph
     try:
-        opened = engine_class()(file, threads=1)
-        return [opened.run(feeds) for feeds, _ in session.calls]
+        with engine_call(engine_class(), f"opened the graph '{graph}'"):
+            opened = engine_class()(file, threads=1)
+        with engine_call(engine_class(), f"ran the graph '{graph}'"):
+            return [opened.run(feeds) for feeds, _ in session.calls]
     except Exception as error:  # the seam: an engine raises many foreign types
         text = error.message if isinstance(error, VlatoolError) else message_of(error)
         reason = one_line(text.replace(str(file), file.name), REASON_CHARACTERS).rstrip(".")
-        graph = session.step.graph
         raise GraphError(f"ONNX Runtime does not run the graph '{graph}': {reason}.", WHERE_DIFFERENT) from error
 
 
