@@ -78,7 +78,8 @@ class Openvino(Transform):
         graphs = source.manifest.graphs
         recorded = bool(recorded_observations(source, 1))
         made = finish(source, out, made_by=made_by(self), graphs=graphs, observations=observations, recorded=recorded)
-        error = self._compare(made, observations[:OBSERVATIONS])
+        with engine_call(engine_class(ENGINE), "ran the IR"):
+            error = self._compare(made, observations[:OBSERVATIONS])
         size = sum(file.stat().st_size for file in (out / FOLDER).iterdir()) / 1e6
         count = min(OBSERVATIONS, len(observations))
         return Result(made, (
