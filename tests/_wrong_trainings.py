@@ -244,7 +244,7 @@ ROWS = [
         lambda at: at.teacher(("statistics.json", "[0.1, -0.2, 0.5]", "[0.1, -0.2, 0.6]"))),
     Row("a teacher with other statistics of its action", "have another normalisation for 'action'", 3,
         lambda at: at.teacher(("statistics.json", "[0.05, 0.1]", "[0.05, 0.2]"))),
-    Row("a teacher that acts in another way", "have another unit or mode for 'action'", 3,
+    Row("a teacher that acts in another way", "have another unit, mode, parts or conversions for 'action'", 3,
         lambda at: at.teacher(("policy.yaml", "mode: delta", "mode: absolute"))),
     Row("a teacher without one of the inputs", "is given 'proprio' as nothing", 3, lambda at: at.teacher(
         ("policy.yaml", "- {name: proprio,", "- {name: state,"), drop=RECORDINGS)),
