@@ -10,8 +10,8 @@ from _render_reports import benchmark, optimize
 from vlatool.render import render
 from vlatool.render._columns import board, columns, sides
 from vlatool.render._format import is_share, quantity
-from vlatool.render._view import latency
-from vlatool.report import ON_BOARD, Measurement, Report
+from vlatool.render._view import further, headline, latency
+from vlatool.report import ON_BOARD, Measurement, Report, Row
 
 
 def for_pi() -> Report:
@@ -83,3 +83,15 @@ def test_a_limit_for_the_board_is_not_drawn_over_the_latencies_of_this_host() ->
 def test_a_share_of_what_an_engine_reaches_is_in_per_cent_above_the_whole_too():
     assert [is_share(Measurement("reach_share", value, "1")) for value in (0.9, 2.23)] == [True, True]
     assert not is_share(Measurement("occupancy", 2.23, "1"))
+
+
+def test_what_a_limit_names_is_in_the_headline() -> None:
+    rows = tuple(
+        Row(name, measurements=(Measurement("latency_p50", value, "ms"), Measurement("relative_error", error, "1")))
+        for name, value, error in (("float32", 9.0, 0.0), ("int8", 4.0, 0.031))
+    )
+    report = Report("optimize", "tiny", "pass", rows=rows)
+    assert [each.name for each in headline(report)] == ["latency_p50"]
+    limited = replace(report, limits={"relative_error": 0.04})
+    assert [each.name for each in headline(limited)] == ["latency_p50", "relative_error"]
+    assert "relative_error" not in [each.name for each in further(limited)]

@@ -63,10 +63,11 @@ def places(report: Report, origin: str) -> list[str]:
 
 
 def headline(report: Report) -> list[Quantity]:
-    """Return the few measured quantities that decide, each a column of the variants."""
+    """Return the few measured quantities that decide, those that a limit names among them, each a column."""
     present = quantities(report)
     sections = (HEADLINE,) if SUCCESS in present else (HEADLINE, RECORDED_ACCURACY)
-    return sorted((each for each in present if each.section in sections), key=lambda each: each.order)
+    decide = (each for each in present if each.section in sections or each.name in report.limits)
+    return sorted(decide, key=lambda each: each.order)
 
 
 def further(report: Report) -> list[Quantity]:
