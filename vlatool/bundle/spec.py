@@ -425,20 +425,20 @@ class PolicySpec:
     def _check_units(self, relative: Conversion, spans: tuple[tuple[Span, Span], ...]) -> None:
         """Refuse a step ``relative`` behind one that changes units which the action and the state have in common."""
         before = self.action.convert[: self.action.convert.index(relative)]
-        if self.reference is None or any(step.growth for step in before):  # then places are no longer the robot's
+        if self.reference is None or any(step.growth for step in before):  # then they are not where the robot has them
             return
         mine, theirs = self.action.units(), self.reference.units()
         common = {
-            own + place: theirs[other + place]
+            own + index: theirs[other + index]
             for (own, stop), (other, _) in spans
-            for place in range(stop - own)
-            if mine[own + place] == theirs[other + place] != ""
+            for index in range(stop - own)
+            if mine[own + index] == theirs[other + index] != ""
         }
         for step, layout in zip(before, self.action.layouts(), strict=False):
             changed = layout.spans(step.parts, step.where) if step.op in CHANGE_UNITS else ()
-            for place in (place for start, stop in changed for place in range(start, stop) if place in common):
+            for index in (index for start, stop in changed for index in range(start, stop) if index in common):
                 raise SpecError(
-                    f"{relative.where} stands behind the step '{step.op}', and '{relative.to}' is in {common[place]} "
+                    f"{relative.where} stands behind the step '{step.op}', and '{relative.to}' is in {common[index]} "
                     "as the robot has it.",
                     "let the step 'relative' stand first; where robot and state differ, name the unit of each",
                 )
