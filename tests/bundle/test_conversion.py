@@ -103,6 +103,10 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "relative to normalised values": (
         {}, {"normalisation": "mean_std", "statistics": "s.json#y", "convert": [{"op": "normalisation"}, RELATIVE]},
         "relative behind its normalisation"),
+    "relative to degrees in radians": (
+        {"unit": ["deg", "deg", "deg", "1"]},
+        {"unit": ["deg", "deg", "deg", "1"], "convert": [{"op": "scale", "parts": [1], "factor": 0.01745}, RELATIVE]},
+        r"A step of 'convert', relative, stands behind the step 'scale', and 's' is in deg as the robot has it"),
     "a factor of text": ({"convert": [{"op": "scale", "factor": "-1"}]}, {}, "of which one must be a number; got '-1'"),
     "two factors for four": ({"convert": [{"op": "scale", "factor": [1, -1]}]}, {}, "2 numbers as factor, for 4 elem"),
     "no offset": ({"convert": [{"op": "scale", "offset": []}]}, {}, "wanted: numbers"),
@@ -127,6 +131,17 @@ def test_a_bad_spec_is_one_sentence(name: str) -> None:
     state, action, words = BAD[name]
     with pytest.raises(SpecError, match=words):
         spec(state, action)
+
+
+@pytest.mark.parametrize(("unit", "steps"), [
+    ("deg", [RELATIVE, {"op": "scale", "factor": 0.01745}]),  # differences are scaled
+    ("deg", [{"op": "scale", "parts": ["grip"], "factor": 2}, RELATIVE]),  # another part
+    ("deg", [{"op": "clip", "low": -180}, RELATIVE]),
+    ("rad", [{"op": "scale", "factor": 57.3}, RELATIVE]),  # the robot says degrees, and takes radians
+    ("", [{"op": "scale", "factor": 57.3}, RELATIVE]),  # nobody knows
+])  # fmt: skip
+def test_what_is_relative_has_the_units_of_the_state(unit: str, steps: list[dict[str, Any]]) -> None:
+    assert spec({"unit": "deg"}, {"unit": unit, "convert": steps}).reference is not None
 
 
 def test_the_shape_is_the_networks_and_all_else_the_robots() -> None:

@@ -79,3 +79,12 @@ def test_what_openvino_does_not_take_is_refused_with_a_remedy(tmp_path: Path) ->
 def test_a_tolerance_that_is_too_small_is_an_error(float_bundle: Bundle, tmp_path: Path) -> None:
     with pytest.raises(GraphError, match=r"relative L2 error .* allowed 1e-12"):
         converted(float_bundle, tmp_path, tolerance=1e-12)
+
+
+def test_the_fix_is_not_what_was_done_already(float_bundle: Bundle, tmp_path: Path) -> None:
+    (tmp_path / "int8").mkdir()
+    int8 = StaticInt8(layout="openvino").run(float_bundle, tmp_path / "int8", Context()).bundle
+    with pytest.raises(GraphError, match="relative L2 error") as caught:
+        converted(int8, tmp_path, tolerance=1e-12)
+    assert "round otherwise on this processor" in caught.value.fix
+    assert "--layout openvino" not in caught.value.fix

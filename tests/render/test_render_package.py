@@ -121,11 +121,11 @@ def test_histogram_envelope_and_sparkline() -> None:
     assert samples.histogram([0.0, 0.5, 1.0, 2.0], lambda value: value, 2) == [1, 2]
     band = samples.Band
     assert samples.envelope([0.0, 1.0, 9.0, 10.0], [3.0, 1.0, 2.0, 9.0], 2) == [
-        band(2.5, 1.0, 1.0, 3.0, 3.0, 3.0), band(7.5, 2.0, 2.0, 9.0, 9.0, 9.0),
+        band(2.5, 1.0, 1.0, 2.0, 3.0, 3.0), band(7.5, 2.0, 2.0, 5.5, 9.0, 9.0),
     ]  # fmt: skip
     assert [found.at for found in samples.envelope([0.0, 0.1, 8.0], [1.0, 2.0, 3.0], 4)] == [1.0, 7.0]
     hundred = [float(value) for value in range(100)]
-    assert samples.envelope([5.0] * 100, hundred, 3) == [band(5.0, 0.0, 9.0, 50.0, 89.0, 99.0)]
+    assert samples.envelope([5.0] * 100, hundred, 3) == [band(5.0, 0.0, 9.0, 49.5, 89.0, 99.0)]
     assert samples.sparkline([1.0] * 5, 8) == "█"
     assert len(samples.sparkline([float(value) for value in range(100)], 8)) == 8
 

@@ -119,6 +119,14 @@ def test_a_policy_directory_to_keep_has_links_to_the_weights(tmp_path: Path) -> 
     assert read_description(kept).spec.control_hz == 5
 
 
+def test_a_shape_that_nobody_asks_for_is_refused(tmp_path: Path, capsys) -> None:
+    command = ["new", str(tmp_path / "kept"), "--from", str(write(tmp_path / "c", parts())), "--shape", "state=1,2"]
+    with pytest.raises(SystemExit, match="2"):
+        main(command)
+    assert "says the shapes of all inputs" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "kept").exists()
+
+
 def test_a_directory_of_gigabytes_is_described_without_an_export(tmp_path: Path, capsys) -> None:
     folder, nbytes = write(tmp_path / "c", parts()), 1 << 33
     header = json.dumps({"unused": {"dtype": "F32", "shape": [nbytes // 4], "data_offsets": [0, nbytes]}}).encode()

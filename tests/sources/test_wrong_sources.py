@@ -343,7 +343,9 @@ OTHERS = [
         lambda at: at.export(at.folder(
         policy_dot_yaml="name: a\nsource: net.onnx\nspec: {inputs: [{name: a, shape: [1, 2]}], "
         "outputs: [{name: b, shape: [1, 2]}], control_hz: unknown}\n"))),
-    Row("a new policy where one is", "exists already", 3,
+    Row("neither a target nor a policy", "Unknown export target 'nope', and no such file", 2,
+        lambda at: ["export", "nope", "-o", at.out]),
+    Row("a new policy where one is", "exists already. fix: name a directory that does not exist", 3,
         lambda at: ["new", at.folder(), "--from", at.onnx(linear())]),
     Row("a new policy of one that is described", "has a policy.yaml already", 2, lambda at: [
         "new", at.out, "--from", at.folder(policy_dot_yaml="name: a\nsource: a.py:make\nspec: {inputs: [{name: a, "

@@ -32,6 +32,8 @@ STATISTICS_OF = {
     "quantile10": ("q10", "q90"),
 }  # fmt: skip
 NORMALISATIONS = tuple(STATISTICS_OF)
+CHANGE_UNITS = ("scale", "range", "linkage")
+"""Steps of ``convert`` behind which a value is in another unit than that of the robot."""
 MODES = ("", "delta", "absolute", "velocity", "relative")
 MAX_INDICES = 2**18
 """Most labels that are generated for a discrete output without labels: more than any token vocabulary has."""
@@ -418,7 +420,28 @@ class PolicySpec:
                 "write mode: absolute, or leave the step out: the controller then adds the state itself",
             )
         for step in steps:
-            self.state_spans(step)
+            self._check_units(step, self.state_spans(step))
+
+    def _check_units(self, relative: Conversion, spans: tuple[tuple[Span, Span], ...]) -> None:
+        """Refuse a step ``relative`` behind one that changes units which the action and the state have in common."""
+        before = self.action.convert[: self.action.convert.index(relative)]
+        if self.reference is None or any(step.growth for step in before):  # then they are not where the robot has them
+            return
+        mine, theirs = self.action.units(), self.reference.units()
+        common = {
+            own + index: theirs[other + index]
+            for (own, stop), (other, _) in spans
+            for index in range(stop - own)
+            if mine[own + index] == theirs[other + index] != ""
+        }
+        for step, layout in zip(before, self.action.layouts(), strict=False):
+            changed = layout.spans(step.parts, step.where) if step.op in CHANGE_UNITS else ()
+            for index in (index for start, stop in changed for index in range(start, stop) if index in common):
+                raise SpecError(
+                    f"{relative.where} stands behind the step '{step.op}', and '{relative.to}' is in {common[index]} "
+                    "as the robot has it.",
+                    "let the step 'relative' stand first; where robot and state differ, name the unit of each",
+                )
 
     def state_spans(self, step: Conversion) -> tuple[tuple[Span, Span], ...]:
         """Return, for a step ``relative`` of the action, the places in the action and those in the state.

@@ -118,5 +118,11 @@ def _error_text(error: Measurement) -> str:
 def _number(number: Measurement) -> str:
     if not number.known:
         return number.note or "not known"
-    interval = f" ({number.low:.3g} to {number.high:.3g})" if number.low is not None and number.high is not None else ""
-    return f"{number.value:.3g} {number.unit}{interval}"
+    low, high = number.low, number.high
+    interval = f" ({_digits(low)} to {_digits(high)})" if low is not None and high is not None else ""
+    return f"{_digits(number.value)} {number.unit}{interval}"
+
+
+def _digits(value: float) -> str:
+    """Return three digits, or more where the number has more before the point."""
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:,.0f}"

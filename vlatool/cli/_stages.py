@@ -58,8 +58,8 @@ class StageGroup(DefaultGroup):
         other = "" if self.names_command(ctx, args) or ctx.resilient_parsing else args[0]
         if difflib.get_close_matches(other, known, n=1) and not Path(other).exists():
             raise UsageError(
-                f"Unknown {registry.noun_of(self.name or '')} '{other}'; {suggest(other, known)}.",
-                fix_for(other, known),
+                f"Unknown {registry.noun_of(self.name or '')} '{other}', and no such file; {suggest(other, known)}.",
+                f"{fix_for(other, known)}, or name a policy or bundle that exists",
             )
         return super().parse_args(ctx, args)
 

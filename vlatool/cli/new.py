@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +16,7 @@ from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson
 from vlatool.cli._proposal import proposal
-from vlatool.errors import UsageError
+from vlatool.errors import OutputError, UsageError
 from vlatool.files.directory_writer import write_directory
 
 Source = Annotated[
@@ -40,9 +41,13 @@ def new(
     """Make a policy directory of a file: a copy of it, and a policy.yaml to complete. Refuses one that exists."""
     from vlatool.sources import source_stage
 
+    if os.path.lexists(policy):
+        raise OutputError(f"{policy} exists already.", "name a directory that does not exist; nothing is replaced")
     refuse_existing(policy, False, source, kind="")
     stage: Any = source_stage(source)
     if (converted := stage.converted_directory()) is not None:
+        if shape:
+            raise UsageError(f"--shape is given, and {source} says the shapes of all inputs.", "leave --shape out")
         text, unknown = _copy(converted, policy, control_hz)
     else:
         text, unknown = _make(stage, source, shape, control_hz, policy)

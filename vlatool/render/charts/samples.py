@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -76,7 +77,7 @@ def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> lis
     for index, part in enumerate(stretches):
         if part:
             part.sort()
-            inner = quantile(part, 0.1), part[len(part) // 2], quantile(part, 0.9)
+            inner = quantile(part, 0.1), statistics.median(part), quantile(part, 0.9)
             bands.append(Band(first + (index + 0.5) * wide, part[0], *inner, part[-1]))
     return bands
 
