@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import SourceError, require, suggest
+from vlatool.files.bounded import read_bounded
 from vlatool.files.json import read_json
 from vlatool.files.printable import truncate
 from vlatool.sources._lerobot_conversions import (
@@ -185,7 +186,7 @@ def _check_names(folder: Path, keys: Iterable[str]) -> None:
 
 def _mapping(folder: Path, name: str) -> dict[str, Any]:
     try:
-        content = (folder / name).read_bytes()
+        content = read_bounded(folder / name, "statistics_bytes", SourceError)
     except OSError as error:
         raise SourceError(f"The LeRobot checkpoint {folder} has no {name} ({error.strerror}).", COMPLETE) from error
     value = read_json(content, f"{folder / name}", SourceError, COMPLETE)
