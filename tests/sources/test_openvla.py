@@ -4,6 +4,7 @@
 """
 
 import json
+import math
 import os
 import struct
 from collections.abc import Callable, Iterator
@@ -348,6 +349,36 @@ def test_what_has_no_end_is_not_read(tmp_path: Path, name: str, kind: str) -> No
     else:
         (folder / name).symlink_to("/dev/zero")
     with pytest.raises(SourceError, match="not a regular file"):
+        OpenVla.of(str(folder)).describe()
+
+
+def sparse(file: Path, named: dict[str, tuple[int, ...]]) -> None:
+    """Write a shard whose tensors are holes, which take no place on the disk."""
+    entries, at = {}, 0
+    for name, shape in named.items():
+        entries[name] = {"dtype": "F16", "shape": list(shape), "data_offsets": [at, at := at + 2 * math.prod(shape)]}
+    text = json.dumps(entries).encode()
+    with file.open("wb") as stream:
+        stream.write(struct.pack("<Q", len(text)) + text)
+        stream.truncate(8 + len(text) + at)
+
+
+@pytest.mark.parametrize("what", ["positions", "bins"])
+def test_what_is_computed_from_claimed_sizes_is_limited(tmp_path: Path, what: str) -> None:
+    files, named, grid, vocabulary = parts(), shapes(), 20_000, 2**31
+    if what == "positions":
+        files["config.json"]["image_sizes"] = [2 * grid] * 2
+        for name in [name for name in named[VISION] if name.endswith("pos_embed")]:
+            named[VISION][name] = (1, grid**2, named[VISION][name][2])
+    else:
+        files["config.json"]["n_action_bins"] = 2**30
+        files["config.json"]["text_config"]["vocab_size"] = vocabulary
+        for name in ("model.embed_tokens", "lm_head"):
+            named[LANGUAGE][f"language_model.{name}.weight"] = (vocabulary, 8)
+    folder = write(tmp_path / "c", {name: content for name, content in files.items() if name not in named})
+    for name, shard in named.items():
+        sparse(folder / name, shard)
+    with pytest.raises(SourceError, match=f"The {what} of .* the limit 'elements'"):
         OpenVla.of(str(folder)).describe()
 
 

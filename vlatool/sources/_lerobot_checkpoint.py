@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import SourceError, require, suggest
-from vlatool.files.bounded import read_bounded
 from vlatool.files.json import read_json
 from vlatool.files.printable import truncate
+from vlatool.files.small_file import read_bounded
 from vlatool.sources._lerobot_conversions import (
     ABSOLUTE,
     RELATIVE,

@@ -16,9 +16,10 @@ from typing import Any
 from vlatool.bundle.conversion import LARGEST
 from vlatool.bundle.prompt import Prompt
 from vlatool.errors import SourceError, suggest
-from vlatool.files.bounded import read_bounded
 from vlatool.files.json import read_json
+from vlatool.files.limits import check_limit
 from vlatool.files.printable import truncate
+from vlatool.files.small_file import read_bounded
 from vlatool.files.validate import short_repr
 from vlatool.runtime.tokenizer import Tokenizer
 from vlatool.weights.shards import FLOATS, StoredTensor, read_shards
@@ -97,6 +98,12 @@ def read_checkpoint(folder: Path, unnorm_key: str, prompt_tokens: int) -> Checkp
         "language": language,
         "decoding": _decoding(folder, config, len(statistics["q01"]), language["vocabulary"], prompt_tokens),
     }
+    places = max(tower["grid"] for tower in towers.values()) ** 2 + prompt_tokens + len(statistics["q01"])
+    for count, what in (
+        (places * language["head_width"], "The positions"),
+        (arguments["decoding"]["bins"], "The bins"),
+    ):
+        check_limit("elements", count, f"{what} of {folder}", SourceError)  # are computed, not read
     if len({tower["grid"] for tower in towers.values()}) > 1:
         raise SourceError(f"The towers of {folder} see different numbers of patches.", SAVE)
     prompt = _prompt(folder, config)

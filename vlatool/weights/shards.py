@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import SourceError
-from vlatool.files.bounded import read_bounded
 from vlatool.files.json import parse_json
+from vlatool.files.small_file import read_bounded
 from vlatool.files.validate import path_problem, short_repr
 
 READ_FIX = "check its permissions and its disk"
