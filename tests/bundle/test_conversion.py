@@ -54,6 +54,10 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "a key of another": ({}, {"convert": [{"op": "normalisation", "to": "s"}]}, "which belongs to another"),
     "too many": ({}, {"convert": [RELATIVE] * 33}, "33 steps; allowed: up to 32"),
     "an unknown part": ({}, {"convert": [{**RELATIVE, "parts": ["arms"]}]}, "the part 'arms'; did you mean 'arm'"),
+    "a label of two elements": (
+        {"labels": ["g", "g", "h", "i"], "convert": [{"op": "scale", "factor": -1, "parts": ["g"]}]}, {},
+        "names the part 'g'; known: arm, h, i",
+    ),
     "overlapping parts": ({}, {"convert": [{**RELATIVE, "parts": ["arm", 0]}]}, "parts that overlap"),
     "relative to nothing": ({}, {"convert": [{"op": "relative"}]}, "needs 'to'"),
     "relative to what is no input": ({}, {"convert": [{**RELATIVE, "to": "t"}]}, "'t', which is not an input"),

@@ -170,6 +170,17 @@ def test_a_path_that_leaves_the_bundle_is_refused(path):
         Manifest("evil", "1", SPEC, {"main": Graph(path)}, files={})
 
 
+@pytest.mark.parametrize("name", ["../../../main", "/tmp/main", "graphs/main", "..", "a\nb", "a\0b", "x" * 201, "a:b"])
+def test_a_graph_whose_name_is_a_path_is_refused(name):
+    """Exporters write files that are called after the graphs."""
+    record = {"graphs/main.onnx": FileRecord("0" * 64, 3)}
+    with pytest.raises(SpecError, match="A graph has the name"):
+        step(graph=name)
+    with pytest.raises(BundleError, match="A graph has the name"):
+        Manifest("evil", "1", SPEC, {"main": Graph("graphs/main.onnx"), name: Graph("graphs/main.onnx")},
+                 single_graph(SPEC), record)  # fmt: skip
+
+
 def test_a_graph_needs_a_hash():
     with pytest.raises(BundleError, match=r"graphs/main.onnx, but records no hash"):
         Manifest("plain", "1", SPEC, GRAPHS)

@@ -105,6 +105,12 @@ def test_a_check_between_modules_is_exported_by_the_parts(export: Export) -> Non
     assert {"body.first/Gemm", "body.second/Gemm"} <= set(ops(result))
 
 
+@pytest.mark.parametrize("read", ["np.asarray(x)", "np.from_dlpack(x)", "float(f'{x.sum()}')", "len(repr(x))"])
+def test_each_way_out_of_a_tensor_is_named(export: Export, read: str) -> None:
+    body = f"import numpy as np\nh = self.second(self.first(x))\nreturn h if np.max({read}) < 1e9 else -h"
+    assert "decides by values at policy.py:" in export(body, exporter="legacy").messages[1]
+
+
 OFF = "if h.abs().max() > 1e9:\n    raise ValueError\n"
 RECORDED = {
     "a value set in place": f"h = self.first(x)\nh[:, 0] = 1\nh.mul_(2)\n{OFF}return self.second(h)",

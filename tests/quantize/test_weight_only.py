@@ -376,7 +376,7 @@ def test_the_observations_of_the_sample_fit_its_spec(llama):
     assert synthetic_observations(llama, 1)[0]["ids"].shape == (TOKENS,)
 
 
-@pytest.mark.parametrize("pattern", ["/data/*.safetensors", "../*.safetensors", "[1]"])
+@pytest.mark.parametrize("pattern", ["/data/*.safetensors", "../*.safetensors", "[1]", "'**x'", ".", "x" * 300])
 def test_weights_outside_the_folder_are_refused(llama_dir, pattern):
     described = llama_dir / "policy.yaml"
     described.write_text(described.read_text().replace("'*.safetensors'", pattern))

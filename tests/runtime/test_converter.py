@@ -250,6 +250,17 @@ def test_what_is_no_rotation_is_no_action(tmp_path: Path) -> None:
         policy.infer({"x": np.zeros(6)})
 
 
+@pytest.mark.parametrize("step", [{"op": "binarise"}, {"op": "clip", "low": -1, "high": 1}])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_no_number_does_not_become_an_action(tmp_path: Path, step: dict[str, Any], value: float) -> None:
+    text = "g (float[1,2] x) => (float[1,2] y) { y = Identity(x) }"
+    policy = load(
+        written(tmp_path, text, (tensor("x", 1, 2, finite=False),), (tensor("y", 1, 2, convert=[step]),)).path
+    )
+    with pytest.raises(GraphError, match="'y' is not finite"):
+        policy.infer({"x": np.array([value, 1], np.float32)})
+
+
 def test_moments_of_a_history_are_converted_one_by_one(tmp_path: Path) -> None:
     text = "g (float[1,2,3] s, float[1,2,3] x) => (float[1,2,3] y) { y = Identity(s) }"
     turn = {"op": "rotation", "parts": [[0, 4]], "robot": "quaternion_wxyz", "network": "axis_angle"}

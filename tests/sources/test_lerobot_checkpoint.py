@@ -306,6 +306,20 @@ def test_relative_actions_are_a_step_of_the_spec(
 INPUTS = ("config.json", "input_features")
 STEPS = ("policy_preprocessor.json", "steps")
 STATES = "policy_preprocessor_step_3_normalizer_processor.safetensors"
+
+
+def text_step(turned: bool = False, **config: Any) -> Callable[[dict[str, Any]], None]:
+    """Return an edit that makes the policy SmolVLA, with settings of its tokenizer, or with its steps turned around."""
+
+    def edit(files: dict[str, Any]) -> None:
+        instruct("smolvla", tokenizer_max_length=48)(files)
+        steps = files["policy_preprocessor.json"]["steps"]
+        steps[3]["config"] = config
+        steps[2:4] = steps[3:1:-1] if turned else steps[2:4]
+
+    return edit
+
+
 BROKEN = {
     "unknown family": (edited("config.json", "type", to="tdmpc"), "of the type 'tdmpc'"),
     "ensembling": (edited("config.json", "temporal_ensemble_coeff", to=0.01), "averages overlapping chunks"),
@@ -320,6 +334,19 @@ BROKEN = {
     "a list": (edited("config.json", to="[]"), "holds no mapping"),
     "a NaN": (edited("policy_preprocessor.json", to='{"steps": NaN}'), "lists no steps"),
     "not normalised": (edited(*STEPS, 3, to=None), "its processors do IDENTITY"),
+    "statistics of other keys": (
+        edited(*STEPS, 3, "config", "normalize_observation_keys", to=["observation.images.top"]),
+        "its processors do IDENTITY to 'observation.state'",
+    ),
+    "keys of text": (edited(*STEPS, 3, "config", "normalize_observation_keys", to="a"), "normalize_observation_keys"),
+    "another kind": (
+        edited(*STEPS, 3, "config", "features", to={**FEATURES, "observation.state": {"type": "ENV", "shape": [3]}}),
+        "as 'ENV'",
+    ),
+    "renamed behind the statistics": (lambda files: files[STEPS[0]]["steps"].reverse(), "in the order normalizer"),
+    "padding before the instruction": (text_step(padding_side="left"), "padding_side 'left'; wanted: right"),
+    "an instruction of another length": (text_step(max_length=8), "max_length 8; wanted: 48"),
+    "a line break behind the ids": (text_step(turned=True), "in the order tokenizer_processor"),
     "no preprocessor": (edited("policy_preprocessor.json", to=None), "has no policy_preprocessor.json"),
     "no postprocessor": (edited("policy_postprocessor.json", to=None), "has no policy_postprocessor.json"),
     "names that collide": (edited(*INPUTS, "observation_state", to=STATE), "of one name in the graph"),

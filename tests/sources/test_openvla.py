@@ -4,6 +4,9 @@
 """
 
 import json
+import math
+import os
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -40,6 +43,7 @@ from vlatool.sources.openvla import OpenVla
 from vlatool.stage.base import Context
 
 pytest.importorskip("tokenizers")
+UNREAD = "vision_backbone.fused_featurizer.attn_pool.latent"
 FRAME = np.random.default_rng(2).integers(0, 256, (9, 12, 3), dtype=np.uint8)
 
 
@@ -129,7 +133,7 @@ def test_a_shape_that_nobody_asks_for_is_refused(tmp_path: Path, capsys) -> None
 
 def test_a_directory_of_gigabytes_is_described_without_an_export(tmp_path: Path, capsys) -> None:
     folder, nbytes = write(tmp_path / "c", parts()), 1 << 33
-    header = json.dumps({"unused": {"dtype": "F32", "shape": [nbytes // 4], "data_offsets": [0, nbytes]}}).encode()
+    header = json.dumps({UNREAD: {"dtype": "F32", "shape": [nbytes // 4], "data_offsets": [0, nbytes]}}).encode()
     with (folder / "more.safetensors").open("wb") as stream:
         stream.write(len(header).to_bytes(8, "little") + header)
         stream.truncate(8 + len(header) + nbytes)  # a hole takes no place on the disk
@@ -216,10 +220,19 @@ BROKEN = {
     "quantiles of text": (edited(*STATS, "q99", to=["a"]), "'q99' of the action of 'bridge_orig'"),
     "infinite quantiles": (edited(*STATS, "q99", to=[1, 2, float("inf")]), "'q99' of the action of 'bridge_orig'"),
     "a short mask": (edited(*STATS, "mask", to=[True]), "of different lengths"),
+    "quantiles beyond float32": (edited(*STATS, "q99", to=[1e299, 1, 1]), "'q99' of the action of 'bridge_orig'"),
+    "a mask of text": (edited(*STATS, "mask", to=["false"] * 3), "'mask' of the action of 'bridge_orig'"),
+    "a mask of nothing": (edited(*STATS, "mask", to=0), "'mask' of the action of 'bridge_orig'"),
+    "an empty mask": (edited(*STATS, "mask", to=[]), "of different lengths"),
     "quantiles in the wrong order": (edited(*STATS, "q01", to=[2, 0, 0]), "q01 of .* is above q99"),
     "another language model": (edited(*TEXT, "model_type", to="phi"), r"text_config.*'phi'; known: llama"),
     "no language model": (edited(*TEXT, to="llama"), "text_config in config.json"),
     "scaled rotary positions": (edited(*TEXT, "rope_scaling", to={"factor": 2}), "rope_scaling"),
+    "rotary positions of another type": (edited(*TEXT, "rope_parameters", to={"type": "linear"}), "'linear'"),
+    "rotary positions of a part": (edited(*TEXT, "partial_rotary_factor", to=0.5), "partial_rotary_factor 0.5"),
+    "heads of another width": (edited(*TEXT, "head_dim", to=2), "head_dim 2; the tensors have 4"),
+    "two heads": (edited(*TEXT, "tie_word_embeddings", to=True), "tie_word_embeddings True"),
+    "an epsilon beyond float32": (edited(*TEXT, "rms_norm_eps", to=1e299), "rms_norm_eps"),
     "other heads": (edited(*TEXT, "num_attention_heads", to=3), "has 3 heads"),
     "other width": (edited(*TEXT, "hidden_size", to=16), "hidden_size 16; the tensors have 8"),
     "layers of another checkpoint": (edited(*TEXT, "num_hidden_layers", to=32), "num_hidden_layers 32; the tensors"),
@@ -236,6 +249,7 @@ BROKEN = {
     "no preprocessor": (edited("preprocessor_config.json", to=None), "has no preprocessor_config.json"),
     "means of one tower": (edited("preprocessor_config.json", "means", to=PICTURES["means"][:1]), "has means"),
     "a std of zero": (edited("preprocessor_config.json", "stds", to=[[0, 1, 1]] * 2), "has the std"),
+    "a std that float32 has not": (edited("preprocessor_config.json", "stds", to=[[1e-300, 1, 1]] * 2), "has the std"),
     "no tokenizer": (edited("tokenizer.json", to=None), "has no tokenizer.json"),
     "a tokenizer of text": (edited("tokenizer.json", to=b"[]"), "holds no mapping"),
     "no first token": (edited("tokenizer.json", "post_processor", to=NO_FIRST), "bos_token_id"),
@@ -301,6 +315,111 @@ def test_a_broken_checkpoint_is_named_with_its_place(tmp_path: Path, kind: str) 
         OpenVla.of(str(write(tmp_path / "c", files))).describe()
     assert caught.value.fix
     assert caught.value.exit_code == 3
+
+
+def more(name: str, *shape: int, file: str = LANGUAGE) -> Callable[[dict[str, Any]], None]:
+    return both(edited(file, name, to=np.zeros(shape, np.float32)), edited(INDEX, to=None))
+
+
+UNKNOWN = {
+    "a bias": more("language_model.model.layers.0.self_attn.q_proj.bias", 8),
+    "a norm of queries": more("language_model.model.layers.0.self_attn.q_norm.weight", 4),
+    "a layer of an adapter": more("base_model.model.language_model.model.layers.0.mlp.up_proj.lora_A.weight", 2, 8),
+    "an adapter of its own": edited("adapter_model.safetensors", to={"lora_A.weight": np.zeros((2, 2), np.float32)}),
+    "a norm in a tower": more("vision_backbone.featurizer.blocks.0.attn.q_norm.weight", 8, file=VISION),
+    "a factor of one block": more("vision_backbone.fused_featurizer.blocks.0.ls2.gamma", 32, file=VISION),
+    "a longer projector": more("projector.fc4.weight", 8, 8, file=VISION),
+}
+
+
+@pytest.mark.parametrize("kind", UNKNOWN)
+def test_a_tensor_that_would_be_left_out_is_refused(tmp_path: Path, kind: str) -> None:
+    files = parts()
+    UNKNOWN[kind](files)
+    with pytest.raises(SourceError, match="which the known network does not have"):
+        OpenVla.of(str(write(tmp_path / "c", files))).describe()
+
+
+def test_tensors_behind_the_last_block_that_runs_are_not_read(tmp_path: Path) -> None:
+    files = parts()
+    edited(VISION, UNREAD, to=np.zeros((1, 1, 32), np.float32))(files)
+    more("language_model.model.layers.0.self_attn.rotary_emb.inv_freq", 2)(files)
+    assert OpenVla.of(str(write(tmp_path / "c", files))).describe().weights
+
+
+@pytest.mark.parametrize("name", ["tokenizer.json", "preprocessor_config.json", "dataset_statistics.json", INDEX])
+@pytest.mark.parametrize("kind", ["a pipe", "a device"])
+def test_what_has_no_end_is_not_read(tmp_path: Path, name: str, kind: str) -> None:
+    folder = write(tmp_path / "c", parts())
+    (folder / name).unlink(missing_ok=True)
+    if kind == "a pipe":
+        os.mkfifo(folder / name)
+    else:
+        (folder / name).symlink_to("/dev/zero")
+    with pytest.raises(SourceError, match="not a regular file"):
+        OpenVla.of(str(folder)).describe()
+
+
+def sparse(file: Path, named: dict[str, tuple[int, ...]]) -> None:
+    """Write a shard whose tensors are holes, which take no place on the disk."""
+    entries, at = {}, 0
+    for name, shape in named.items():
+        entries[name] = {"dtype": "F16", "shape": list(shape), "data_offsets": [at, at := at + 2 * math.prod(shape)]}
+    text = json.dumps(entries).encode()
+    with file.open("wb") as stream:
+        stream.write(struct.pack("<Q", len(text)) + text)
+        stream.truncate(8 + len(text) + at)
+
+
+@pytest.mark.parametrize("what", ["positions", "bins"])
+def test_what_is_computed_from_claimed_sizes_is_limited(tmp_path: Path, what: str) -> None:
+    files, named, grid, vocabulary = parts(), shapes(), 20_000, 2**31
+    if what == "positions":
+        files["config.json"]["image_sizes"] = [2 * grid] * 2
+        for name in [name for name in named[VISION] if name.endswith("pos_embed")]:
+            named[VISION][name] = (1, grid**2, named[VISION][name][2])
+    else:
+        files["config.json"]["n_action_bins"] = 2**30
+        files["config.json"]["text_config"]["vocab_size"] = vocabulary
+        for name in ("model.embed_tokens", "lm_head"):
+            named[LANGUAGE][f"language_model.{name}.weight"] = (vocabulary, 8)
+    folder = write(tmp_path / "c", {name: content for name, content in files.items() if name not in named})
+    for name, shard in named.items():
+        sparse(folder / name, shard)
+    with pytest.raises(SourceError, match=f"The {what} of .* the limit 'elements'"):
+        OpenVla.of(str(folder)).describe()
+
+
+def header(text: str, data: int = 8) -> bytes:
+    return struct.pack("<Q", len(text)) + text.encode() + bytes(data)
+
+
+ENTRY = '{"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}'
+HEADERS = {
+    "nested": ("[" * 200_000 + "]" * 200_000, "nested too deep"),
+    "twice the same name": (f'{{"a": {ENTRY}, "a": {ENTRY}}}', "'a' occurs twice"),
+    "two in one place": (f'{{"a": {ENTRY}, "b": {ENTRY}}}', "'a' and 'b' overlap"),
+    "endless": ('{"a": ' + ENTRY.replace("[1]", "[1e999]") + "}", "whole numbers"),
+    "a fraction": ('{"a": ' + ENTRY.replace("[1]", "[1.5]") + "}", "whole numbers"),
+    "a truth value": ('{"a": ' + ENTRY.replace("[1]", "[true]") + "}", "whole numbers"),
+    "text": ('{"a": ' + ENTRY.replace("[1]", '"1"') + "}", "whole numbers"),
+}
+
+
+@pytest.mark.parametrize("kind", HEADERS)
+def test_a_header_that_is_ambiguous_or_no_header_is_refused(tmp_path: Path, kind: str) -> None:
+    text, words = HEADERS[kind]
+    with pytest.raises(SourceError, match=words):
+        OpenVla.of(str(write(tmp_path / "c", {**parts(), "x.safetensors": header(text)}))).describe()
+
+
+@pytest.mark.parametrize("name", ["../outside.safetensors", "/outside.safetensors", "x" * 5000])
+def test_an_index_names_shards_beside_it_alone(tmp_path: Path, name: str) -> None:
+    files = parts()
+    files[INDEX]["weight_map"]["more"] = name
+    write(tmp_path, {"outside.safetensors": {"more": np.zeros(1, np.float32)}})
+    with pytest.raises(SourceError, match=r"names the shard .*: it (leaves|is)"):
+        OpenVla.of(str(write(tmp_path / "c", files))).describe()
 
 
 def test_what_claims_a_directory(tmp_path: Path) -> None:

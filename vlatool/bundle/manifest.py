@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
-from vlatool.bundle.program import ProgramStep, check_program, program_from
+from vlatool.bundle.program import ProgramStep, check_graph_name, check_program, program_from
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import BundleError
 from vlatool.files.limits import check_limit
@@ -120,6 +120,8 @@ class Manifest:
         check_limit("graphs", len(self.graphs), "The manifest", BundleError)
         for path in (*self.files, *(graph.file for graph in self.graphs.values())):
             _inside(path)
+        for name in self.graphs:
+            check_graph_name(name, BundleError)
         for graph in self.graphs.values():
             if graph.file not in self.files:
                 raise BundleError(f"The manifest names the graph {graph.file}, but records no hash for it.")

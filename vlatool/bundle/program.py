@@ -10,14 +10,30 @@ from vlatool.bundle.spec import DTYPES, PolicySpec
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values
-from vlatool.files.validate import element_count, finite_number, known_keys, mapping, short_repr, text
+from vlatool.files.validate import (
+    Kind,
+    element_count,
+    finite_number,
+    known_keys,
+    mapping,
+    name_problem,
+    short_repr,
+    text,
+)
 
 DISTRIBUTIONS = ("normal", "uniform", "zeros")
+
+
+def check_graph_name(name: Any, error: Kind) -> None:
+    """Refuse the name of a graph after which no file can be called: exporters write ``NAME.onnx``, ``NAME.xml``."""
+    if problem := name_problem(name):
+        raise error(f"A graph has the name {short_repr(name)}: {problem}.", "call it by letters and digits, as in main")
 
 
 def check_step(step: ProgramStep) -> None:
     """Refuse wrong types, and values beyond the limits, in an entry; raises SpecError with the word and the graph."""
     text(step.graph, "The graph of a step", SpecError, empty=False)
+    check_graph_name(step.graph, SpecError)
     for word in ("feeds", "gives", "carry", "schedule", "noise", "keep"):
         mapping(getattr(step, word), f"'{word}' of '{step.graph}'", SpecError)
     for word in ("feeds", "gives", "carry"):

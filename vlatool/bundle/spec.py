@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -268,7 +269,8 @@ class TensorSpec:
         Raises:
             SpecError: for parts that are not there, or overlap.
         """
-        places = {label: (index, index + 1) for index, label in enumerate(self.labels)}
+        counts = Counter(self.labels)  # a label of two elements names neither
+        places = {label: (index, index + 1) for index, label in enumerate(self.labels) if counts[label] == 1}
         return layouts_of(Layout(self.robot_width, {**places, **self.parts}), self.convert)
 
     @property

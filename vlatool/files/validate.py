@@ -85,6 +85,26 @@ def element_count(value: Any, where: str, error: Kind) -> int:
     return math.prod(axes)
 
 
+MAX_NAME_BYTES = 200
+"""Bytes of a name that files are called after, with endings of their own."""
+
+
+def name_problem(name: Any) -> str:
+    """Return why files inside a directory cannot be called after a name, or nothing when they can.
+
+    Example:
+        >>> name_problem("../../main")
+        'it leaves the directory'
+        >>> name_problem("graphs/main")
+        'it is a path'
+    """
+    if problem := path_problem(name):
+        return problem
+    if "/" in name:
+        return "it is a path"
+    return "it is too long" if len(name.encode()) > MAX_NAME_BYTES else ""
+
+
 def path_problem(path: Any) -> str:
     """Return why a path does not name a file inside a bundle, or nothing when it does.
 

@@ -14,7 +14,8 @@ from vlatool.module.failures import is_tool
 
 READERS = frozenset({
     *("__bool__", "__int__", "__float__", "__index__", "__contains__", "item", "tolist", "numpy"),
-    *("equal", "allclose", "is_nonzero"),
+    *("equal", "allclose", "is_nonzero", "__complex__", "__repr__", "__format__", "__reduce_ex__"),
+    *("__array__", "__array_wrap__", "__dlpack__", "data_ptr", "storage", "untyped_storage"),
 })  # fmt: skip
 """Functions of torch that turn values of tensors into values of Python."""
 

@@ -258,7 +258,12 @@ def _training(file: Path, named: Any) -> str:
 
 
 def _inside(pattern: Any) -> bool:
-    return isinstance(pattern, str) and not pattern.startswith("/") and ".." not in pattern.split("/")
+    """Return whether a pattern, which may be empty, is one that pathlib takes and that stays in its folder."""
+    if not isinstance(pattern, str) or pattern.startswith("/") or len(pattern) > 1024 or "\0" in pattern:
+        return False
+    parts = pattern.split("/")
+    whole = all(part == "**" or "**" not in part for part in parts) and all(len(part.encode()) <= 255 for part in parts)
+    return whole and ".." not in parts and (not pattern or any(part not in ("", ".") for part in parts))
 
 
 def write_location(out: Path, folder: Path) -> None:

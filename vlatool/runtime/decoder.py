@@ -40,6 +40,8 @@ class Decoder:
         """
         tensor = self.tensor
         physical = raw.astype(np.float32) if self._half else raw
+        if self._converts and not all_finite(raw):  # a threshold or a bound would make an action of it
+            raise not_finite(tensor.name)
         try:
             if self._converts:
                 physical = self._converter.to_robot(physical.reshape(-1, physical.shape[-1]), state)

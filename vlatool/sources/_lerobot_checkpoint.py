@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vlatool.errors import SourceError, require, suggest
 from vlatool.files.json import read_json
 from vlatool.files.printable import truncate
+from vlatool.files.small_file import read_bounded
 from vlatool.sources._lerobot_conversions import (
     ABSOLUTE,
     RELATIVE,
@@ -116,6 +117,9 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             raise SourceError(
                 f"{folder / 'policy_preprocessor.json'} has no step '{name}', as {family} has it.", COMPLETE
             )
+    _check_order(folder, steps, RENAME, NORMALIZER)
+    _check_order(folder, steps, *TEXT_STEPS.get(str(family), ()))
+    _check_text(folder, config, steps.get("tokenizer_processor", {}))
     behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER, ABSOLUTE))
     mapping = config.get("normalization_mapping")
     trained_with = mapping if isinstance(mapping, dict) else {}
@@ -138,6 +142,30 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     if not isinstance(execute, int) or execute < 1:
         raise SourceError(f"config.json of {folder} has n_action_steps {truncate(repr(execute), 40)}.", COMPLETE)
     return Checkpoint(folder, str(family), inputs, action, execute)
+
+
+def _check_order(folder: Path, steps: Steps, *names: str) -> None:
+    """Refuse steps in another order than LeRobot has them: what one gives, the next one would not get."""
+    listed = [name for name in steps if name in names]
+    if listed != [name for name in names if name in steps]:
+        raise SourceError(
+            f"{folder / 'policy_preprocessor.json'} has its steps in the order {', '.join(listed)}; LeRobot's is "
+            f"{', '.join(names)}.",
+            COMPLETE,
+        )
+
+
+def _check_text(folder: Path, config: Mapping[str, Any], step: Mapping[str, Any]) -> None:
+    """Refuse what changes the ids of an instruction in ways that the tokenizer's file does not show."""
+    for key, known in (
+        ("padding_side", "right"), ("task_key", "task"), ("max_length", config.get("tokenizer_max_length")),
+    ):  # fmt: skip
+        if (value := step.get(key)) not in (None, known):
+            raise SourceError(
+                f"{folder / 'policy_preprocessor.json'} has tokenizer_processor with {key} {truncate(repr(value), 40)};"
+                f" wanted: {known}.",
+                COMPLETE,
+            )
 
 
 def _converted(folder: Path, action: Feature, state: Feature | None, steps: tuple[Steps, Steps]) -> Feature:
@@ -185,7 +213,7 @@ def _check_names(folder: Path, keys: Iterable[str]) -> None:
 
 def _mapping(folder: Path, name: str) -> dict[str, Any]:
     try:
-        content = (folder / name).read_bytes()
+        content = read_bounded(folder / name, "statistics_bytes", SourceError)
     except OSError as error:
         raise SourceError(f"The LeRobot checkpoint {folder} has no {name} ({error.strerror}).", COMPLETE) from error
     value = read_json(content, f"{folder / name}", SourceError, COMPLETE)
@@ -255,8 +283,22 @@ def _feature(
         raise SourceError(f"{folder} has the norm_map {truncate(repr(modes), 60)}; wanted: kind -> mode.", COMPLETE)
     if isinstance(epsilon, bool) or not isinstance(epsilon, int | float) or not 0 <= epsilon < 1:
         raise SourceError(f"{folder} has the eps {truncate(repr(epsilon), 40)}; wanted: 0 to 1.", COMPLETE)
-    mode = str(modes.get(kind, "IDENTITY")) if isinstance(known, dict) and key in known else ""
-    mode = mode or "IDENTITY"
+    chosen = step.get("normalize_observation_keys")
+    if chosen is not None and not isinstance(chosen, list):
+        raise SourceError(
+            f"{folder} has the normalize_observation_keys {truncate(repr(chosen), 60)}; wanted: a list of keys.",
+            COMPLETE,
+        )
+    taken = known.get(key) if isinstance(known, dict) else None
+    listed = taken is not None and (chosen is None or kind == "ACTION" or key in chosen)
+    mode = str(modes.get(kind, "IDENTITY")) if listed else "IDENTITY"
+    said = taken.get("type", kind) if isinstance(taken, dict) else kind
+    if said != kind:
+        raise SourceError(
+            f"config.json of {folder} has '{key}' as {truncate(kind, 40)}, its processors as "
+            f"{truncate(repr(said), 40)}.",
+            COMPLETE,
+        )
     if mode not in MODES:
         raise SourceError(f"{folder} normalises '{key}' by {truncate(mode, 40)}; {suggest(mode, MODES)}.", COMPLETE)
     trained = str(trained_with.get(kind, mode))

@@ -13,11 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vlatool.bundle.conversion import LARGEST
 from vlatool.bundle.prompt import Prompt
 from vlatool.errors import SourceError, suggest
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit
 from vlatool.files.printable import truncate
+from vlatool.files.small_file import read_bounded
 from vlatool.files.validate import short_repr
 from vlatool.runtime.tokenizer import Tokenizer
 from vlatool.weights.shards import FLOATS, StoredTensor, read_shards
@@ -96,6 +98,12 @@ def read_checkpoint(folder: Path, unnorm_key: str, prompt_tokens: int) -> Checkp
         "language": language,
         "decoding": _decoding(folder, config, len(statistics["q01"]), language["vocabulary"], prompt_tokens),
     }
+    places = max(tower["grid"] for tower in towers.values()) ** 2 + prompt_tokens + len(statistics["q01"])
+    for count, what in (
+        (places * language["head_width"], "The positions"),
+        (arguments["decoding"]["bins"], "The bins"),
+    ):
+        check_limit("elements", count, f"{what} of {folder}", SourceError)  # are computed, not read
     if len({tower["grid"] for tower in towers.values()}) > 1:
         raise SourceError(f"The towers of {folder} see different numbers of patches.", SAVE)
     prompt = _prompt(folder, config)
@@ -109,8 +117,7 @@ def read_checkpoint(folder: Path, unnorm_key: str, prompt_tokens: int) -> Checkp
 def _mapping(folder: Path, name: str) -> dict[str, Any]:
     path = folder / name
     try:
-        check_limit("statistics_bytes", path.stat().st_size, str(path), SourceError)
-        content = path.read_bytes()
+        content = read_bounded(path, "statistics_bytes", SourceError)
     except OSError as error:
         raise SourceError(f"The OpenVLA checkpoint {folder} has no {name} ({error.strerror}).", SAVE) from error
     value = read_json(content, str(path), SourceError, SAVE)
@@ -135,6 +142,8 @@ def _check_kind(folder: Path, config: Mapping[str, Any]) -> None:
             )
     for key, value, known in (
         ("hidden_act", text.get("hidden_act", "silu"), "silu"), ("rope_type", _rope(text).get("rope_type"), "default"),
+        ("type of rotary positions", _rope(text).get("type"), "default"),
+        ("partial_rotary_factor", {**_rope(text), **text}.get("partial_rotary_factor"), 1),
     ):  # fmt: skip
         if value not in (known, None):
             raise SourceError(
@@ -177,13 +186,13 @@ def _tensors(folder: Path) -> Tensors:
 
 
 def check_tensors(checkpoint: Checkpoint, wanted: Mapping[str, tuple[int, ...]]) -> None:
-    """Check that the shards hold what the network of the checkpoint's arguments has.
+    """Check that the shards hold what the network of the checkpoint's arguments has, and nothing that it would miss.
 
     Args:
         wanted: name -> shape of each parameter.
 
     Raises:
-        SourceError: naming the first tensor that is missing or has another shape.
+        SourceError: naming the first tensor that is missing, has another shape, or is not known.
     """
     for name, shape in wanted.items():
         got = _shape(checkpoint.folder, checkpoint.tensors, name, len(shape))
@@ -193,6 +202,23 @@ def check_tensors(checkpoint: Checkpoint, wanted: Mapping[str, tuple[int, ...]])
                 f"beside the other tensors it must have {list(shape)}.",
                 SAVE,
             )
+    unread = _unread(checkpoint.arguments)
+    for name, tensor in checkpoint.tensors.items():
+        if name not in wanted and not unread.fullmatch(name):
+            raise SourceError(
+                f"{tensor.file.name} of {checkpoint.folder} holds '{truncate(name, 120)}', which the known network "
+                "does not have: without it, its actions would be others.",
+                f"merge an adapter into its base, and keep other checkpoints in directories of their own; or {BY_HAND}",
+            )
+
+
+def _unread(arguments: Mapping[str, Any]) -> re.Pattern[str]:
+    """Return a pattern of the tensors that do not change an action: what follows the last block that a tower runs."""
+    behind = [
+        rf"vision_backbone\.{name}\.(blocks\.{tower['layers']}|norm|fc_norm|attn_pool|head)\..*"
+        for name, tower in arguments["towers"].items()
+    ]
+    return re.compile("|".join([*behind, r"language_model\.model\.(layers\.\d+\.self_attn\.)?rotary_emb\.inv_freq"]))
 
 
 def _shape(folder: Path, tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:
@@ -295,7 +321,7 @@ def _tower(folder: Path, prefix: str, tensors: Tensors, about: Mapping[str, Any]
 
 def _three(folder: Path, name: str, values: Any) -> list[float]:
     known = isinstance(values, list) and len(values) == 3 and all(_is_number(each) for each in values)
-    if not known or (name == "std" and min(values) <= 0):
+    if not known or (name == "std" and min(values) < 1 / LARGEST):
         raise SourceError(
             f"preprocessor_config.json of {folder} has the {name} {short_repr(values)}; wanted three numbers, a std "
             "above 0.",
@@ -305,7 +331,7 @@ def _three(folder: Path, name: str, values: Any) -> list[float]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 < value < 1e300
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST < value < LARGEST
 
 
 def _projector(folder: Path, tensors: Tensors, features: int, width: int) -> list[int]:
@@ -352,9 +378,21 @@ def _language(folder: Path, config: Mapping[str, Any], tensors: Tensors) -> dict
             f"config.json and the shards belong together: {SAVE}",
         )
     tied = "language_model.lm_head.weight" not in tensors
-    if tied and not text.get("tie_word_embeddings", False):
+    if tied and text.get("tie_word_embeddings", False) is not True:
         raise SourceError(
             f"No shard of {folder} holds 'language_model.lm_head.weight'; {_nearest('lm_head', tensors)}.", SAVE
+        )
+    if not tied and text.get("tie_word_embeddings", False) is not False:
+        raise SourceError(
+            f"text_config in config.json of {folder} has tie_word_embeddings "
+            f"{short_repr(text['tie_word_embeddings'])}, and its shards a head of their own: which of both is meant?",
+            "write false if the head is used, or save the checkpoint again without it",
+        )
+    if text.get("head_dim") not in (None, queries // heads):
+        raise SourceError(
+            f"text_config in config.json of {folder} has head_dim {short_repr(text['head_dim'])}; the tensors have "
+            f"{queries // heads}.",
+            f"config.json and the shards belong together: {SAVE}",
         )
     base = _number(folder, {**_rope(text), **text}, "rope_theta", 10000.0)
     epsilon = _number(folder, text, "rms_norm_eps", 1e-6)
@@ -374,7 +412,7 @@ def _count(folder: Path, values: Mapping[str, Any], key: str, default: int, low:
 
 def _number(folder: Path, values: Mapping[str, Any], key: str, default: float) -> float:
     value = values.get(key, default)
-    if not _is_number(value) or value <= 0:
+    if not _is_number(value) or value < 1 / LARGEST:
         raise SourceError(f"config.json of {folder} has {key} {short_repr(value)}; wanted a number above 0.", SAVE)
     return float(value)
 
@@ -416,8 +454,13 @@ def _statistics(folder: Path, config: Mapping[str, Any], unnorm_key: str) -> tup
         raise SourceError(f"{where} has no statistics '{truncate(key, 60)}'; it has: {keys}.", "name one of these")
     action = table[key].get("action") if isinstance(table[key], dict) else None
     lows, highs = (_row(action, name, f"the action of '{key}' in {where}") for name in ("q01", "q99"))
-    mask = action.get("mask") or [True] * len(lows) if isinstance(action, dict) else None
-    if not isinstance(mask, list) or len({len(lows), len(highs), len(mask)}) > 1:
+    mask = action.get("mask", [True] * len(lows)) if isinstance(action, dict) else None
+    if not isinstance(mask, list) or not all(isinstance(each, bool) for each in mask):
+        raise SourceError(
+            f"'mask' of the action of '{key}' in {where} is {short_repr(mask)}; wanted: true or false for each one.",
+            SAVE,
+        )
+    if len({len(lows), len(highs), len(mask)}) > 1:
         raise SourceError(f"q01, q99 and mask of the action of '{key}' in {where} are of different lengths.", SAVE)
     pairs = [(low, high) if on else (-1.0, 1.0) for low, high, on in zip(lows, highs, mask, strict=True)]
     if any(high < low for low, high in pairs):
@@ -453,8 +496,7 @@ def _tokenizer(folder: Path, prompt: Prompt, decoding: Mapping[str, int], config
     """
     path = folder / "tokenizer.json"
     try:
-        check_limit("tokenizer_bytes", path.stat().st_size, str(path), SourceError)
-        content = path.read_bytes()
+        content = read_bounded(path, "tokenizer_bytes", SourceError)
     except OSError as error:
         raise SourceError(
             f"The OpenVLA checkpoint {folder} has no tokenizer.json ({error.strerror}).",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import json
+import itertools
 import math
 import mmap
 import os
@@ -19,6 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import SourceError
+from vlatool.files.json import parse_json
+from vlatool.files.small_file import read_bounded
+from vlatool.files.validate import path_problem, short_repr
 
 READ_FIX = "check its permissions and its disk"
 
@@ -112,11 +115,13 @@ def _check_indexes(files: list[Path]) -> None:
     """Check that every shard in an index next to the shards exists and holds the tensors of the index."""
     for index in sorted({path for file in files for path in file.parent.glob(f"*{INDEX}")}):
         try:
-            weight_map = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
+            weight_map = parse_json(read_bounded(index, "statistics_bytes", SourceError))["weight_map"]
             files_of = {str(tensor): str(file) for tensor, file in weight_map.items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise SourceError(f"{index} is not an index of safetensors shards: {error!r}.", DOWNLOAD_FIX) from error
         for name in sorted(set(files_of.values())):
+            if reason := path_problem(name):
+                raise SourceError(f"{index} names the shard {short_repr(name)}: {reason}.", DOWNLOAD_FIX)
             if not (index.parent / name).is_file():
                 raise SourceError(f"{index} names the shard {name}, which is missing.", DOWNLOAD_FIX)
         held = {name: {tensor.name for tensor in read_header(index.parent / name)} for name in set(files_of.values())}
@@ -129,12 +134,18 @@ def read_header(file: Path) -> list[StoredTensor]:
     """Return the tensors of a safetensors file from its header; raises SourceError with the fault of the file."""
     header, start, size = _header_bytes(file)
     try:
-        entries = json.loads(header)
+        entries = parse_json(header)
     except ValueError as error:
         raise SourceError(f"{file} has a damaged safetensors header: {error}.", DOWNLOAD_FIX) from error
     if not isinstance(entries, Mapping):
         raise SourceError(f"{file} has a damaged safetensors header: it is not a mapping.", DOWNLOAD_FIX)
-    return [_entry(file, str(name), entry, start, size) for name, entry in entries.items() if name != "__metadata__"]
+    tensors = [_entry(file, name, entry, start, size) for name, entry in entries.items() if name != "__metadata__"]
+    for one, two in itertools.pairwise(sorted(tensors, key=lambda tensor: (tensor.offset, tensor.nbytes))):
+        if one.offset + one.nbytes > two.offset:
+            raise SourceError(
+                f"{file} has a damaged safetensors header: '{one.name}' and '{two.name}' overlap.", DOWNLOAD_FIX
+            )
+    return tensors
 
 
 def _header_bytes(file: Path) -> tuple[bytes, int, int]:
@@ -155,8 +166,8 @@ def _header_bytes(file: Path) -> tuple[bytes, int, int]:
 
 def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTensor:
     try:
-        dtype, shape = str(entry["dtype"]), tuple(int(axis) for axis in entry["shape"])
-        begin, end = (int(offset) for offset in entry["data_offsets"])
+        dtype, shape = str(entry["dtype"]), _whole_numbers(entry["shape"])
+        begin, end = _whole_numbers(entry["data_offsets"])
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{file} has a damaged safetensors header at '{name}': {error!r}.", DOWNLOAD_FIX) from error
     if dtype not in ITEM_BYTES:
@@ -172,6 +183,13 @@ def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTe
     if start + end > size:
         raise SourceError(f"{file} is cut off: it has {size} bytes, '{name}' ends at {start + end}.", DOWNLOAD_FIX)
     return tensor
+
+
+def _whole_numbers(values: Any) -> tuple[int, ...]:
+    """Return a list of a header as a tuple; raises ValueError for anything but whole numbers."""
+    if not isinstance(values, list) or not all(type(value) is int for value in values):
+        raise ValueError(f"{short_repr(values)} is not a list of whole numbers")
+    return tuple(values)
 
 
 def fingerprint(files: list[Path]) -> str:
