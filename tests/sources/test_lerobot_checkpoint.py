@@ -22,6 +22,7 @@ from vlatool.runtime.converter import action_converter
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.sources import _lerobot_directory as directory
+from vlatool.sources import source_stage
 from vlatool.sources._lerobot_checkpoint import read_checkpoint
 from vlatool.sources.lerobot import LerobotCheckpoint
 
@@ -430,3 +431,10 @@ def test_without_lerobot_the_error_says_how_to_name_its_python(tmp_path: Path, m
     with pytest.raises(SourceError, match="not installed beside vlatool") as caught:
         LerobotCheckpoint.of(str(write(tmp_path / "c", parts()))).describe()
     assert "--python" in caught.value.fix
+
+
+def test_a_python_without_lerobot_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(LEROBOT_PYTHON, sys.executable)
+    with pytest.raises(SourceError, match="No module named") as caught:
+        source_stage(str(write(tmp_path / "c", parts()))).describe()
+    assert caught.value.fix.startswith("name the Python that LeRobot is installed in, with --python")

@@ -131,10 +131,12 @@ def _traced(checkpoint: Checkpoint, python: str, out: Path) -> dict[str, Any]:
     facts = out / "facts.json"
     if ended.returncode or not facts.is_file():
         last = next((line for line in reversed(ended.stderr.splitlines()) if line.strip()), f"exit {ended.returncode}")
+        fix = "see whether LeRobot loads it there: from_pretrained(DIRECTORY)"
+        if "No module named" in last:
+            fix = f"name the Python that LeRobot is installed in, with --python; {python} lacks that module"
         raise SourceError(
             f"LeRobot cannot trace the policy in {checkpoint.folder}: {truncate(last.strip(), 300)}.",
-            "see whether LeRobot loads it there: from_pretrained(DIRECTORY); extras of LeRobot may be missing "
-            "(lerobot[diffusion], lerobot[smolvla])",
+            f"{fix}; extras of LeRobot may be missing (lerobot[diffusion], lerobot[smolvla])",
         )
     said: dict[str, Any] = json.loads(facts.read_text(encoding="utf-8"))
     request.unlink()
