@@ -127,6 +127,21 @@ def test_a_deadline_stops_a_graph_whose_tensors_stay(sessions):
     sessions["endless"].deadline = None
 
 
+def test_scalars_and_views_are_fed_as_they_are(tmp_path: Path):
+    text = f"""g (float[] scale, float[4,4] x) => ({CACHE} keys, float[4,4] y) <int64[3] shape = {{1, 300, 512}}> {{
+        y = Mul(x, scale) keys = Expand(scale, shape) }}"""
+    model = onnx.parser.parse_model(f'<ir_version: 10, opset_import: ["" : 20]> {text}')
+    onnx.save(model, str(tmp_path / "graph.onnx"))
+    session = OrtCpuSession(tmp_path / "graph.onnx", 1)
+    feeds = {"scale": np.array(2, np.float32), "x": np.arange(32, dtype=np.float32).reshape(4, 8)[:, ::2].T}
+    expected = session.run(feeds)
+    session.leave_on_device({"keys"}, ())
+    for _ in range(20):
+        got = session.run(feeds)
+        np.testing.assert_array_equal(got["y"], expected["y"])
+    np.testing.assert_array_equal(np.asarray(got["keys"]), expected["keys"])
+
+
 def test_a_wrong_feed_is_named_as_ever(sessions):
     program = Program(STEPS, chosen(sessions, "prefill", "decode"), outputs=["action"])
     with pytest.raises(GraphError, match=r"prefill\.onnx"):

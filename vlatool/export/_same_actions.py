@@ -1,14 +1,19 @@
-"""Whether a bundle made of another one gives the same actions."""
+"""A bundle whose graphs were rewritten for another engine: finished, and held against the one that it was made of."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for
+from vlatool.bundle.manifest import Graph
+from vlatool.data import observations_for, recorded_observations
 from vlatool.errors import GraphError
 from vlatool.runtime.policy import Policy, relative_error
-from vlatool.stage.finish import reference_policy
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.finish import MAX_COMPARED, carry_over, finish, reference_policy
+from vlatool.stage.record import made_by
 
 OBSERVATIONS = 8
 ROUNDING = 1e-4
@@ -24,6 +29,27 @@ def largest_difference(policy: Policy, other: Policy, observations: list[dict[st
         one, two = policy.infer(observation).outputs, other.infer(observation).outputs
         largest = max([largest, *(relative_error(two[name], one[name]) for name in one)])
     return largest
+
+
+def finish_rewritten(
+    stage: Transform,
+    source: Bundle,
+    out: Path,
+    graphs: Mapping[str, Graph],
+    context: Context,
+    changes: Mapping[str, Any] | None = None,
+) -> Bundle:
+    """Finish a bundle of rewritten graphs, which are run on the observations of the source.
+
+    Args:
+        changes: further fields of the manifest.
+    """
+    carry_over(source, out)
+    context.progress("running the graphs", None)
+    return finish(
+        source, out, made_by=made_by(stage), graphs=dict(graphs), observations=observations_for(source, MAX_COMPARED),
+        recorded=bool(recorded_observations(source, 1)), changes=changes,
+    )  # fmt: skip
 
 
 def refuse_other_actions(source: Bundle, made: Bundle, allowed: float = ROUNDING, fix: str = "") -> float:

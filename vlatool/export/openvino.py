@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for, recorded_observations
+from vlatool.data import observations_for
 from vlatool.errors import GraphError, RecipeError
 from vlatool.export._interface import graph_entry, write_interface
-from vlatool.export._same_actions import OBSERVATIONS, largest_difference
+from vlatool.export._same_actions import OBSERVATIONS, finish_rewritten, largest_difference
 from vlatool.files.blob_store import link_or_copy
 from vlatool.files.printable import message_of, one_line
 from vlatool.machine.engine_calls import engine_call
@@ -20,8 +20,7 @@ from vlatool.runtime.engine import engine_class
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context, Result, Transform, source_of
-from vlatool.stage.finish import MAX_COMPARED, SEED, carry_over, finish, reference_policy
-from vlatool.stage.record import made_by
+from vlatool.stage.finish import SEED, reference_policy
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -77,16 +76,12 @@ class Openvino(Transform):
             settings = {"INFERENCE_PRECISION_HINT": HINTS[graph.compute]}
             entries[name] = {**graph_entry(source, name, out / graph.file, files, out), "settings": settings}
         write_interface(out / FOLDER / "interface.json", source, entries)
-        carry_over(source, out)
-        context.progress("running the graphs", None)
-        observations = observations_for(source, MAX_COMPARED)
-        graphs = source.manifest.graphs
-        recorded = bool(recorded_observations(source, 1))
-        made = finish(source, out, made_by=made_by(self), graphs=graphs, observations=observations, recorded=recorded)
+        made = finish_rewritten(self, source, out, source.manifest.graphs, context)
+        observations = observations_for(source, OBSERVATIONS)
         with engine_call(engine_class(ENGINE), "ran the IR"):
-            error = self._compare(made, observations[:OBSERVATIONS])
+            error = self._compare(made, observations)
         size = sum(file.stat().st_size for file in (out / FOLDER).iterdir()) / 1e6
-        count = min(OBSERVATIONS, len(observations))
+        count = len(observations)
         return Result(made, (
             f"OpenVINO {engine_class(ENGINE).version()}: {FOLDER}/ with {len(entries)} graphs, {size:.2f} MB; its "
             f"actions differ from what the graphs say by up to {error:.2g} on {count} observations",

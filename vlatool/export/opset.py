@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for, recorded_observations
 from vlatool.errors import RecipeError
-from vlatool.export._same_actions import refuse_other_actions
+from vlatool.export._same_actions import finish_rewritten, refuse_other_actions
 from vlatool.graph.opsets import fit_file
 from vlatool.stage.base import Context, Result, Transform, source_of
-from vlatool.stage.finish import MAX_COMPARED, carry_over, finish
-from vlatool.stage.record import made_by
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -54,18 +51,15 @@ class Opset(Transform):
 
     def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Fit each graph, run the bundle, and compare its actions."""
-        (out / "graphs").mkdir()
         graphs, lowered = {}, []
+        for name in source.manifest.files:
+            if name.startswith("graphs/"):  # with external data; a copy, which is changed in place
+                (out / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source.file(name), out / name)
         for name, graph in source.manifest.graphs.items():
-            for file in source.file(graph.file).parent.glob(f"{Path(graph.file).name}*"):
-                shutil.copyfile(file, out / "graphs" / file.name)
             opset = fit_file(out / graph.file, self.opset, self.ir_version)
             lowered += [f"{name}: opset {graph.opset} -> {opset}"] if opset != graph.opset else []
             graphs[name] = replace(graph, opset=opset)
-        carry_over(source, out)
-        context.progress("running the graphs", None)
-        observations = observations_for(source, MAX_COMPARED)
-        recorded = bool(recorded_observations(source, 1))
-        made = finish(source, out, made_by=made_by(self), graphs=graphs, observations=observations, recorded=recorded)
+        made = finish_rewritten(self, source, out, graphs, context)
         refuse_other_actions(source, made)
         return Result(made, tuple(lowered) or ("the graphs are as old as that already",))

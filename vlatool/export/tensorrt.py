@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for, recorded_observations
 from vlatool.errors import GraphError, RecipeError
-from vlatool.export._same_actions import ROUNDING, refuse_other_actions
+from vlatool.export._same_actions import ROUNDING, finish_rewritten, refuse_other_actions
 from vlatool.export._tensorrt_operators import refuse_unsupported, support_list
 from vlatool.export._tensorrt_plan import FOLDER, ranges_from, write_plan
 from vlatool.export._tensorrt_qdq import TensorrtQdq, cast_pixels
@@ -22,8 +21,7 @@ from vlatool.files.printable import one_line
 from vlatool.graph.files import read, save
 from vlatool.graph.opsets import fit_versions, opset_of
 from vlatool.stage.base import Context, Result, Transform, source_of
-from vlatool.stage.finish import MAX_COMPARED, MAX_ROUNDING, carry_over, finish
-from vlatool.stage.record import made_by
+from vlatool.stage.finish import MAX_ROUNDING
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -61,23 +59,16 @@ class Tensorrt(Transform):
 
     def run(self, source: Bundle, out: Path, context: Context) -> Result:
         """Rewrite each graph, check its operators, write the plan, run the bundle, and compare its actions."""
-        (out / "graphs").mkdir()
         graphs, requantized = {}, list[str]()
         for number, (name, graph) in enumerate(source.manifest.graphs.items()):
             context.progress(f"rewriting {name}", number / len(source.manifest.graphs))
-            file = out / "graphs" / Path(graph.file).name
-            opset, changed = _rewrite(source.file(graph.file), file, name)
-            graphs[name] = replace(graph, file=f"graphs/{file.name}", opset=opset)
+            (out / graph.file).parent.mkdir(parents=True, exist_ok=True)
+            opset, changed = _rewrite(source.file(graph.file), out / graph.file, name)
+            graphs[name] = replace(graph, opset=opset)
             requantized += changed
         files = {name: out / graph.file for name, graph in graphs.items()}
         write_plan(source, out, files, self.workspace_mb, ranges_from(self.shapes))
-        carry_over(source, out)
-        context.progress("running the graphs", None)
-        observations = observations_for(source, MAX_COMPARED)
-        made = finish(
-            source, out, made_by=made_by(self), graphs=graphs, observations=observations, changes={"engine": ""},
-            recorded=bool(recorded_observations(source, 1)),
-        )  # fmt: skip
+        made = finish_rewritten(self, source, out, graphs, context, {"engine": ""})
         return Result(made, (*self._compared(source, made, requantized), *self._built(out)))
 
     def _compared(self, source: Bundle, made: Bundle, requantized: list[str]) -> tuple[str, ...]:

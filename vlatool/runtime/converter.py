@@ -15,7 +15,7 @@ from vlatool.errors import SpecError
 from vlatool.runtime.assets import Assets
 from vlatool.runtime.pose import absolute_poses, relative_poses
 from vlatool.runtime.rotation import convert_rotation
-from vlatool.runtime.statistics import load_normaliser
+from vlatool.runtime.statistics import Normaliser, load_normaliser
 
 Array = NDArray[Any]
 Change = Callable[[Array, "Array | None"], Array]
@@ -54,18 +54,13 @@ class Converter:
         remaining, marked = iter(states), False
         for conversion, layout in zip(tensor.convert, tensor.layouts(), strict=False):
             if conversion.op == "normalisation":
-                self._steps, marked = [*self._steps, self._normalisation()], True
+                self._steps, marked = [*self._steps, *_normalisation(self.normaliser)], True
             elif conversion.op == "relative":
                 self._steps.append(_relative(conversion, next(remaining)))
             else:
                 self._steps.append(_step(conversion, layout, outward))
-        if not marked and self.normaliser is not None:
-            self._steps.append(self._normalisation())
-
-    def _normalisation(self) -> _Step:
-        normaliser = self.normaliser
-        assert normaliser is not None  # the spec has a step 'normalisation' only beside statistics
-        return _Step(lambda values, _: normaliser.forward(values), lambda values, _: normaliser.inverse(values))
+        if not marked:
+            self._steps += _normalisation(self.normaliser)
 
     def to_network(self, values: Array, state: Array | None = None) -> Array:
         """Return what the network takes.
@@ -102,6 +97,12 @@ def newest_moment(values: Any, width: int) -> Array:
     """Return the state (S,) of an observation, of its newest moment where it holds several."""
     newest: Array = np.asarray(values, np.float32).reshape(-1, width)[-1]
     return newest
+
+
+def _normalisation(normaliser: Normaliser | None) -> list[_Step]:
+    if normaliser is None:
+        return []
+    return [_Step(lambda values, _: normaliser.forward(values), lambda values, _: normaliser.inverse(values))]
 
 
 def _step(conversion: Conversion, layout: Layout, outward: bool) -> _Step:

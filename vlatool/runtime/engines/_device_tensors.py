@@ -43,11 +43,12 @@ def run_bound(
         Output name -> array, or ``DeviceTensor`` where it stays; later runs do not change either.
     """
     binding = session.io_binding()
-    for name, value in feeds.items():
-        if isinstance(value, DeviceTensor):
-            binding.bind_ortvalue_input(name, value.value)
-        else:
-            binding.bind_cpu_input(name, np.ascontiguousarray(value))
+    left = {name: value.value for name, value in feeds.items() if isinstance(value, DeviceTensor)}
+    arrays = {name: np.asarray(value, order="C") for name, value in feeds.items() if name not in left}
+    for name, value in left.items():
+        binding.bind_ortvalue_input(name, value)
+    for name, array in arrays.items():  # whose memory is bound until the run ends
+        binding.bind_cpu_input(name, array)
     for name, stays in outputs.items():
         binding.bind_output(name, memory if stays else HOST)
     session.run_with_iobinding(binding, options)
