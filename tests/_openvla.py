@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import copy
 import itertools
-import json
 import math
-from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.numpy import save_file
 
 VOCABULARY, ACTIONS, SIDE = 30016, 3, 4
 CONFIG: dict[str, Any] = {
@@ -120,32 +116,3 @@ def parts() -> dict[str, Any]:
         "tokenizer.json": copy.deepcopy(TOKENIZER), "model.safetensors.index.json": {"weight_map": files}, **shards,
         "modeling_prismatic.py": b"open('pwned', 'w')\n",
     }  # fmt: skip
-
-
-def write(folder: Path, files: Mapping[str, Any]) -> Path:
-    """Write the files of a checkpoint."""
-    folder.mkdir(exist_ok=True)
-    for name, content in files.items():
-        if isinstance(content, bytes):
-            (folder / name).write_bytes(content)
-        elif name.endswith(".json"):
-            (folder / name).write_text(json.dumps(content))
-        else:
-            save_file(dict(content), folder / name)
-    return folder
-
-
-def edited(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
-    """Return what replaces an entry of the files, or removes it when ``to`` is None."""
-
-    def edit(files: dict[str, Any]) -> None:
-        *way, last = path
-        inside: Any = files
-        for key in way:
-            inside = inside[key]
-        if to is None:
-            del inside[last]
-        else:
-            inside[last] = to
-
-    return edit

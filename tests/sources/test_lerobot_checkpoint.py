@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from safetensors.numpy import save_file
+from _checkpoint_files import edited, write
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError
@@ -68,18 +68,6 @@ def parts() -> dict[str, Any]:
         "policy_postprocessor_step_0_unnormalizer_processor.safetensors": dict(STATS),
         "model.safetensors": {"w": [0.0]},
     }
-
-
-def write(folder: Path, files: dict[str, Any]) -> Path:
-    folder.mkdir(exist_ok=True)
-    for name, content in files.items():
-        if isinstance(content, bytes):
-            (folder / name).write_bytes(content)
-        elif name.endswith(".json"):
-            (folder / name).write_text(content if isinstance(content, str) else json.dumps(content))
-        else:
-            save_file({key: np.asarray(value, np.float32) for key, value in content.items()}, folder / name)
-    return folder
 
 
 def test_features_and_statistics_are_those_of_the_processors(tmp_path: Path) -> None:
@@ -141,20 +129,6 @@ def test_the_name_of_a_directory_is_not_code(tmp_path: Path, name: str, monkeypa
     exec(compile(code, "policy.py", "exec"), {"__file__": str(tmp_path / "policy.py")})
     assert not (tmp_path / "pwned").exists()
     assert checkpoint.folder.name == name
-
-
-def edited(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
-    def edit(files: dict[str, Any]) -> None:
-        *way, last = path
-        inside: Any = files
-        for key in way:
-            inside = inside[key]
-        if to is None:
-            del inside[last]
-        else:
-            inside[last] = to
-
-    return edit
 
 
 def quantiles(files: dict[str, Any]) -> None:

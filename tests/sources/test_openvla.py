@@ -14,19 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from _openvla import (
-    ACTIONS,
-    CONFIG,
-    LANGUAGE,
-    PICTURES,
-    SIDE,
-    VISION,
-    VOCABULARY,
-    edited,
-    parts,
-    shapes,
-    write,
-)
+from _checkpoint_files import edited, write
+from _openvla import ACTIONS, CONFIG, LANGUAGE, PICTURES, SIDE, VISION, VOCABULARY, parts, shapes
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main

@@ -21,13 +21,14 @@ from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.files.printable import mask_passwords
 from vlatool.machine.host import isa
-from vlatool.report import REPORT
+from vlatool.report import REPORT, Report
 from vlatool.runtime.engine import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
     from vlatool.optimize.plan import Plan
     from vlatool.optimize.recipe import Pruning, Recipe
+    from vlatool.sources import Source
     from vlatool.stage.base import Stage
 
 TRAINS = "distill.policy"
@@ -123,7 +124,7 @@ def optimize(
     from vlatool.module.source import RecordingOptions
     from vlatool.optimize import pipeline
     from vlatool.optimize.plan import make_plan
-    from vlatool.sources import brings_calibration, source_stage
+    from vlatool.sources import source_stage
     from vlatool.stage.run import cache_directory
 
     launch_for("vlatool optimize", trains=False)
@@ -139,12 +140,9 @@ def optimize(
         "environment_timeout": environment_timeout,
     }  # fmt: skip
     recordings = RecordingOptions(str(calibration or ""), str(evaluation or ""), tuple(map_names or ()))
-    calibrated = brings_calibration(source_stage(source).with_recordings(recordings))
-    given = {name: value for name, value in effort.items() if value is not None}
-    chosen = _recipe(recipe, calibrated, board, asked, given)
-    chosen = chosen.model_copy(update={"pruning": _pruning(chosen.pruning, trials, train_steps, study)})
-    if search is not None:
-        chosen = chosen.model_copy(update={"search": search})
+    chosen = _recipe(recipe, source_stage(source).with_recordings(recordings), board, asked, _given(effort))
+    pruning = _pruning(chosen.pruning, trials, train_steps, study)
+    chosen = chosen.model_copy(update={"pruning": pruning, **_given({"search": search})})
     plan = make_plan(source, board, chosen, cache or cache_directory(), recordings, fresh=fresh)
     if dry_run:
         answer(as_json, plan_document(plan), plan.lines())
@@ -152,12 +150,22 @@ def optimize(
     with progress(*crew(workers)) as context:
         report = pipeline.optimize(plan, output, context, force=force)
     propose(source, Bundle.open(output, verify=False).manifest, output)
+    _show(report, output, as_json, raw)
+    raise_verdict(report)
+
+
+def _given(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options that were given."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _show(report: Report, output: Path, as_json: bool, raw: bool) -> None:
+    """Print a report, as JSON or in short."""
     if as_json:
         document(report_document(report, raw=raw, file=output / "reports" / REPORT))
-    else:
-        put(terminal_text(report, brief=True))
-        put(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}\n")
-    raise_verdict(report)
+        return
+    put(terminal_text(report, brief=True))
+    put(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}\n")
 
 
 def _limits(
@@ -177,15 +185,16 @@ def _limits(
 
 
 def _recipe(
-    file: Path | None, calibrated: bool, board: Profile | None, limits: dict[str, Any], effort: dict[str, Any]
+    file: Path | None, source: Source, board: Profile | None, limits: dict[str, Any], effort: dict[str, Any]
 ) -> Recipe:
     """Return the recipe of a file, or the default one, with the limits and the effort that were given."""
     from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
+    from vlatool.sources import brings_calibration
 
     if file is None:
         engine = board.engine if board else DEFAULT_ENGINE
         features = board.units[board.engines[engine].unit].isa if board else isa() or ()
-        return default_recipe(Limits(**limits), Effort(**effort), calibrated, engine, features)
+        return default_recipe(Limits(**limits), Effort(**effort), brings_calibration(source), engine, features)
     recipe = read_recipe(file)
     update = {"limits": recipe.limits.model_copy(update=limits), "effort": recipe.effort.model_copy(update=effort)}
     return recipe.model_copy(update=update)
@@ -205,7 +214,7 @@ def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str
                 "leave --train-steps out, or name one of them under pruning.recover",
             )
         update["recover"] = tuple(recover)
-    return pruning.model_copy(update={name: value for name, value in update.items() if value is not None})
+    return pruning.model_copy(update=_given(update))
 
 
 def budget(text: str) -> dict[str, Any]:

@@ -28,7 +28,6 @@ from vlatool.bundle.bundle import Bundle, seal
 from vlatool.data import Recording, build_recording
 from vlatool.sources import open_source, source_bundle
 from vlatool.stage.base import Context
-from vlatool.verify._images import is_image
 from vlatool.verify._other_episodes import Judge, Outcome
 from vlatool.verify._reading import names_of
 from vlatool.verify._search import DELAY_KIND
@@ -72,13 +71,12 @@ class Subject:
     @property
     def vectors(self) -> list[str]:
         """Names of the inputs that are vectors of floats."""
-        return [each.name for each in self.bundle.manifest.spec.inputs
-                if each.kind != "text" and not is_image(each) and each.dtype == "float32"]  # fmt: skip
+        return wiring_recordings.vector_inputs(self.bundle.manifest.spec)
 
     @property
     def images(self) -> list[str]:
         """Names of the inputs that are images."""
-        return [each.name for each in self.bundle.manifest.spec.inputs if is_image(each)]
+        return wiring_recordings.image_inputs(self.bundle.manifest.spec)
 
     def log(self, random: np.random.Generator, kind: str = "ordinary") -> list[Arrays]:
         """Return some episodes."""

@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from vlatool.bundle.spec import PolicySpec
+from vlatool.verify._images import is_image
+
 ROOT = Path(__file__).parents[3]
 REFERENCE, ORDINARY = 4, 3
 """Episodes of each task in the reference, and of others; one each is disturbed."""
@@ -33,6 +36,16 @@ SEEDS = {"vla-metaworld": 0, "vla-flow": 1, "sawyer-joints": 2, "vln-babyai": 3,
 Arrays = dict[str, np.ndarray]
 Player = Callable[[str, int, str], Arrays]
 """Plays one episode of a task, with a seed and a kind of disturbance."""
+
+
+def vector_inputs(spec: PolicySpec) -> list[str]:
+    """Return the names of the inputs that are vectors of floats."""
+    return [each.name for each in spec.inputs if each.kind != "text" and not is_image(each) and each.dtype == "float32"]
+
+
+def image_inputs(spec: PolicySpec) -> list[str]:
+    """Return the names of the inputs that are images."""
+    return [each.name for each in spec.inputs if is_image(each)]
 
 
 def record(policy: str, reference: int = REFERENCE, ordinary: int = ORDINARY) -> dict[str, list[Arrays]]:

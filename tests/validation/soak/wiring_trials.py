@@ -40,7 +40,7 @@ from vlatool.files.rows import Rows  # noqa: E402
 from vlatool.sources import open_source, source_bundle  # noqa: E402
 from vlatool.stage.base import Context  # noqa: E402
 from vlatool.verify._explanation import Explanation  # noqa: E402
-from vlatool.verify._images import changes_of, is_image  # noqa: E402
+from vlatool.verify._images import changes_of  # noqa: E402
 from vlatool.verify._vectors import FACTORS  # noqa: E402
 from vlatool.verify.log import explain_inputs  # noqa: E402
 
@@ -68,13 +68,12 @@ class Subject:
     @property
     def vectors(self) -> list[str]:
         """Names of the inputs that are vectors of floats."""
-        return [tensor.name for tensor in self.bundle.manifest.spec.inputs
-                if tensor.kind != "text" and not is_image(tensor) and tensor.dtype == "float32"]  # fmt: skip
+        return wiring_recordings.vector_inputs(self.bundle.manifest.spec)
 
     @property
     def images(self) -> list[str]:
         """Names of the inputs that are images."""
-        return [tensor.name for tensor in self.bundle.manifest.spec.inputs if is_image(tensor)]
+        return wiring_recordings.image_inputs(self.bundle.manifest.spec)
 
 
 def stream(recording: Recording, knots: int = KNOTS) -> Arrays:
