@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -107,6 +107,33 @@ def test_readings_are_taken_from_the_observation_or_from_a_function():
     controller.act(see(0.5, 0.5))
     assert controller.result is not None
     assert controller.result.checks == ()
+
+
+class Origin(NamedTuple):
+    """Where an action came from, as controllers say it."""
+
+    source: str
+    age_ms: float
+    checks: tuple[str, ...] = ()
+
+    def altered_by(self, *checks: str) -> Origin:
+        return self._replace(checks=(*self.checks, *checks))
+
+
+def test_the_age_that_a_controller_says_is_checked_and_the_origin_passed_on():
+    controller = bounded(max_age_s=0.1)
+    controller.act(see(0.5, 0.5))
+    assert controller.result is not None
+    assert controller.result.checks == ("fresh",), "nobody says an age"
+    inner: Any = controller.controller
+    inner.origin = Origin("policy", 50.0)
+    controller.act(see(0.5001, 0.5))
+    assert controller.origin == Origin("policy", 50.0)
+    controller.act(see(0.51, 0.5))
+    assert controller.origin.checks == controller.result.checks
+    inner.origin = Origin("chunk", 150.0, ("other",))
+    controller.act(see(0.51, 0.5))
+    assert controller.origin == Origin("stop", 150.0, ("other", "fresh"))
 
 
 def spec(hz: float | None = 50.0, **changes: Any) -> PolicySpec:

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import DataError, UsageError
-from vlatool.runtime.envelope import Envelope, StepResult
+from vlatool.runtime.envelope import Envelope, Level, StepResult
 from vlatool.runtime.interface import Array, Controller
 
+STOP = "stop"
+"""Source of an action that is a step of the proven stop."""
 Measurement = str | Callable[[Mapping[str, Any]], Any]
 
 
@@ -23,7 +25,7 @@ class EnvelopeController:
 
     Args:
         controller: whose actions are bounded.
-        envelope: of the robot.
+        envelope: of the robot. Its ``max_age_s`` is compared with the age that the controller says (``origin.age_ms``).
         position: where the robot is measured to be, in the units of the limits: an entry of the observation, or a
             function of it. None is enough if no joint has position limits, or the envelope was started.
         readings: values for the monitors of the envelope: a function of the observation; None takes the entries of the
@@ -58,6 +60,15 @@ class EnvelopeController:
         """Whether the last action was the first of a chunk."""
         return self.controller.fresh
 
+    @property
+    def origin(self) -> Any:
+        """Where the last action came from, as the controller says it, with the checks that touched it."""
+        inner, result = getattr(self.controller, "origin", None), self.result
+        if inner is None or result is None:
+            return inner
+        inner = inner.altered_by(*result.checks)
+        return inner._replace(source=STOP) if result.level >= Level.CRITICAL else inner
+
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step within the envelope.
 
@@ -72,7 +83,8 @@ class EnvelopeController:
         if not self.envelope.ready:
             self.envelope.start(self._measure(observation))
         action = self.controller.act(observation)
-        return self._step(action, self._values(observation))
+        age = getattr(getattr(self.controller, "origin", None), "age_ms", None)
+        return self._step(action, self._values(observation), None if age is None else age / 1e3)
 
     def stop(self) -> Array:
         """Return the next step of the stop that was proven last: (A,) float64.
@@ -85,9 +97,9 @@ class EnvelopeController:
         """Start a new episode of the controller; the robot is where it is, so the envelope goes on."""
         self.controller.reset(seed)
 
-    def _step(self, action: Any, readings: Mapping[str, Any]) -> Array:
+    def _step(self, action: Any, readings: Mapping[str, Any], age_s: float | None = None) -> Array:
         enabled = None if self._enabled is None else self._enabled()
-        self.result = result = self.envelope.step(action, readings=readings, enabled=enabled)
+        self.result = result = self.envelope.step(action, readings=readings, enabled=enabled, age_s=age_s)
         if isinstance(action, np.ndarray) and action.ndim == 1 and action.tolist() == list(result.command):
             return action
         return np.array(result.command)
