@@ -159,7 +159,8 @@ class BundlePolicy:
                 self._sequence += 1
             finally:
                 self._busy = False
-        return Action(chunk, labels, (time.perf_counter_ns() - start) / 1e6, sequence, outputs)
+        taken_ms = (time.perf_counter_ns() - start) / 1e6
+        return Action(chunk, labels, taken_ms, sequence, outputs, age_ms=taken_ms)
 
     def _answer(
         self, state: Array | None, values: dict[str, Any]
