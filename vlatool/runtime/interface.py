@@ -108,6 +108,14 @@ class Controller(Protocol):
         """Start a new episode, with noise of this seed; that of the policy when None."""
 
 
+def layers_of(layer: Any) -> list[Any]:
+    """Return a layer and all those inside it, the outermost first: what it has as ``controller`` or ``policy``."""
+    found = [layer]
+    while (inner := getattr(found[-1], "controller", None) or getattr(found[-1], "policy", None)) is not None:
+        found.append(inner)
+    return found
+
+
 def origin_of(controller: Controller) -> Origin:
     """Return where the last action of a controller came from; without a source and an age if it does not say."""
     origin = getattr(controller, "origin", None)

@@ -26,7 +26,8 @@ class Session(Protocol):
         """Run the graph: input name -> array, output name -> array, both of NumPy and in the memory of the host.
 
         In whose memory they are meanwhile is the session's affair; later runs do not change what it gave. A session
-        with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
+        with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it. One with ``stop()`` does so
+        when that is called from another thread, and again at each run until ``resume()``.
         """
 
 
@@ -92,6 +93,17 @@ class Program:
     @kept_values.setter
     def kept_values(self, values: Mapping[str, Array]) -> None:
         self._kept = dict(values)
+
+    @property
+    def snapshot(self) -> tuple[dict[str, Array], Any]:
+        """What ``restore`` takes: the kept values, and the state of the noise where any is drawn."""
+        return self._kept, self._random.bit_generator.state if self._noisy else None
+
+    def restore(self, snapshot: tuple[dict[str, Array], Any]) -> None:
+        """Go back to the kept values and the noise of a snapshot."""
+        self._kept, noise = snapshot
+        if noise is not None:
+            self._random.bit_generator.state = noise
 
     def run(
         self,
