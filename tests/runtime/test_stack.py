@@ -15,7 +15,7 @@ from _written import written
 
 from vlatool import registry
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.errors import DeadlineMissed, UsageError
+from vlatool.errors import DeadlineMissed, GraphError, ProfileError, UsageError
 from vlatool.runtime import Policy, load
 from vlatool.runtime.control import check_order, layers
 from vlatool.runtime.control.checked import CheckedPolicy
@@ -23,7 +23,8 @@ from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.control.fallback import FallbackLadder
 from vlatool.runtime.control.late import LateController
-from vlatool.runtime.interface import CHUNK, FALLBACK, HOLD, POLICY, STOP, Controller, Origin, origin_of
+from vlatool.runtime.envelope import RobotLimits
+from vlatool.runtime.interface import CHUNK, FALLBACK, HOLD, POLICY, STOP, Action, Controller, Origin, origin_of
 from vlatool.runtime.stack import SWITCH_S, Fallback, Stack, TickRecord, build_stack, prepare_process
 
 POSITIONS = TensorSpec("a", (1, 1, 2), labels=("x", "gripper"), mode="absolute")
@@ -263,9 +264,59 @@ def test_a_shorter_switch_interval_is_left_as_it_is():
         gc.unfreeze()
 
 
-def test_a_robot_without_limits_is_refused():
-    with pytest.raises(UsageError, match="no-such-robot"):
-        built(envelope="no-such-robot")
+JOINTS = tuple(joint.name for joint in RobotLimits.named("franka-panda").joints)
+READY = [0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8]
+"""A pose within the limits, rad."""
+
+
+class Reaching(NumberedPolicy):
+    """Moves the first joint by a hundredth of a rad each step, until it fails."""
+
+    fails_from = 30
+
+    def infer(self, observation: Any, *, noise: Any = None) -> Action:
+        step = observation["t"]
+        if step >= self.fails_from:
+            raise GraphError("not finite")
+        pose = np.array([READY], np.float32)
+        pose[0, 0] += 0.01 * min(step, 10) ** 2 / 20 + 0.01 * max(0, step - 10)
+        return Action(pose, JOINTS, 0.0, step, {})
+
+
+def panda(**labels: Any) -> Any:
+    action = TensorSpec("a", (1, 1, 7), labels=JOINTS, mode="absolute", unit="rad")
+    seen = TensorSpec("q", (1, 7), **{"labels": JOINTS, **labels})
+    return Reaching(PolicySpec((seen,), (action,), 50.0))
+
+
+def test_a_robot_by_name_is_stopped_as_its_envelope_has_proven_where_the_policy_fails():
+    stack = build_stack(panda(), fallback=Fallback(misses=3), envelope="franka-panda")
+    played = [stack.act({"t": step, "q": np.array(READY)}) for step in range(60) if not pace(stack)]
+    sources = [type(stack.controller).__name__, stack.origin.source]
+    assert sources == ["EnvelopeController", STOP]
+    place = np.array(played)[:, 0]
+    speeds = np.diff(place) * 50
+    assert place[28] < place[29] <= place[30] <= place[59], "it slows down and does not go back"
+    assert abs(speeds[-5:]).max() < 1e-6, "and stands still"
+    assert abs(np.diff(speeds) * 50).max() < 15.1, "rad/s^2"
+
+
+def pace(stack: Any) -> None:
+    """Let the envelope see a control period go by."""
+    envelope = stack.controller.envelope
+    envelope.clock = lambda: envelope._time + 0.02 if envelope.ready else 0.0
+
+
+@pytest.mark.parametrize(
+    ("robot", "policy", "error", "message"),
+    [("no-such-robot", panda(), ProfileError, "no-such-robot"),
+     ("franka-panda", NumberedPolicy(spec_of()), UsageError, "has 2 elements"),
+     ("franka-panda", panda(labels=()), UsageError, "0 inputs have the labels of the action")],
+    ids=["robot", "width", "position"],
+)  # fmt: skip
+def test_limits_that_do_not_fit_are_refused(robot: str, policy: Any, error: type, message: str):
+    with pytest.raises(error, match=message):
+        build_stack(policy, envelope=robot)
 
 
 def test_velocities_ramp_down_in_the_time_that_is_asked_for():

@@ -66,14 +66,14 @@ def run(
 def lines(found: DryRun) -> Iterator[str]:
     """Return what a person reads: the layers from the robot inwards, then the times."""
     yield f"{found.bundle}{f' on {found.robot}' if found.robot else ''}, from the robot to the graphs:"
-    width = max(len(name) for name, _ in found.layers)
-    for name, what in found.layers:
-        yield f"  {name:{width}}  {what}"
+    width = max(len(note.layer) for note in found.layers)
+    for note in found.layers:
+        yield f"  {note.layer:{width}}  {note.does}"
     yield f"control period {found.period_ms:g} ms, deadline {found.deadline_ms:g} ms"
     yield f"  inference  p50 {found.inference.p50:.3f} ms, p99 {found.inference.p99:.3f} ms"
     share = f"{found.missed:.1%} of {found.answer.samples} steps without an action of the policy in time"
     yield f"  act        p50 {found.answer.p50:.3f} ms, p99 {found.answer.p99:.3f} ms; {share}"
     yield "a control step is answered by the first of these that has an action:"
-    for number, (source, spread) in enumerate(found.rungs):
-        time = "" if spread is None else f"  p50 {spread.p50:.3f} ms, p99 {spread.p99:.3f} ms"
-        yield f"  {number}  {source:10}{time}".rstrip()
+    for number, rung in enumerate(found.rungs):
+        time = "" if rung.time is None else f"  p50 {rung.time.p50:.3f} ms, p99 {rung.time.p99:.3f} ms"
+        yield f"  {number}  {rung.source:10}{time}".rstrip()

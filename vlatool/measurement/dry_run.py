@@ -15,7 +15,7 @@ from vlatool.data import observations_for
 from vlatool.errors import GateFailed
 from vlatool.runtime import load
 from vlatool.runtime.interface import POLICY
-from vlatool.runtime.rungs import Hold
+from vlatool.runtime.rungs import PolicyRung
 from vlatool.runtime.stack import Fallback, Stack, TickRecord
 
 OBSERVATIONS = 16
@@ -42,6 +42,32 @@ class Spread:
 
 
 @dataclass(frozen=True)
+class LayerNote:
+    """One layer.
+
+    Args:
+        layer: Name of its class.
+        does: What it does.
+    """
+
+    layer: str
+    does: str
+
+
+@dataclass(frozen=True)
+class RungNote:
+    """What may answer a control step.
+
+    Args:
+        source: What its actions say that they come from.
+        time: Time of an inference; None where it needs none.
+    """
+
+    source: str
+    time: Spread | None
+
+
+@dataclass(frozen=True)
 class DryRun:
     """What ``vlatool run --dry-run`` shows.
 
@@ -52,7 +78,7 @@ class DryRun:
         deadline_ms: Time in which a control step is answered.
         layers: Layers from the robot to the graphs, each with what it does.
         inference: Times of ``infer`` of the open bundle alone.
-        answer: Times of ``act`` of all layers.
+        answer: Times of ``act`` of all layers, called at the rate of the robot.
         missed: Share of the control steps at which the policy had no action in time.
         rungs: What answers a control step, in the order in which it is asked, each with the time of an answer.
     """
@@ -61,11 +87,11 @@ class DryRun:
     robot: str
     period_ms: float
     deadline_ms: float
-    layers: tuple[tuple[str, str], ...]
+    layers: tuple[LayerNote, ...]
     inference: Spread
     answer: Spread
     missed: float
-    rungs: tuple[tuple[str, Spread | None], ...]
+    rungs: tuple[RungNote, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
@@ -105,31 +131,30 @@ def dry_run(
     """
     plain = load(path, engine=engine, threads=threads, seed=0)
     period_ms = 1000 / plain.spec.rate
+    limit_ms = period_ms if deadline_ms is None else deadline_ms
     second = None if fallback is None else load(fallback, threads=threads, seed=0)
     records: list[TickRecord] = []
     options = Fallback(second, neutral=neutral)
     stack = load(path, engine=engine, threads=threads, seed=0, controllers=controllers, envelope=robot or None,
-                 deadline_ms=deadline_ms or period_ms, fallback=options, telemetry=records.append)  # fmt: skip
-    assert isinstance(stack, Stack)
+                 deadline_ms=limit_ms, fallback=options, telemetry=records.append)  # fmt: skip
+    if not isinstance(stack, Stack):
+        raise TypeError("a deadline makes a stack")
     bundle = Bundle.open(path)
     observations = observations_for(bundle, OBSERVATIONS)
-    spreads = [
-        None if policy is None else Spread.of(_times(policy.infer, observations, steps)) for policy in (plain, second)
-    ]
-    stack.act(observations[0])
-    answers = _times(stack.act, observations, steps)
+    inference = Spread.of(_times(plain.infer, observations, steps))
+    others = [] if second is None else [Spread.of(_times(second.infer, observations, steps))]
+    answers = _paced(stack, observations, steps)
     stack.close()
-    assert spreads[0] is not None
     return DryRun(
         f"{bundle.manifest.name} {bundle.manifest.version}",
         robot,
         period_ms,
-        deadline_ms or period_ms,
-        tuple((type(layer).__name__, _what(layer)) for layer in stack.layers),
-        spreads[0],
+        limit_ms,
+        tuple(LayerNote(type(layer).__name__, _what(layer)) for layer in stack.layers),
+        inference,
         Spread.of(answers),
         sum(record.missed for record in records[1:]) / steps,
-        tuple(_rungs(stack, spreads)),
+        tuple(_rungs(stack, [inference, *others])),
     )
 
 
@@ -143,18 +168,24 @@ def _times(call: Any, observations: Sequence[Any], count: int) -> list[float]:
     return times[len(observations) :]
 
 
+def _paced(stack: Stack, observations: Sequence[Any], count: int) -> list[float]:
+    """Return the milliseconds of control steps at the rate of the robot, from the call; the first one apart."""
+    times, begin = [], time.monotonic()
+    for number in range(count + 1):
+        time.sleep(max(0.0, begin + number / stack.spec.rate - time.monotonic()))
+        called = time.perf_counter_ns()
+        stack.act(observations[number % len(observations)])
+        times.append((time.perf_counter_ns() - called) / 1e6)
+    return times[1:]
+
+
 def _what(layer: Any) -> str:
     """Return what a layer does, as its class says it."""
     return (type(layer).__doc__ or "").strip().partition("\n")[0]
 
 
-def _rungs(stack: Stack, spreads: Sequence[Spread | None]) -> list[tuple[str, Spread | None]]:
+def _rungs(stack: Stack, spreads: Sequence[Spread | None]) -> list[RungNote]:
     """Return the source of each rung's actions and the time that it takes, where it infers."""
-    ladder = stack.ladder
-    assert ladder is not None
-    left = list(spreads)
-    found = []
-    for rung in ladder.rungs:
-        infers = not rung.bridges and not isinstance(rung, Hold)
-        found.append((rung.source or POLICY, left.pop(0) if infers else None))
-    return found
+    left = iter(spreads)
+    rungs = [] if stack.ladder is None else stack.ladder.rungs
+    return [RungNote(rung.source or POLICY, next(left) if isinstance(rung, PolicyRung) else None) for rung in rungs]

@@ -68,7 +68,8 @@ class Program:
 
     def reset(self, seed: int | None = None) -> None:
         """Zero the kept values and restart the noise: from this seed, or from that of the program when None."""
-        self._random = np.random.default_rng(self._seed if seed is None else seed)
+        if self._noisy:  # NumPy imports its generators here, for which a robot without noise need not wait
+            self._random = np.random.default_rng(self._seed if seed is None else seed)
         self._kept = {
             name: np.zeros(kept["shape"], kept.get("dtype", "float32"))
             for step in self.steps

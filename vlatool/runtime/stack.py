@@ -178,11 +178,14 @@ class Stack:
         self._stopped = False
         try:
             return self.controller.act(observation)
-        except Exception:
+        except Exception as error:
             if self._stop is None:
                 raise
             self._stopped = True
-            return np.asarray(self._stop())
+            try:
+                return np.asarray(self._stop())
+            except UsageError:  # the envelope does not know yet where the robot is
+                raise error from None
 
     def _record(self, started: float, called: float, action: Array | None, error: str) -> None:
         rung, level, cause = 0, 0, error
@@ -242,7 +245,7 @@ def build_stack(
     for entry in outer:
         inner = build_layer(entry, inner)
     if envelope is not None:
-        inner = (envelope_of(envelope) if isinstance(envelope, str) else envelope)(inner)
+        inner = (robot_envelope(policy.spec, envelope) if isinstance(envelope, str) else envelope)(inner)
         if ladder is not None and hasattr(inner, "stop"):
             for rung in ladder.rungs:
                 if isinstance(rung, Hold):
@@ -326,13 +329,37 @@ def check_same_actions(first: PolicySpec, second: PolicySpec) -> None:
         )
 
 
-def envelope_of(robot: str) -> Wrapper:
-    """Return the wrapper that keeps actions within the limits of a robot.
+def robot_envelope(spec: PolicySpec, robot: str) -> Wrapper:
+    """Return the wrapper that keeps the actions of a policy within the limits of a robot.
 
     Raises:
-        UsageError: as no robot has any yet.
+        ProfileError: when no robot has that name.
+        UsageError: when the limits do not fit the action, or no input is known to be the measured position.
     """
-    raise UsageError(f"There are no limits of a robot '{robot}'.", "pass a controller wrapper: load(..., envelope=...)")
+    from vlatool.runtime.control.envelope import EnvelopeController
+    from vlatool.runtime.envelope import RobotLimits, envelope_of
+
+    limits = RobotLimits.named(robot)
+    envelope = envelope_of(spec, limits)
+    bounded = any(joint.low is not None for joint in limits.joints)
+    position = measured_position(spec) if bounded else None
+    return lambda controller: EnvelopeController(controller, envelope, position=position)
+
+
+def measured_position(spec: PolicySpec) -> str:
+    """Return the input that says where the robot is: the one with the labels of the action.
+
+    Raises:
+        UsageError: when there is none, or several.
+    """
+    names = [tensor.name for tensor in spec.inputs if tensor.labels and tensor.labels == spec.action.labels]
+    if len(names) == 1:
+        return names[0]
+    raise UsageError(
+        f"{len(names)} inputs have the labels of the action; one has to be the position at which the robot starts.",
+        "label the input as the action, or pass envelope=lambda controller: EnvelopeController(controller, "
+        "envelope_of(policy.spec, limits), position=NAME)",
+    )
 
 
 def prepare_process() -> None:

@@ -2,8 +2,8 @@
 
     python tests/validation/stack/bad_outputs.py --outputs 100000
 
-Chunks with NaN or infinity at random places, of wrong shapes and dtypes, and things that are no arrays, a seventh of them
-right; and a graph whose output is not finite wherever its input says so.
+Chunks with NaN or infinity at random places, of wrong shapes and dtypes, and things that are no arrays, a seventh of
+them right; and a graph whose output is not finite wherever its input says so.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "runtime")]
+sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "runtime"))
 from _numbered import NumberedPolicy, spec_of
 from _written import written
 
@@ -33,8 +33,9 @@ WRONG = (
     lambda chunk: chunk[:-1], lambda chunk: chunk[:, :-1], lambda chunk: chunk[None], lambda chunk: chunk[0],
     lambda chunk: np.concatenate([chunk, chunk]), lambda chunk: chunk.astype(np.float64),
     lambda chunk: chunk.astype(np.float16), lambda chunk: chunk.astype(np.int64), lambda chunk: chunk.astype(object),
-    lambda chunk: chunk.tolist(), lambda chunk: None, lambda chunk: chunk.astype(str), lambda chunk: chunk.astype(complex),
-    lambda chunk: np.empty((0, 3), np.float32), lambda chunk: np.ma.masked_array(chunk), lambda chunk: float(chunk[0, 0]),
+    lambda chunk: chunk.tolist(), lambda chunk: None, lambda chunk: chunk.astype(str),
+    lambda chunk: chunk.astype(complex), lambda chunk: np.empty((0, 3), np.float32),
+    lambda chunk: np.ma.masked_array(chunk), lambda chunk: float(chunk[0, 0]),
 )  # fmt: skip
 
 

@@ -6,8 +6,8 @@
 
 A policy takes 0 to 10 times the deadline, half of the time at most the deadline. The first number of an action says
 which inference it is from. Times are from when a step was to begin, so a step that the machine begins late counts as
-late; "waited" is that part, which the stack cannot change, and "beyond" the time beyond the deadline, or beyond the call
-where that came after it.
+late; "waited" is that part, which the stack cannot change, and "beyond" the time beyond the deadline, or beyond the
+call where that came after it.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ def run(ticks: int, *, real: bool, stubborn: bool = False, seed: int = 0) -> dic
     """Return how many steps were answered, how late at worst, and how many late actions were used."""
     clock: Any = time.monotonic if real else FakeClock()
     policy = DelayedPolicy(clock, seed, stubborn)
-    stack = build_stack(policy, deadline_ms=DEADLINE_MS, fallback=Fallback(start=[0, 0]), clock=clock)
+    stack = build_stack(
+        policy, deadline_ms=DEADLINE_MS, fallback=Fallback(start=[0, 0], misses=9, recover=1), clock=clock
+    )
     if real:
         prepare_process()
     else:
@@ -109,8 +111,7 @@ def run(ticks: int, *, real: bool, stubborn: bool = False, seed: int = 0) -> dic
 
 
 def _percentiles(values: np.ndarray) -> str:
-    shares = (50, 99, 99.9, 100)
-    return ", ".join(f"p{share:g} {value:.3f}" for share, value in zip(shares, np.percentile(values, shares)))
+    return ", ".join(f"p{share:g} {np.percentile(values, share):.3f}" for share in (50, 99, 99.9, 100))
 
 
 def main() -> None:

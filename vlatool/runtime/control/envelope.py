@@ -9,7 +9,7 @@ import numpy as np
 
 from vlatool.errors import DataError, UsageError
 from vlatool.runtime.envelope import Envelope, StepResult
-from vlatool.runtime.interface import Array, Controller
+from vlatool.runtime.interface import Array, Controller, Origin, origin_of
 
 Measurement = str | Callable[[Mapping[str, Any]], Any]
 
@@ -57,6 +57,12 @@ class EnvelopeController:
     def fresh(self) -> bool:
         """Whether the last action was the first of a chunk."""
         return self.controller.fresh
+
+    @property
+    def origin(self) -> Origin:
+        """Where the last action of the controller came from, and which checks altered it."""
+        origin = origin_of(self.controller)
+        return origin if self.result is None else origin.altered_by(*self.result.checks)
 
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step within the envelope.
