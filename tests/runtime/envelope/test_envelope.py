@@ -10,6 +10,7 @@ import importlib.util
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from _envelope_attacks import KINDS, Robot, attack, refused
+from _envelope_judge import excesses
 
 import vlatool.runtime.envelope as package
 from vlatool.errors import DataError, UsageError
@@ -91,14 +93,14 @@ def contract(make: Make) -> None:
 
 
 def discontinuity(make: Make) -> None:
-    """A jump is rejected, not slewed, also right after a seam or a reset; the robot does not move towards it."""
+    """A jump of 5.8 rad is rejected, not slewed, also after a seam or a reset; the robot does not move towards it."""
     arm = RobotLimits.named("franka-panda")
     envelope = make(arm, T)
-    envelope.start([-2.8, 0, 0, -1.5, 0, 1.5, 0])
+    envelope.start([-2.89, 0, 0, -1.5, 0, 1.5, 0])
     for _ in range(50):
-        result = envelope.step([2.8, 0, 0, -1.5, 0, 1.5, 0], elapsed_s=T)
+        result = envelope.step([2.89, 0, 0, -1.5, 0, 1.5, 0], elapsed_s=T)
         assert result.checks == ("discontinuity",)
-        assert result.command[0] == -2.8
+        assert result.command[0] == -2.89
 
 
 def start(make: Make) -> None:
@@ -201,6 +203,15 @@ def readings(make: Make) -> None:
     assert step(2.0, 0.0).level is Level.SAFE
 
 
+def name_of_a_check(make: Make) -> None:
+    """A monitor that has the name of a check does not hide that a command was changed."""
+    limits = RobotLimits("cart", (replace(AXES[0], jerk=1e5),))
+    envelope = at(make, limits=limits, monitors=(Monitor("acceleration", warning=1.0, critical=2.0),))
+    result = envelope.step([0.505], elapsed_s=T, readings={"acceleration": 1.0})
+    assert result.checks == ("acceleration",)
+    assert result.command[0] == envelope.position[0] < 0.502
+
+
 def base_while_moving(make: Make) -> None:
     """A reading may concern some joints alone: a base that may not drive while the arm moves."""
     limits = SLIDE.plus(JointLimits("base", "m", velocity=(-0.5, 0.5), acceleration=2.0, jerk=40.0, command="velocity"))
@@ -227,13 +238,17 @@ def escalation(make: Make) -> None:
 
 
 def clock(make: Make) -> None:
-    """A clock that stands, goes back or says nothing moves nothing; a step that is too early repeats the last one."""
+    """Where the clock goes back or says nothing, the robot stops; a step that is too early repeats the last one."""
     envelope = at(make)
     x = move(envelope)
-    for elapsed in (math.nan, -1.0, math.inf, "soon"):
-        assert envelope.step([x + 0.008], elapsed_s=elapsed) == ((x,), ("clock",), Level.CRITICAL)
     assert envelope.step([x + 0.008], elapsed_s=0.1 * T) == ((x,), ("early",), Level.WARNING)
     assert envelope.step([x + 0.008], elapsed_s=0.9 * T) == ((x + 0.008,), (), Level.SAFE)
+    for elapsed in (math.nan, -1.0, math.inf, "soon"):
+        last = envelope.position[0]
+        result = envelope.step([x + 0.016], elapsed_s=elapsed)
+        assert result.checks == ("clock",)
+        assert result.level is Level.CRITICAL
+        assert 0 < result.command[0] - last < 0.4 * T
     now = [0.0]
     timed = at(make, clock=lambda: now[0])
     now[0] = T
@@ -242,6 +257,9 @@ def clock(make: Make) -> None:
     assert timed.step([0.5]).checks == ("clock",)
     now[0] += T
     assert timed.step([0.5]).checks == ()
+    broken = at(make)
+    broken.clock = lambda: 1 / 0
+    assert broken.step([0.5]).checks == ("clock",)
 
 
 def bands(make: Make) -> None:
@@ -255,6 +273,17 @@ def bands(make: Make) -> None:
         assert slowed.checks
         assert 0 < slowed.command[0] - (0.5 if mode == "absolute" else 0.0) < near
         assert at(make, mode=mode).step([beyond], elapsed_s=T).checks == ("discontinuity",)
+
+
+def behind(make: Make) -> None:
+    """Smooth commands that are too fast slow the robot down; it does not freeze."""
+    envelope = at(make, 0.1)
+    asked, position = 0.1, 0.1
+    for _ in range(60):
+        asked += 0.55 * T
+        last, position = position, envelope.step([asked], elapsed_s=T).command[0]
+    assert (position - last) / T == pytest.approx(0.5, abs=1e-6)
+    assert 0.05 < asked - position < 0.3
 
 
 def gripper(make: Make) -> None:
@@ -286,7 +315,7 @@ SCENARIOS: dict[str, Callable[[Make], None]] = {
     scenario.__name__: scenario
     for scenario in (
         finite, fresh, contract, discontinuity, start, moving_start, late, missed, dead_man, internal, keep_out,
-        readings, base_while_moving, escalation, clock, bands, gripper,
+        readings, name_of_a_check, base_while_moving, escalation, clock, bands, behind, gripper,
     )
 } | {
     "positions": attacks(SLIDE, "absolute", HARD),
@@ -306,7 +335,8 @@ MUTATIONS: tuple[tuple[str, str, str, str], ...] = (
     ("fresh", "envelope", "if not self._is_fresh(age, sequence):", "if False:"),
     ("fresh", "envelope", "fresh = fresh and sequence > self._sequence", "pass"),
     ("contract", "envelope", "command.shape != (width,)", "False"),
-    ("contract", "envelope", 'command.dtype.kind != "f"', "False"),
+    ("contract", "envelope", "command.dtype not in FLOATS", "False"),
+    ("contract", "envelope", "or not NUMBERS.issuperset(map(type, command))", ""),
     ("discontinuity", "envelope", "if axis.is_discontinuity(wanted, tick):", "if False:"),
     ("start", "envelope", "if not axis.fits(value):", "if False:"),
     ("moving_start", "envelope", "if self.ready and not self.at_rest():", "if False:"),
@@ -320,10 +350,12 @@ MUTATIONS: tuple[tuple[str, str, str, str], ...] = (
     ("keep_out", "axis", "high if high > last else last)", "value)"),
     ("readings", "monitor", "if not _is_finite(reading):", "if False:"),
     ("readings", "envelope", "axis.scale_velocity(scale)", "pass"),
+    ("name_of_a_check", "envelope", "tuple(sent if slowed else values)", "tuple(values)"),
     ("base_while_moving", "envelope", "Level.WARNING if local else level", "level"),
     ("escalation", "envelope", "if self.escalate_after and", "if False and"),
     ("clock", "envelope", "if interval is None:", "if False:"),
     ("clock", "envelope", "and elapsed >= 0", ""),
+    ("behind", "envelope", "axis.request = wanted", "pass"),
     ("gripper", "range_axis", "inside = self.low - TOLERANCE <= value <= self.high + TOLERANCE", "inside = True"),
     ("positions", "axis", "if low < self._low or high > self._high or", "if"),
     ("positions", "axis", "self.slow, self.fast = limits.velocity", "self.slow, self.fast = -9.0, 9.0"),
@@ -342,6 +374,30 @@ MUTATIONS: tuple[tuple[str, str, str, str], ...] = (
     ("curve", "axis", "if max(velocity, later) > curve.upper(outer[1]) + TOLERANCE:", "if False:"),
 )  # fmt: skip
 """Scenario, module, what is removed, and what stands there instead."""
+
+
+def clamp(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+def test_a_guard_that_clamps_one_limit_after_the_other_leaves_them_and_the_envelope_does_not():
+    """Position, velocity, acceleration, jerk in turn: with the last clamp, the first limit is no longer kept."""
+    joint = SLIDE.joints[0]
+    at_, speed, rate, passed = 0.5, 0.0, 0.0, []
+    envelope, bounded = at(Envelope), []
+    for _ in range(300):
+        wanted = 1.0
+        velocity = clamp((clamp(wanted, 0.0, 1.0) - at_) / T, *joint.velocity)
+        acceleration = clamp((velocity - speed) / T, -joint.acceleration, joint.acceleration)
+        rate += clamp((acceleration - rate) / T, -joint.jerk, joint.jerk) * T
+        speed += rate * T
+        at_ += speed * T
+        passed.append((at_,))
+        bounded.append(envelope.step([min(wanted, envelope.position[0] + 0.01)], elapsed_s=T).command)
+    times = [T * (step + 1) for step in range(300)]
+    assert excesses(SLIDE, [False], [0.5], times, passed, T)["position"] > 1e-3
+    assert max(excesses(SLIDE, [False], [0.5], times, bounded, T).values()) <= 1e-9
+    assert bounded[-1][0] == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(("scenario", "module", "old", "new"), MUTATIONS)

@@ -8,6 +8,7 @@ import random
 import numpy as np
 import pytest
 
+from vlatool.runtime.envelope import Envelope, RobotLimits
 from vlatool.runtime.envelope.stop import stop_phases, stop_range, stop_state
 
 LIMITS = ((2.0, 8.0), (15.0, 7500.0), (1.0, 100.0), (5.0, 3.0))
@@ -57,6 +58,30 @@ def test_time_is_counted_from_the_start_of_the_stop():
     positions = [stop_state(0.0, 1.0, 0.0, phases, time)[0] for time in (0.0, 0.25, 0.5, 0.75, 9.0)]
     assert positions == pytest.approx([0, 0.25 - 8 * 0.25**3 / 6, 0.354166667, 0.375, 0.375])
     assert all(before <= after for before, after in itertools.pairwise(positions))
+
+
+def test_no_stop_of_a_robot_takes_longer_than_ruckigs_by_more_than_a_tenth_and_a_step():
+    ruckig = pytest.importorskip("ruckig", reason="Ruckig is an oracle of this test alone: pip install ruckig")
+    limits, period = RobotLimits.named("ur5e"), 0.01
+    wave = np.sin(np.linspace(0, 6, 400))[:, None] * np.linspace(0.1, 0.5, 6)
+    for length in (60, 130, 200, 290):
+        envelope = Envelope(limits, period)
+        envelope.start([0.0] * 6)
+        for command in wave[:length]:
+            envelope.step(command, elapsed_s=period)
+        sent = np.array([envelope.step(None, elapsed_s=period).command for _ in range(3)])
+        steps = 0
+        while not envelope.at_rest():
+            envelope.step(None, elapsed_s=period)
+            steps += 1
+        wanted = ruckig.InputParameter(6)
+        wanted.control_interface = ruckig.ControlInterface.Velocity
+        wanted.current_velocity = ((sent[2] - sent[1]) / period).tolist()
+        wanted.current_acceleration = (np.diff(sent, 2, axis=0)[0] / period**2).tolist()
+        wanted.max_velocity, wanted.max_acceleration, wanted.max_jerk = [9.0] * 6, [3.0] * 6, [60.0] * 6
+        trajectory = ruckig.Trajectory(6)
+        assert ruckig.Ruckig(6).calculate(wanted, trajectory) == ruckig.Result.Working
+        assert steps * period <= 1.1 * trajectory.duration + period
 
 
 def test_no_stop_is_longer_than_that_of_ruckig():

@@ -27,6 +27,8 @@ PROOF_MARGIN = 1e-8
 BISECTIONS = 10
 BRAKING_SHARES = (0.0, 0.5, 1.0)
 """Jerks that may have led to a sample, as shares of the strongest braking one, in the order in which they are tried."""
+MAX_LAG = 10
+"""How far commands may go ahead of an axis that is slowed, in jumps that are discontinuities."""
 CURVE_POINTS = 24
 """Parts of a stop in each of which its greatest velocity must be allowed at its outermost position."""
 
@@ -91,7 +93,7 @@ class PositionAxis:
 
     Args:
         limits: of this axis.
-        near: commands farther than so many periods at the velocity limit are a discontinuity.
+        near: commands farther from the last one than so many periods at the velocity limit are a discontinuity.
     """
 
     def __init__(self, limits: JointLimits, near: float) -> None:
@@ -110,7 +112,7 @@ class PositionAxis:
 
     def arm(self, position: float) -> None:
         """Begin at rest at a position."""
-        self.value, self.velocity, self.acceleration = position, 0.0, 0.0
+        self.value, self.velocity, self.acceleration, self.request = position, 0.0, 0.0, position
         self.start, self.elapsed = (position, 0.0, 0.0), 0.0
         self.phases: Phases | None = None
         self.lowest = self.highest = position
@@ -128,8 +130,12 @@ class PositionAxis:
         return self.elapsed >= sum(self._stop_phases()[:3])
 
     def is_discontinuity(self, value: float, tick: Tick) -> bool:
-        """Return whether a command is farther away than the axis could go in a few periods."""
-        return abs(value - self.value) > self.reach * max(tick.interval, tick.period)
+        """Return whether a command is farther from the last one than the axis could go in a few periods.
+
+        Commands that go on smoothly, faster than the axis may, leave it behind; that is one only when it is far behind.
+        """
+        far = self.reach * max(tick.interval, tick.period)
+        return abs(value - self.request) > far or abs(value - self.value) > MAX_LAG * far
 
     def sample(self, value: float, tick: Tick) -> Sample | None:
         """Return a command with its stop if it may be sent as it is, else None."""
@@ -153,6 +159,7 @@ class PositionAxis:
     def commit(self, sample: Sample, interval: float) -> None:
         """Remember what is sent."""
         self.value, self.velocity, self.acceleration, start, self.lowest, self.highest = sample
+        self.request = self.value
         self.elapsed += interval
         if start is not None:
             self.start, self.elapsed, self.phases = start, 0.0, None
@@ -179,18 +186,22 @@ class PositionAxis:
 
     def _with_stop(self, value: float, velocity: float, acceleration: float, tick: Tick) -> Sample | None:
         """Return the sample with a legal stop, for one of the motions that may have led to it."""
-        for share in BRAKING_SHARES:
-            jerk = share and share * self._braking_jerk(velocity, acceleration, tick)
-            begin = velocity + acceleration * tick[4] + jerk * tick[6]
-            end = acceleration + jerk * tick[5]
-            bounds = self._proof(value, begin, end)
-            if bounds is not None:
-                low, high = bounds
-                last = self.value
-                start = (value, begin, end)
-                return Sample(value, velocity, acceleration, start, low if low < last else last,
-                              high if high > last else last)  # fmt: skip
-        return None
+        begin, end = velocity + acceleration * tick[4], acceleration
+        bounds = self._proof(value, begin, end)
+        if bounds is None:
+            braking = self._braking_jerk(velocity, acceleration, tick)
+            for jerk in (braking / 2, braking):
+                begin = velocity + acceleration * tick[4] + jerk * tick[6]
+                end = acceleration + jerk * tick[5]
+                bounds = self._proof(value, begin, end)
+                if bounds is not None:
+                    break
+            else:
+                return None
+        low, high = bounds
+        last = self.value
+        return Sample(value, velocity, acceleration, (value, begin, end), low if low < last else last,
+                      high if high > last else last)  # fmt: skip
 
     def _braking_jerk(self, velocity: float, acceleration: float, tick: Tick) -> float:
         """Return the largest jerk against a velocity with which the accelerations since the last sample are legal."""

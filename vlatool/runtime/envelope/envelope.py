@@ -20,6 +20,10 @@ from vlatool.runtime.envelope.velocity_axis import VelocityAxis
 
 MODES = ("absolute", "delta", "velocity")
 """Modes of an action that can be bounded without knowing what it is relative to."""
+FLOATS = frozenset(map(np.dtype, (np.float64, np.float32, np.float16)))
+NUMBERS = frozenset((float, int, np.float64, np.float32, np.float16))
+"""Types of the elements of a command that is a list; a truth value is none of them."""
+MIN_PERIOD_S, MAX_PERIOD_S = 5e-4, 10.0
 NEAR_PERIODS = 3.0
 LONGEST_PERIODS = 4.0
 SHORTEST_PERIODS = 0.25
@@ -56,8 +60,8 @@ class Envelope:
         period_s: nominal time between two steps.
         mode: what an action is: ``absolute`` positions, ``delta`` from the last commanded position, or ``velocity``.
         monitors: readings that slow or stop the robot.
-        near: a position farther than so many periods at the velocity limit from the last one, or a velocity so many
-            times its limit, is rejected instead of slowed.
+        near: a position farther than so many periods at the velocity limit from the last one that was asked for, or a
+            velocity so many times its limit, is rejected instead of slowed.
         max_interval_s: longest interval for which the positions of velocity commands are proven, and after which a
             command comes too late and a stop step is sent instead; four periods when None.
         max_age_s: age from which a command is stale; None if ages are not given.
@@ -94,6 +98,11 @@ class Envelope:
     ) -> None:
         for name, value in (("period_s", period_s), ("near", near)):
             _check_finite(name, value)
+        if not MIN_PERIOD_S <= period_s <= MAX_PERIOD_S:
+            raise UsageError(
+                f"period_s is {period_s!r}; allowed: {MIN_PERIOD_S} to {MAX_PERIOD_S:g} s.",
+                "pass the time between two commands in seconds; faster, rounding hides the jerk",
+            )
         for name, optional in (("max_interval_s", max_interval_s), ("max_age_s", max_age_s)):
             _check_finite(name, optional, optional=True)
         if mode not in MODES:
@@ -160,17 +169,17 @@ class Envelope:
         if not self.ready:
             raise UsageError("The envelope does not know where its robot is.", "call start(position) first")
         interval = self._elapsed(elapsed_s)
-        if interval is None:
-            return self._repeat("clock", Level.CRITICAL)
-        if interval < SHORTEST_PERIODS * self.period_s:
+        if interval is not None and interval < SHORTEST_PERIODS * self.period_s:
             self._early = interval
-            return self._repeat("early", Level.WARNING)
+            return self._repeat()
         self._early = 0.0
         try:
+            if interval is None:
+                return self._reject(self.period_s, ("clock", *self._emergency))
             return self._checked(command, interval, age_s, sequence, readings or {}, enabled)
         except Exception as error:  # whatever a check raises, the robot stops
             self._emergency = ("internal", type(error).__name__)
-            return self._stop(interval, self._emergency)
+            return self._stop(interval or self.period_s, self._emergency)
 
     def emergency(self, reason: str = "emergency") -> None:
         """Stop the robot, from the next step until ``clear``."""
@@ -264,24 +273,25 @@ class Envelope:
         """Return the command, or the nearest one, or a stop step if it is a discontinuity or enters a box."""
         tick = Tick.of(interval, self._last, self._before, self.period_s, self.max_interval_s)
         samples: list[Sample] = []
+        slowed: list[tuple[PositionAxis, float]] = []
         checks: list[str] = reports
         for axis, value, relative in zip(self._axes, values, self._relative, strict=True):
             wanted = axis.value + value if relative else value
-            if axis.is_discontinuity(wanted, tick):
-                return self._reject(interval, (*reports, "discontinuity"))
             sample = axis.sample(wanted, tick)
             if sample is None:
+                if axis.is_discontinuity(wanted, tick):
+                    return self._reject(interval, (*reports, "discontinuity"))
                 sample, check = axis.nearest(wanted, tick)
-                if check not in checks:
-                    checks = [*checks, check]
+                slowed.append((axis, sample.value if relative else wanted))
+                checks = checks if check in checks else [*checks, check]
             samples.append(sample)
         if self._boxes and self._enters_box(samples):
             return self._reject(interval, (*checks, "keep-out"))
         self._rejections = 0
         sent = self._commit(samples, interval)
-        if checks == reports:
-            sent = values
-        return StepResult(tuple(sent), tuple(checks), Level.WARNING if checks else Level.SAFE)
+        for axis, wanted in slowed:
+            axis.request = wanted
+        return StepResult(tuple(sent if slowed else values), tuple(checks), Level.WARNING if checks else Level.SAFE)
 
     def _enters_box(self, samples: Sequence[Sample]) -> bool:
         """Return whether the box around all positions until the stop ends meets a box to keep out of."""
@@ -309,28 +319,29 @@ class Envelope:
 
     def _commit(self, samples: Sequence[Sample], interval: float) -> list[float]:
         """Remember what is sent, and return it in the mode of the action."""
-        sent = [
-            sample.value - axis.value if relative else sample.value
-            for axis, sample, relative in zip(self._axes, samples, self._relative, strict=True)
-        ]
+        sent = [sample.value for sample in samples]
+        if self.mode == "delta":
+            columns = zip(self._axes, sent, self._relative, strict=True)
+            sent = [value - axis.value if relative else value for axis, value, relative in columns]
         for axis, sample in zip(self._axes, samples, strict=True):
             axis.commit(sample, interval)
         self._last, self._before = interval, self._last
         return sent
 
-    def _repeat(self, check: str, level: Level) -> StepResult:
-        """Return the last command again; a delta of 0."""
+    def _repeat(self) -> StepResult:
+        """Return the last command again, a delta of 0, as no time has gone by since."""
         held = [0.0 if relative else axis.value for axis, relative in zip(self._axes, self._relative, strict=True)]
-        return StepResult(tuple(held), (check, *self._emergency), Level.EMERGENCY if self._emergency else level)
+        level = Level.EMERGENCY if self._emergency else Level.WARNING
+        return StepResult(tuple(held), ("early", *self._emergency), level)
 
     def _elapsed(self, elapsed: Any) -> float | None:
         """Return the time since the last command that was not a repetition; None if no clock says it."""
-        if elapsed is None:
-            now = self.clock()
-            elapsed, self._time = now - self._time, now
         try:
+            if elapsed is None:
+                now = self.clock()
+                elapsed, self._time = now - self._time, now
             elapsed = float(elapsed)
-        except (TypeError, ValueError):
+        except Exception:  # whatever a clock raises, the robot stops
             return None
         return elapsed + self._early if isfinite(elapsed) and elapsed >= 0 else None
 
@@ -380,17 +391,14 @@ def _sides(limits: RobotLimits, low: Mapping[str, float], high: Mapping[str, flo
 
 def _numbers(command: Any, width: int) -> list[float] | None:
     """Return the elements of a vector of floats; None for another shape or dtype."""
-    if isinstance(command, list | tuple):
-        right = len(command) == width and all(isinstance(value, float | int | np.floating) for value in command)
-        return [float(value) for value in command] if right and not any(map(_is_flag, command)) else None
-    if not isinstance(command, np.ndarray) or command.dtype.kind != "f" or command.shape != (width,):
+    if isinstance(command, np.ndarray):
+        if command.dtype not in FLOATS or command.shape != (width,):
+            return None
+        values: list[float] = command.tolist()
+        return values
+    if not isinstance(command, list | tuple) or len(command) != width or not NUMBERS.issuperset(map(type, command)):
         return None
-    values: list[float] = command.tolist()
-    return values
-
-
-def _is_flag(value: Any) -> bool:
-    return isinstance(value, bool)
+    return list(map(float, command))
 
 
 def _check_finite(name: str, value: Any, *, optional: bool = False) -> None:

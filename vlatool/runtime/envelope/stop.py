@@ -68,16 +68,16 @@ def stop_range(velocity: float, acceleration: float, max_acceleration: float, ma
         >>> stop_range(1.0, 0.0, 2.0, 8.0)
         (0.0, 0.375, 0.0, 1.0)
     """
-    if velocity + acceleration * abs(acceleration) / (2 * max_jerk) < 0:
+    square = acceleration * acceleration / 2
+    if velocity * max_jerk < (square if acceleration < 0 else -square):
         low, high, slow, fast = stop_range(-velocity, -acceleration, max_acceleration, max_jerk)
         return -high, -low, -fast, -slow
-    square = acceleration * acceleration / 2
-    peak = sqrt(max(0.0, max_jerk * velocity + square))
-    constant = 0.0
+    radicand = max_jerk * velocity + square
+    peak, constant = sqrt(radicand) if radicand > 0 else 0.0, 0.0
     if peak > max_acceleration:
-        peak = max(max_acceleration, -acceleration)
-        constant = max(0.0, (velocity + (square - peak * peak) / max_jerk) / peak)
-    first = max(0.0, (acceleration + peak) / max_jerk)
+        peak = max_acceleration if max_acceleration > -acceleration else -acceleration
+        constant = (velocity + (square - peak * peak) / max_jerk) / peak
+    first = (acceleration + peak) / max_jerk
     end = (
         first * (velocity + first * (acceleration / 2 - first * max_jerk / 6))
         + constant * peak * (peak / max_jerk + constant) / 2
@@ -86,6 +86,6 @@ def stop_range(velocity: float, acceleration: float, max_acceleration: float, ma
     fastest = velocity + square / max_jerk if acceleration > 0 else velocity
     if velocity >= 0:
         return 0.0, end, 0.0, fastest
-    turn = (acceleration - sqrt(max(0.0, 2 * (square + max_jerk * velocity)))) / max_jerk
+    turn = (acceleration - sqrt(max(0.0, 2 * radicand))) / max_jerk
     back = turn * (velocity + turn * (acceleration / 2 - turn * max_jerk / 6))
     return back, max(0.0, end), velocity, fastest

@@ -17,7 +17,7 @@ class VelocityAxis(PositionAxis):
     def arm(self, position: float) -> None:
         """Begin at rest at a position."""
         super().arm(position)
-        self.position, self.value = position, 0.0
+        self.position, self.value, self.request = position, 0.0, 0.0
 
     def is_discontinuity(self, value: float, tick: Tick) -> bool:
         """Return whether a command is far above the velocity limit."""
