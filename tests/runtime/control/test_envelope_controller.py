@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from vlatool.errors import DataError, UsageError
 from vlatool.runtime.control import layers
 from vlatool.runtime.control.envelope import EnvelopeController
 from vlatool.runtime.envelope import Envelope, JointLimits, Level, Monitor, RobotLimits, envelope_of
-from vlatool.runtime.interface import Controller
+from vlatool.runtime.interface import Controller, Origin
 
 T = 0.02
 PAIR = RobotLimits("pair", tuple(JointLimits(name, "m", 0.0, 1.0, (-0.5, 0.5), 2.0, 40.0) for name in "xy"))
@@ -107,17 +107,6 @@ def test_readings_are_taken_from_the_observation_or_from_a_function():
     controller.act(see(0.5, 0.5))
     assert controller.result is not None
     assert controller.result.checks == ()
-
-
-class Origin(NamedTuple):
-    """Where an action came from, as controllers say it."""
-
-    source: str
-    age_ms: float
-    checks: tuple[str, ...] = ()
-
-    def altered_by(self, *checks: str) -> Origin:
-        return self._replace(checks=(*self.checks, *checks))
 
 
 def test_the_age_that_a_controller_says_is_checked_and_the_origin_passed_on():

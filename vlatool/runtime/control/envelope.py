@@ -9,10 +9,8 @@ import numpy as np
 
 from vlatool.errors import DataError, UsageError
 from vlatool.runtime.envelope import Envelope, Level, StepResult
-from vlatool.runtime.interface import Array, Controller
+from vlatool.runtime.interface import STOP, Array, Controller, Origin, origin_of
 
-STOP = "stop"
-"""Source of an action that is a step of the proven stop."""
 Measurement = str | Callable[[Mapping[str, Any]], Any]
 
 
@@ -61,13 +59,13 @@ class EnvelopeController:
         return self.controller.fresh
 
     @property
-    def origin(self) -> Any:
+    def origin(self) -> Origin:
         """Where the last action came from, as the controller says it, with the checks that touched it."""
-        inner, result = getattr(self.controller, "origin", None), self.result
-        if inner is None or result is None:
-            return inner
-        inner = inner.altered_by(*result.checks)
-        return inner._replace(source=STOP) if result.level >= Level.CRITICAL else inner
+        origin, result = origin_of(self.controller), self.result
+        if result is None:
+            return origin
+        origin = origin.altered_by(*result.checks)
+        return origin._replace(source=STOP) if result.level >= Level.CRITICAL else origin
 
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step within the envelope.
