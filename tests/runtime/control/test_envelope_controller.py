@@ -14,7 +14,7 @@ from vlatool.errors import DataError, UsageError
 from vlatool.runtime.control import layers
 from vlatool.runtime.control.envelope import EnvelopeController
 from vlatool.runtime.envelope import Envelope, JointLimits, Level, Monitor, RobotLimits, envelope_of
-from vlatool.runtime.interface import Controller
+from vlatool.runtime.interface import Controller, Origin
 
 T = 0.02
 PAIR = RobotLimits("pair", tuple(JointLimits(name, "m", 0.0, 1.0, (-0.5, 0.5), 2.0, 40.0) for name in "xy"))
@@ -107,6 +107,22 @@ def test_readings_are_taken_from_the_observation_or_from_a_function():
     controller.act(see(0.5, 0.5))
     assert controller.result is not None
     assert controller.result.checks == ()
+
+
+def test_the_age_that_a_controller_says_is_checked_and_the_origin_passed_on():
+    controller = bounded(max_age_s=0.1)
+    controller.act(see(0.5, 0.5))
+    assert controller.result is not None
+    assert controller.result.checks == ("fresh",), "nobody says an age"
+    inner: Any = controller.controller
+    inner.origin = Origin("policy", 50.0)
+    controller.act(see(0.5001, 0.5))
+    assert controller.origin == Origin("policy", 50.0)
+    controller.act(see(0.51, 0.5))
+    assert controller.origin.checks == controller.result.checks
+    inner.origin = Origin("chunk", 150.0, ("other",))
+    controller.act(see(0.51, 0.5))
+    assert controller.origin == Origin("stop", 150.0, ("other", "fresh"))
 
 
 def spec(hz: float | None = 50.0, **changes: Any) -> PolicySpec:

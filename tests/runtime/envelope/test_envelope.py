@@ -83,7 +83,18 @@ def fresh(make: Make) -> None:
 def contract(make: Make) -> None:
     """Another shape or dtype is not taken for a command."""
     envelope = at(make, limits=HAND, position=0.05)
-    for wrong in ([0.05], [0.05] * 3, np.zeros((1, 2)), np.array([0, 0]), ["a", 0.0], [True, 0.05], "ab", {0: 1}, 5.0):
+    for wrong in (
+        [0.05],
+        [0.05] * 3,
+        np.zeros((1, 2)),
+        np.array([0, 0]),
+        ["a", 0.0],
+        [True, 0.05],
+        "ab",
+        {0: 1},
+        5.0,
+        [10**400, 0],
+    ):
         result = envelope.step(wrong, elapsed_s=T)
         assert "contract" in result.checks, wrong
         assert result.command == (0.05, 0.05)

@@ -28,6 +28,7 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 from _envelope_attacks import Robot, attack  # noqa: E402
+from _envelope_judge import over_curve  # noqa: E402
 
 from vlatool.runtime.envelope import Box, Envelope, RobotLimits, robot_names  # noqa: E402
 
@@ -86,6 +87,11 @@ def motion(robot: Robot, steps: int, random: np.random.Generator, share: float) 
             ((1, min(-joint.velocity[0], joint.velocity[1])), (2, joint.acceleration), (3, joint.jerk))
         )]  # fmt: skip
         columns.append((low + high) / 2 + wave * share / max(most))
+        while (
+            joint.curve is not None
+            and over_curve(joint.curve, columns[-1], np.diff(columns[-1]) / robot.period / share) > 0
+        ):
+            columns[-1] = (low + high) / 2 + 0.9 * (columns[-1] - (low + high) / 2)
     positions: list[list[float]] = np.column_stack(columns).tolist()
     return positions
 

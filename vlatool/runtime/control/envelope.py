@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import DataError, UsageError
-from vlatool.runtime.envelope import Envelope, StepResult
-from vlatool.runtime.interface import Array, Controller, Origin, origin_of
+from vlatool.runtime.envelope import Envelope, Level, StepResult
+from vlatool.runtime.interface import STOP, Array, Controller, Origin, origin_of
 
 Measurement = str | Callable[[Mapping[str, Any]], Any]
 
@@ -23,7 +23,7 @@ class EnvelopeController:
 
     Args:
         controller: whose actions are bounded.
-        envelope: of the robot.
+        envelope: of the robot. Its ``max_age_s`` is compared with the age that the controller says (``origin.age_ms``).
         position: where the robot is measured to be, in the units of the limits: an entry of the observation, or a
             function of it. None is enough if no joint has position limits, or the envelope was started.
         readings: values for the monitors of the envelope: a function of the observation; None takes the entries of the
@@ -60,9 +60,12 @@ class EnvelopeController:
 
     @property
     def origin(self) -> Origin:
-        """Where the last action of the controller came from, and which checks altered it."""
-        origin = origin_of(self.controller)
-        return origin if self.result is None else origin.altered_by(*self.result.checks)
+        """Where the last action came from, as the controller says it, with the checks that touched it."""
+        origin, result = origin_of(self.controller), self.result
+        if result is None:
+            return origin
+        origin = origin.altered_by(*result.checks)
+        return origin._replace(source=STOP) if result.level >= Level.CRITICAL else origin
 
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step within the envelope.
@@ -78,7 +81,8 @@ class EnvelopeController:
         if not self.envelope.ready:
             self.envelope.start(self._measure(observation))
         action = self.controller.act(observation)
-        return self._step(action, self._values(observation))
+        age = getattr(getattr(self.controller, "origin", None), "age_ms", None)
+        return self._step(action, self._values(observation), None if age is None else age / 1e3)
 
     def stop(self) -> Array:
         """Return the next step of the stop that was proven last: (A,) float64.
@@ -91,9 +95,9 @@ class EnvelopeController:
         """Start a new episode of the controller; the robot is where it is, so the envelope goes on."""
         self.controller.reset(seed)
 
-    def _step(self, action: Any, readings: Mapping[str, Any]) -> Array:
+    def _step(self, action: Any, readings: Mapping[str, Any], age_s: float | None = None) -> Array:
         enabled = None if self._enabled is None else self._enabled()
-        self.result = result = self.envelope.step(action, readings=readings, enabled=enabled)
+        self.result = result = self.envelope.step(action, readings=readings, enabled=enabled, age_s=age_s)
         if isinstance(action, np.ndarray) and action.ndim == 1 and action.tolist() == list(result.command):
             return action
         return np.array(result.command)

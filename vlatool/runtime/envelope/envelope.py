@@ -398,7 +398,10 @@ def _numbers(command: Any, width: int) -> list[float] | None:
         return values
     if not isinstance(command, list | tuple) or len(command) != width or not NUMBERS.issuperset(map(type, command)):
         return None
-    return list(map(float, command))
+    try:
+        return list(map(float, command))
+    except OverflowError:
+        return None
 
 
 def _check_finite(name: str, value: Any, *, optional: bool = False) -> None:
