@@ -306,6 +306,11 @@ class TensorSpec:
         return 2 if later or self.normalisation == "quantile10" else 1
 
     @property
+    def name_in_prompt(self) -> str:
+        """The input that the prompt of this one has in it; empty where it has none."""
+        return self.prompt.state.input if self.prompt is not None and self.prompt.state is not None else ""
+
+    @property
     def frame(self) -> str:
         """Order of the channels of the frames that observations have, empty where they have none."""
         return self.image.frame if self.image else ""
@@ -393,6 +398,7 @@ class PolicySpec:
             if tensor.history:
                 raise SpecError(f"The output '{tensor.name}' has a history.", "leave it out there; it is for inputs")
         self._check_conversions()
+        self._check_prompts()
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
         hz = self.control_hz
@@ -423,6 +429,19 @@ class PolicySpec:
             )
         for step in steps:
             self._check_units(step, self.state_spans(step))
+
+    def _check_prompts(self) -> None:
+        """Refuse prompts that have in them what is no vector of numbers."""
+        known = {tensor.name: tensor for tensor in self.inputs}
+        for tensor in (each for each in self.inputs if each.name_in_prompt):
+            where, state = f"The prompt of '{tensor.name}' has '{tensor.name_in_prompt}' in it", tensor.name_in_prompt
+            if state not in known:
+                raise SpecError(f"{where}, which is not an input; {suggest(state, known)}.")
+            given = known[state]
+            if given.kind != "tensor" or given.image or not given.dtype.startswith("float") or len(given.shape) != 2:
+                raise SpecError(
+                    f"{where}, {given.dtype} {list(given.shape)}; wanted: floats of one moment, [1, WIDTH]."
+                )
 
     def _check_units(self, relative: Conversion, spans: tuple[tuple[Span, Span], ...]) -> None:
         """Refuse a step ``relative`` behind one that changes units which the action and the state have in common."""

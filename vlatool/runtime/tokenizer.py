@@ -25,7 +25,7 @@ Encode = Callable[[str], list[int]]
 
 
 class Tokenizer:
-    """Turns an instruction into ids of fixed width; remembers the last instructions.
+    """Turns an instruction into ids of fixed width; remembers the last prompts.
 
     Args:
         path: ``tokenizer.json`` of the ``tokenizers`` library, or a vocabulary
@@ -64,12 +64,16 @@ class Tokenizer:
                 SAVE,
             )
 
-    def __call__(self, text: str) -> NDArray[np.int64]:
+    def __call__(self, text: str, state: NDArray[Any] | None = None) -> NDArray[np.int64]:
         """Return the ids of ``text``, int64, shape (1, max_tokens).
+
+        Args:
+            state: what the prompt has of another input, where it has something, as the network has it.
 
         Raises:
             DataError: when the library cannot read it, or its prompt is too long: cut, it would ask for nothing.
         """
+        text = text if self.prompt is None else self.prompt.write(text, state)
         known = self._cache.get(text)
         if known is None:
             if len(self._cache) >= self.remembered:
@@ -78,7 +82,6 @@ class Tokenizer:
         return known
 
     def _padded(self, text: str) -> NDArray[np.int64]:
-        text = text if self.prompt is None else self.prompt.write(text)
         check_limit(
             "text_characters",
             len(text) * self._growth,
