@@ -18,9 +18,11 @@ import subprocess
 import sys
 import tarfile
 import textwrap
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import psutil
@@ -846,15 +848,23 @@ def test_a_target_that_answers_nonsense(there, bundle, evil, monkeypatch, progra
 
 
 def test_a_target_that_never_ends_is_cut_off(there, bundle, evil, monkeypatch):
-    monkeypatch.setenv("VLATOOL_LIMITS", "target_seconds=3")
+    monkeypatch.setenv("VLATOOL_LIMITS", "target_seconds=1000")
     evil("""
     until_measuring()
-    for _ in range(60):
-        say('{"agent": "{}"}')
+    for _ in range(300):
+        say(json.dumps({"agent": json.dumps({"progress": {"what": "run", "share": 0.5}})}))
         time.sleep(0.1)
     """)
-    with pytest.raises(TargetError, match="is not done after 3 s, while it measured"):
-        there.measure(bundle)
+    later = 0.0
+
+    def half_an_hour_later(what: str, _share: float | None) -> None:
+        nonlocal later
+        later = 1800.0 if what == "run" else 0.0
+
+    now = time.monotonic
+    monkeypatch.setattr(_connection, "time", SimpleNamespace(monotonic=lambda: now() + later))
+    with pytest.raises(TargetError, match="is not done after 1000 s, while it measured"):
+        there.measure(bundle, tell=half_an_hour_later)
 
 
 def test_nothing_of_a_target_reaches_the_terminal_raw(there, bundle, evil):

@@ -115,12 +115,13 @@ class Model:
     def for_log(self, series: Series) -> Model:
         """Return the model with what is needed in a log of this noise and length.
 
-        What a right episode has for a change because predictions are not exact grows with its rows.
+        What a right episode has for a change because predictions are not exact grows with its rows, and what it has by
+        chance with their root, since residuals hang together over more rows than the regression knows.
         """
         quiet = all(roughness(series, name) <= self.usual.get(name, np.inf) for name in self.signals)
         longer = max(1.0, len(series) / self.rows)
         needed = {
-            name: {kind: MIN_EVIDENCE + longer * (value - MIN_EVIDENCE) for kind, value in each.items()}
+            name: {kind: MIN_EVIDENCE * longer**0.5 + longer * (value - MIN_EVIDENCE) for kind, value in each.items()}
             for name, each in (self.needed if quiet else self.needed_rough).items()
         }
         return replace(self, needed=needed)
