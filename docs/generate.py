@@ -36,8 +36,8 @@ def main() -> None:
         "stages.md": stages_page(),
         "command-line.md": command_line_page(),
         "manifest.md": fields_page("manifest.json", [
-            manifest.Manifest, spec.PolicySpec, spec.TensorSpec, image.Image, image.ImageStep, prompt.Prompt, prompt.StateText,
-            manifest.ProgramStep, manifest.Graph,
+            manifest.Manifest, spec.PolicySpec, spec.TensorSpec, image.Image, image.ImageStep, prompt.Prompt,
+            prompt.StateText, manifest.ProgramStep, manifest.Graph,
         ]),
         "report.md": report_page(),
         "measures.md": measures_page(),

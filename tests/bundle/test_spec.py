@@ -282,3 +282,11 @@ def test_a_spec_needs_its_rate():
 def test_a_step_count_of_a_wrong_type_is_a_spec_error_and_no_traceback():
     with pytest.raises(SpecError):
         PolicySpec.from_dict({**SPECS[0], "execute": "all"})
+
+
+@pytest.mark.parametrize(("name", "got"), [("unit", "1 unit"), ("labels", "1 label")])
+def test_one_of_a_kind_is_singular(name: str, got: str):
+    with pytest.raises(SpecError, match=f"has {got} for a last axis of 2"):
+        TensorSpec("y", (1, 2), **{name: ("m",)})
+    with pytest.raises(SpecError, match=f"has 3 {got[2:]}s for a last axis of 2"):
+        TensorSpec("y", (1, 2), **{name: ("m", "n", "o")})

@@ -189,7 +189,7 @@ def test_another_conversion_of_the_action_shows_in_the_golden_file(tmp_path: Pat
     assert "policy.yaml" in caught.value.fix
 
     def drop(arrays: dict[str, Any]) -> None:
-        del arrays["converted.y"]
+        del arrays["robot_chunk.y"]
 
     assert load(rewritten(bundle, drop).path).golden_conversion_error is None  # as it was before it was recorded
 

@@ -162,7 +162,7 @@ def test_loading_without_warm_up_skips_the_golden_check(float_bundle):
 
 def test_a_machine_that_computes_another_golden_action_is_refused(float_bundle, copied):
     def damaged(name: str, value: np.ndarray) -> np.ndarray:
-        return value * 2 if name.startswith("out.") else value[:0] if name.startswith("converted.") else value
+        return value * 2 if name.startswith("out.") else value[:0] if name.startswith("robot_chunk.") else value
 
     bundle = damage_golden(copied(float_bundle), damaged)
     with pytest.raises(

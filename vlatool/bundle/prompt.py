@@ -13,7 +13,7 @@ from vlatool.errors import SpecError
 from vlatool.files.messages import field_values
 from vlatool.files.validate import finite_number, integer, mapping, short_repr, text
 
-PLACE, STATE_PLACE = "{}", "{state}"
+INSTRUCTION_MARK, STATE_MARK = "{}", "{state}"
 MAX_BINS = 1 << 16
 """Most bins of a state in a prompt: openpi has 256."""
 
@@ -84,7 +84,7 @@ class Prompt:
         state: what of an input is written into the prompt; nothing when None.
     """
 
-    template: str = PLACE
+    template: str = INSTRUCTION_MARK
     lower: bool = False
     last: int | None = None
     strip: bool = False
@@ -93,10 +93,10 @@ class Prompt:
 
     def __post_init__(self) -> None:
         text(self.template, "The template of a prompt", SpecError)
-        for place, what in self._places().items():
-            if self.template.count(place) != 1:
+        for mark, what in self._marks().items():
+            if self.template.count(mark) != 1:
                 raise SpecError(
-                    f"The template of a prompt is {short_repr(self.template)}; it has {place} once, for the {what}."
+                    f"The template of a prompt is {short_repr(self.template)}; it has {mark} once, for the {what}."
                 )
         for name in ("lower", "strip"):
             if not isinstance(getattr(self, name), bool):
@@ -108,8 +108,8 @@ class Prompt:
                 got = f"{short_repr(character)}: {short_repr(other)}"
                 raise SpecError(f"A prompt replaces {got}; wanted: one character, and the text in its place.")
 
-    def _places(self) -> dict[str, str]:
-        return {PLACE: "instruction", **({STATE_PLACE: "state"} if self.state else {})}
+    def _marks(self) -> dict[str, str]:
+        return {INSTRUCTION_MARK: "instruction", **({STATE_MARK: "state"} if self.state else {})}
 
     def write(self, instruction: str, state: NDArray[Any] | None = None) -> str:
         """Return the prompt for an instruction.
@@ -126,16 +126,16 @@ class Prompt:
         """
         if self.state is not None and state is None:
             raise SpecError(f"The prompt has the state '{self.state.input}' in it; none was given.")
-        words = {PLACE: self._cleaned(instruction)}
+        words = {INSTRUCTION_MARK: self._cleaned(instruction)}
         if self.state is not None and state is not None:
-            words[STATE_PLACE] = self.state.write(state)
+            words[STATE_MARK] = self.state.write(state)
         pattern = "|".join(map(re.escape, words))
-        return re.sub(pattern, lambda place: words[place[0]], self.template)
+        return re.sub(pattern, lambda mark: words[mark[0]], self.template)
 
     def _cleaned(self, instruction: str) -> str:
         instruction = instruction.strip() if self.strip else instruction
         instruction = instruction.lower() if self.lower else instruction
-        return instruction.translate(str.maketrans(self.replace)) if self.replace else instruction
+        return instruction.translate({ord(character): other for character, other in self.replace.items()})
 
     def end(self, ids: list[int]) -> list[int]:
         """Return ids that end as the prompt does."""

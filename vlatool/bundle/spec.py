@@ -22,6 +22,7 @@ from vlatool.bundle.prompt import Prompt
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values, to_json
+from vlatool.files.printable import amount
 from vlatool.files.validate import finite_number, integer, path_problem, short_repr, text
 
 DTYPES = (
@@ -151,12 +152,16 @@ class TensorSpec:
         check_limit("elements", self.elements, f"'{self.name}'", SpecError)
         width = self.robot_width
         if self.convert and self.width and width < 1:
-            raise SpecError(f"'{self.name}' has {self.width} elements; its rotations alone have more in the network.")
+            raise SpecError(
+                f"'{self.name}' has {amount(self.width, 'element')}; its rotations alone have more in the network."
+            )
         where = "" if width == self.width else ", as the robot has it"
         for name in ("labels", "unit"):
             value = getattr(self, name)
             if isinstance(value, tuple) and value and len(value) != width:
-                raise SpecError(f"'{self.name}' has {len(value)} {name} for a last axis of {width}{where}.")
+                raise SpecError(
+                    f"'{self.name}' has {amount(len(value), name.removesuffix('s'))} for a last axis of {width}{where}."
+                )
 
     def _check_conversions(self) -> None:
         if not self.convert and not self.parts:
@@ -180,7 +185,7 @@ class TensorSpec:
         marks = [index for index, step in enumerate(self.convert) if step.op == "normalisation"]
         if marks and (len(marks) > 1 or self.normalisation == "none"):
             raise SpecError(
-                f"'{self.name}' has {len(marks)} steps 'normalisation' in convert, and normalisation "
+                f"'{self.name}' has {amount(len(marks), 'step')} 'normalisation' in convert, and normalisation "
                 f"{self.normalisation}; allowed: one, with a normalisation."
             )
         if marks and any(step.op == "relative" for step in self.convert[marks[0] :]):
@@ -431,7 +436,7 @@ class PolicySpec:
             self._check_units(step, self.state_spans(step))
 
     def _check_prompts(self) -> None:
-        """Refuse prompts that have in them what is no vector of numbers."""
+        """Refuse prompts that have in them what is not a vector of numbers."""
         known = {tensor.name: tensor for tensor in self.inputs}
         for tensor in (each for each in self.inputs if each.name_in_prompt):
             where, state = f"The prompt of '{tensor.name}' has '{tensor.name_in_prompt}' in it", tensor.name_in_prompt

@@ -19,7 +19,7 @@ COPY_AGAIN = "copy the bundle again from where it was made, or make it again"
 
 GOLDEN_STEPS = 2
 """Golden observations in a row that a program with kept values needs: the first alone does not show what was kept."""
-CHUNK, CONVERTED = "chunk", "converted"
+CHUNK, ROBOT_CHUNK = "chunk", "robot_chunk"
 """Prefixes of actions in physical units: before they are converted, and as the robot gets them."""
 Array = NDArray[Any]
 Golden = tuple[dict[str, Any], dict[str, Array], Array]
@@ -88,7 +88,7 @@ def golden_chunks(action: TensorSpec, stored: Mapping[str, Array], steps: int, k
     """Return the recorded actions in physical units; none for indices, and where they were not recorded.
 
     Args:
-        kind: ``CHUNK``, before they are converted, or ``CONVERTED``, as the robot gets them.
+        kind: ``CHUNK``, before they are converted, or ``ROBOT_CHUNK``, as the robot gets them.
     """
     chunks = stored.get(f"{kind}.{action.name}")
     if chunks is None or action.kind == "discrete" or not chunks.ndim or chunks.dtype.kind not in "fiu":

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError
+from vlatool.files.printable import amount
 from vlatool.runtime.assets import Assets, asset_path
 from vlatool.runtime.converter import Converter, newest_moment
 from vlatool.runtime.history import History
@@ -213,7 +214,8 @@ def _frame_encoder(tensor: TensorSpec, encode_frame: FrameEncoder) -> Encoder:
         frames = frame[0] if len(frame) == 1 and frame.ndim > len(tensor.observation.shape) - 1 else frame
         if len(frames) != tensor.history:
             raise DataError(
-                f"The input '{tensor.name}' is given as {len(frames)} frames; the policy takes {tensor.history}.",
+                f"The input '{tensor.name}' is given as {amount(len(frames), 'frame')}; the policy takes "
+                f"{tensor.history}.",
                 "give the frame of this moment alone, or those of all moments",
             )
         return np.stack([encode_frame(each) for each in frames], axis=1)
@@ -300,7 +302,11 @@ def all_finite(array: Array) -> bool:
 
 def _not_finite(array: Array) -> str:
     nans = int(np.isnan(array).sum())
-    return f"{nans} NaN of {array.size} values" if nans else f"infinity in {int(np.isinf(array).sum())} of {array.size}"
+    return (
+        f"{nans} NaN of {amount(array.size, 'value')}"
+        if nans
+        else f"infinity in {int(np.isinf(array).sum())} of {array.size}"
+    )
 
 
 def not_finite_text(spec: PolicySpec, observation: Mapping[str, Any]) -> str:
@@ -320,4 +326,4 @@ def _texts(spec: PolicySpec, observation: Mapping[str, Any]) -> Iterator[str]:
         counts = {"NaN": np.isnan(array).sum(), "inf": (array == math.inf).sum(), "-inf": (array == -math.inf).sum()}
         parts = [f"{count} {name}" for name, count in counts.items() if count]
         if parts:
-            yield f"{' and '.join(parts)} in the {array.size} values of '{tensor.name}'"
+            yield f"{' and '.join(parts)} in the {amount(array.size, 'value')} of '{tensor.name}'"

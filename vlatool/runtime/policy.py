@@ -25,8 +25,8 @@ from vlatool.runtime.converter import newest_moment
 from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
 from vlatool.runtime.golden import (
-    CONVERTED,
     GOLDEN_STEPS,
+    ROBOT_CHUNK,
     Golden,
     conversion_error,
     golden_arrays,
@@ -294,7 +294,7 @@ class BundlePolicy:
             self.limit_s = limit
         self.reset()
         self.golden_error, self.golden_chunk_error = _worst(errors), _worst(of_chunks)
-        converted = golden_chunks(self.spec.action, stored, len(steps), CONVERTED)
+        converted = golden_chunks(self.spec.action, stored, len(steps), ROBOT_CHUNK)
         self.golden_conversion_error = _worst(
             conversion_error(self._converted(step), expected)
             for step, expected in zip(steps, converted, strict=False)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import STATISTICS_OF, TensorSpec
 from vlatool.errors import SpecError, suggest
 from vlatool.files.json import read_json
+from vlatool.files.printable import amount
 from vlatool.runtime.assets import Assets, asset_path, read_asset
 
 Array = NDArray[np.float32]
@@ -135,8 +136,8 @@ def _checked(values: object, tensor: TensorSpec, where: str) -> Array:
         ) from error
     if row.shape != (tensor.width,):
         raise SpecError(
-            f"{where} has the shape {list(row.shape)}; '{tensor.name}' has {tensor.width} elements.",
-            f"store one number for each of the {tensor.width} elements",
+            f"{where} has the shape {list(row.shape)}; '{tensor.name}' has {amount(tensor.width, 'element')}.",
+            f"store {amount(tensor.width, 'number')}, one for each element",
         )
     if not np.all(np.isfinite(row)):
         raise SpecError(

@@ -15,6 +15,7 @@ from vlatool.bundle.prompt import Prompt
 from vlatool.errors import DataError, SpecError, VlatoolError, require
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit
+from vlatool.files.printable import amount
 from vlatool.runtime.assets import Assets, asset_path, read_asset
 from vlatool.runtime.token_growth import growth
 
@@ -93,12 +94,12 @@ class Tokenizer:
             ids = self.prompt.end(ids)
         if len(ids) > self.max_tokens and self.prompt is not None:
             raise DataError(
-                f"The {self.name} makes a prompt of {len(ids)} tokens; the policy takes {self.max_tokens}.",
+                f"The {self.name} makes a prompt of {amount(len(ids), 'token')}; the policy takes {self.max_tokens}.",
                 "say it in fewer words",
             )
         if len(ids) > self.max_tokens:
             warnings.warn(
-                f"the {self.name} has {len(ids)} tokens; the last {len(ids) - self.max_tokens} are cut",
+                f"the {self.name} has {amount(len(ids), 'token')}; the last {len(ids) - self.max_tokens} are cut",
                 stacklevel=4,
             )
         row = np.full((1, self.max_tokens), self.pad, np.int64)
