@@ -8,6 +8,7 @@ number of control steps that an inference takes.
 from __future__ import annotations
 
 import inspect
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +17,22 @@ from vlatool.errors import PluginError, UsageError
 from vlatool.runtime.interface import Controller, Policy
 
 KIND, DEFAULT_PLAYER, PLAYER_WITH_DELAY = "control", "chunked", "late"
+RANKS = {"deadline": 1, "fallback": 3, "envelope": 5}
+"""Entry -> its place between others: policy wrappers are 0, a player 2, controller wrappers 4."""
+OUTSIDE = {
+    1: "the deadline does not limit the time of what is outside of it",
+    2: "a wrapper of a policy needs a policy, and a player is a controller",
+    3: "a wrapper of a policy, a player and a deadline have to be inside of the fallback, which answers for them",
+    4: "the actions of a fallback would pass by the wrapper inside of it",
+    5: "it would change an action after the envelope has checked it",
+}
+"""Place of a layer -> why nothing that belongs further inside may be around it."""
+SINGLE = {
+    1: "there is one deadline for an action",
+    2: "one player plays the chunks of the policy",
+    3: "one fallback answers for the policy",
+    5: "an action is checked once, by what moves the robot last",
+}
 
 
 def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
@@ -37,7 +54,24 @@ def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
     if delayed and not _takes(entries[player], "delay"):
         raise UsageError(f"The controller {player} waits for each inference: its actions cannot come late.",
                          f"use {PLAYER_WITH_DELAY}, or leave the latency out")  # fmt: skip
-    return sorted(entries.values(), key=_layer)
+    return check_order(sorted(entries.values(), key=_layer))
+
+
+def check_order(entries: Sequence[type]) -> list[type]:
+    """Return layers around a policy, the innermost first, if their order makes sense.
+
+    Raises:
+        UsageError: when one would not do what it is for: it says which, and why.
+    """
+    order = list(entries)
+    for inner, outer in itertools.combinations(order, 2):
+        ranks = _rank(inner), _rank(outer)
+        if ranks[0] > ranks[1] or (ranks[0] == ranks[1] and ranks[0] in SINGLE):
+            reason = SINGLE[ranks[1]] if ranks[0] == ranks[1] else OUTSIDE[ranks[0]]
+            raise UsageError(f"{outer.__name__} cannot be around {inner.__name__}: {reason}.",
+                             "name each once; from the inside: wrappers of the policy, deadline, the player, fallback, "
+                             "wrappers of the controller, envelope")  # fmt: skip
+    return order
 
 
 def build_controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) -> Controller:
@@ -51,18 +85,33 @@ def build_controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) 
         UsageError: as ``layers`` does.
         PluginError: when an entry lacks a method of the protocols.
     """
-    made: Any = policy
+    acting: Any = policy
     for entry in layers(names, delayed=delay > 0):
-        made = entry(made, delay=delay) if delay and _takes(entry, "delay") else entry(made)
-        if not isinstance(made, Controller if _layer(entry) else Policy):
-            raise PluginError(f"{entry.__name__}, an entry of vlatool.{KIND}, lacks methods or properties.",
-                              "give it those of a protocol in vlatool/runtime/interface.py")  # fmt: skip
-    return made  # type: ignore[no-any-return]
+        acting = build_layer(entry, acting, delay)
+    return acting  # type: ignore[no-any-return]
+
+
+def build_layer(entry: type, inner: Any, delay: int = 0) -> Any:
+    """Return a layer around another, with the delay if it takes one; raises PluginError as ``build_controller``."""
+    layer = entry(inner, delay=delay) if delay and takes_delay(entry) else entry(inner)
+    if not isinstance(layer, Controller if _layer(entry) else Policy):
+        raise PluginError(f"{entry.__name__}, an entry of vlatool.{KIND}, lacks methods or properties.",
+                          "give it those of a protocol in vlatool/runtime/interface.py")  # fmt: skip
+    return layer
+
+
+def takes_delay(entry: type) -> bool:
+    """Return whether a controller acts while its policy infers."""
+    return _takes(entry, "delay")
 
 
 def _layer(entry: type) -> int:
     """Return 0 for a policy wrapper, 1 for a player of a policy, 2 for a controller wrapper."""
     return hasattr(entry, "act") * (1 + (not _takes(entry, "policy")))
+
+
+def _rank(entry: type) -> int:
+    return RANKS.get(registry.entry_of(entry).rpartition(".")[2], 2 * _layer(entry))
 
 
 def _takes(entry: type, parameter: str) -> bool:
