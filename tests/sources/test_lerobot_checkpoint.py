@@ -183,8 +183,8 @@ def pi05(files: dict[str, Any], **config: Any) -> None:
     instruct("pi05")(files)
     steps = files["policy_preprocessor.json"]["steps"]
     del steps[2]
-    steps[3:3] = [{"registry_name": STATE_IN_PROMPT, "config": {"max_state_dim": 32, "task_key": "task", **config}}]
-    steps.append(steps.pop(2))  # the tokenizer
+    prompt = {"registry_name": STATE_IN_PROMPT, "config": {"max_state_dim": 32, "task_key": "task", **config}}
+    steps += [prompt, steps.pop(2)]
 
 
 def lerobot_prompt(task: str, state: np.ndarray) -> str:
@@ -220,7 +220,7 @@ def test_another_prompt_of_another_lerobot_is_refused(tmp_path: Path) -> None:
     said = {"versions": {"lerobot": "0.4.0"}, "prompts": [("a", state, lerobot_prompt("a", np.float32(state)))]}
     directory._check_prompts(checkpoint, said)
     said["prompts"] = [("a", state, lerobot_prompt("a", np.float32([*state, 0, 0])))]
-    with pytest.raises(SourceError, match=r"LeRobot 0\.4\.0 makes another prompt of 'a'.*160 -1 255 128 128"):
+    with pytest.raises(SourceError, match=r"LeRobot 0\.4\.0 makes another prompt of 'a'.*160 0 255 128 128"):
         directory._check_prompts(checkpoint, said)
 
 
@@ -232,7 +232,7 @@ def without_state(files: dict[str, Any]) -> None:
 def before_its_statistics(files: dict[str, Any]) -> None:
     pi05(files)
     steps = files["policy_preprocessor.json"]["steps"]
-    steps.insert(1, steps.pop(3))
+    steps.insert(1, steps.pop(-2))
 
 
 @pytest.mark.parametrize(("edit", "words"), [
