@@ -22,8 +22,6 @@ from vlatool.runtime import load
 from vlatool.runtime.interface import Action, Array, Policy
 
 MAX_EVENTS = 100
-HANG_MS, HANG_TIMES = 1000.0, 10.0
-"""An inference on trial is stopped after ``HANG_TIMES`` its limit, and not before ``HANG_MS``."""
 
 
 @dataclass
@@ -243,8 +241,6 @@ class SlotPolicy:
         if trial is not None:
             running.trial, running.judge = trial, Judge(policy.spec, trial.latency_ms, trial.memory_mb)
             running.standby = self._standby_of(pointer)
-            if hasattr(policy, "limit_s") and trial.latency_ms:
-                policy.limit_s = max(HANG_MS, HANG_TIMES * trial.latency_ms) / 1e3
         return running
 
     def _standby_of(self, pointer: Pointer) -> _Running | None:
@@ -355,8 +351,6 @@ class SlotPolicy:
             return
         spare, running.standby = running.standby, None
         running.judge = running.trial = None
-        if hasattr(running.policy, "limit_s"):
-            running.policy.limit_s = None
         self._note(f"committed {running.slot.bundle[:19]} after {judge.count} inferences")
         self._later(lambda: self._write_commit(running.slot, spare))
 

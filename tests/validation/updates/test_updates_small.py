@@ -17,7 +17,7 @@ def test_no_kill_breaks_the_active_slot_and_kills_in_place_do(tmp_path):
 
 
 def test_no_power_cut_breaks_the_active_slot_and_without_flushes_it_does(tmp_path):
-    each = small_or_full(6, 1)
+    each = small_or_full(15, 1)
     bundles = [bundle_of(tmp_path / f"bundle {value}", value) for value in (1, 2, 3)]
     before, change = cases(bundles)["deployment into an empty slot"]
     recorder = recorded(tmp_path / "store", bundles, before, change)

@@ -6,14 +6,19 @@ Records the calls (open, write, fsync, rename, unlink, mkdir, rmdir) of a first 
 into a full slot, of a start, a commit and a rollback, and makes what a cut after each of them may leave (``_disk.py``).
 In each state the active bundle must be whole and the old or the new one, and an update must go through again. Two
 controls show that the states are not harmless: the same calls without their flushes, and files copied in place.
+With --strace the record is held against what strace sees of the same process.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import shutil
+import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,6 +33,9 @@ from vlatool.deployment.store import Store
 from vlatool.errors import VlatoolError
 from vlatool.files.durable import sync_folder, write_file
 
+MARKS = ("/no such file: begin", "/no such file: end")
+SYSTEM_CALLS = {"write": "write", "fsync": "fsync", "rename": "rename", "unlink": "remove", "rmdir": "remove",
+                "mkdir": "mkdir"}  # fmt: skip
 AGAIN_EACH = 25
 """States of which one is updated again."""
 
@@ -115,17 +123,62 @@ def write_in_place(path: Path, content: bytes) -> None:
     sync_folder(path.parent)
 
 
+def counted(recorder: Recorder) -> dict[str, int]:
+    """Return how many calls of each kind were recorded."""
+    kinds = Counter("fsync" if isinstance(step, int) else step.kind for step in recorder.steps)
+    return dict(sorted(kinds.items()))
+
+
+def traced(folder: Path) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the calls that a process records of a deployment, and those that strace sees of it."""
+    words = [sys.executable, __file__, "--record", str(folder / "traced")]
+    log = folder / "strace.txt"
+    done = subprocess.run(["strace", "-f", "-y", "-o", log, *words], capture_output=True, text=True, check=True)
+    lines = log.read_text().splitlines()
+    first, last = (next(at for at, line in enumerate(lines) if mark in line) for mark in MARKS)
+    kinds: Counter[str] = Counter()
+    for line in lines[first:last]:
+        name = line.split("(")[0].split()[-1]
+        kind = SYSTEM_CALLS.get(name, "create" if name == "openat" and "O_CREAT" in line else "")
+        if str(folder / "traced/store") in line and " = -1 " not in line and kind:
+            kinds[kind] += 1
+    return json.loads(done.stdout), dict(sorted(kinds.items()))
+
+
+def record(folder: Path) -> None:
+    """Record a deployment into a full slot, between two calls that show in a trace, and print what was recorded."""
+    folder.mkdir()
+    bundles = [bundle_of(folder / f"bundle {value}", value) for value in (1, 2, 3)]
+    before, change = cases(bundles)["deployment into a full slot"]
+
+    def marked(store: Store) -> None:
+        os.path.exists(MARKS[0])
+        change(store)
+        os.path.exists(MARKS[1])
+
+    print(json.dumps(counted(recorded(folder / "store", bundles, before, marked))))
+
+
 def main() -> int:
     """Print a line for each case; 1 when an active slot is broken, or a control is not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--strace", action="store_true")
+    parser.add_argument("--record", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
+    if given.record is not None:
+        record(given.record)
+        return 0
     failed = False
     shared = "/dev/shm" if Path("/dev/shm").is_dir() else None
     with tempfile.TemporaryDirectory(dir=shared) as name:
         folder = Path(name)
         bundles = [bundle_of(folder / f"bundle {value}", value) for value in (1, 2, 3)]
+        if given.strace:
+            ours, theirs = traced(folder)
+            print(f"recorded {ours}; strace {theirs}")
+            failed |= ours != theirs
         for number, (case, (before, change)) in enumerate(cases(bundles).items()):
             recorder = recorded(folder / f"store {number}", bundles, before, change)
             first = before == 0
