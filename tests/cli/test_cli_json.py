@@ -20,6 +20,7 @@ import typer
 from _acts import POLICY_YAML, policy
 from _arithmetic import computes_bfloat16
 from _flow import write_flow
+from _full import small_or_full
 from _slots import bundle_of, install
 from safetensors.torch import load_file, save_file
 
@@ -374,7 +375,8 @@ def test_the_end_of_the_process_adds_nothing(places) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "kind", "status"), [(signal.SIGINT, "Interrupted", 130), (signal.SIGTERM, "Terminated", 143)]
+    ("number", "kind", "status"),
+    [*small_or_full([], [(signal.SIGINT, "Interrupted", 130)]), (signal.SIGTERM, "Terminated", 143)],
 )
 def test_a_signal_is_a_document(tmp_path, number, kind: str, status: int) -> None:
     mark, mine = tmp_path / "hangs", tmp_path / "mine"
