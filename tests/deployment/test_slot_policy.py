@@ -14,7 +14,7 @@ from vlatool.deployment.judge import LATE_SHARE, MEMORY_PERIOD, MIN_LATE, Judge
 from vlatool.deployment.pointer import FILES
 from vlatool.deployment.slot_policy import SlotPolicy
 from vlatool.deployment.store import MAX_STARTS, Store
-from vlatool.errors import DataError, DeploymentError, GraphError
+from vlatool.errors import DataError, DeploymentError, GraphError, UsageError
 from vlatool.runtime import ChunkQueue
 from vlatool.runtime.interface import Action, Policy
 
@@ -223,6 +223,12 @@ def test_when_neither_slot_loads_the_error_is_that_of_the_active_one(store, bund
         (store.folder(name) / "graphs/main.onnx").write_bytes(name.encode())
     with pytest.raises(Exception, match=f"{store.read().active}/graphs/main.onnx"):
         SlotPolicy(store)
+
+
+def test_what_is_not_a_policy_is_refused_and_nothing_is_rolled_back(store, bundles):
+    with pytest.raises(UsageError, match="does not infer"):
+        SlotPolicy(store, open_policy=lambda path: path)
+    assert active(store, bundles) == (2, True)
 
 
 def test_an_empty_store_is_refused(tmp_path):

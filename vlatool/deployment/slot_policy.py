@@ -235,6 +235,11 @@ class SlotPolicy:
         slot = pointer.slots[name]
         bundle = open_slot(self.store, name, slot)
         policy = self._open(bundle.path)
+        if not isinstance(policy, Policy):
+            raise UsageError(
+                f"{type(policy).__name__} does not infer; a slot is opened as a policy.",
+                "leave out deadline_ms, fallback, envelope and controllers here, and wrap the SlotPolicy in them",
+            )
         check_same(getattr(policy, "bundle", bundle), slot)
         running = _Running(policy, name, slot)
         trial = pointer.trial
