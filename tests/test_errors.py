@@ -23,6 +23,8 @@ EXIT_CODES = {
     "OutputError": 3,
     "TargetError": 3,
     "InstallationError": 3,
+    "DeploymentError": 3,
+    "SignatureError": 3,
     "PluginError": 3,
     "MissingExtra": 4,
     "GateFailed": 1,

@@ -13,6 +13,8 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── RecipeError              a recipe or stage options
 │   ├── OutputError              the output: exists already, read-only, disk full
 │   ├── TargetError              the machine to run on: unreachable, or the run ends early
+│   ├── DeploymentError          a store of deployed bundles: unreadable, busy, an older release
+│   ├── SignatureError           a signature of a bundle: missing, damaged, of another key
 │   ├── InstallationError        two distributions of vlatool in one environment
 │   └── PluginError              another package that adds something to vlatool
 ├── MissingExtra              4  an optional dependency is missing; names the extra
@@ -128,6 +130,14 @@ class OutputError(InputError):
 
 class TargetError(InputError):
     """The machine to run on cannot be reached or used, or the run there ends early."""
+
+
+class DeploymentError(InputError):
+    """A store of deployed bundles is unreadable or busy, or what is asked of it would undo a newer release."""
+
+
+class SignatureError(InputError):
+    """The signature of a bundle, or a key, is missing, damaged, or not the one that is trusted."""
 
 
 class InstallationError(InputError):

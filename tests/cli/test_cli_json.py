@@ -21,10 +21,13 @@ from _acts import POLICY_YAML, policy
 from _arithmetic import computes_bfloat16
 from _flow import write_flow
 from _full import small_or_full
+from _slots import bundle_of, install
 from safetensors.torch import load_file, save_file
 
 from vlatool.cli import app, main
 from vlatool.cli._document import document, output, report_document
+from vlatool.deployment.signature import new_key, sign
+from vlatool.deployment.store import Store
 from vlatool.errors import OutputError
 from vlatool.machine.host import isa
 from vlatool.machine.instruction_sets import saturates
@@ -78,6 +81,11 @@ LINES = {
     "verify": "{policy} --against {original}:act",
     "inspect": "{bundle} --probe",
     "rebuild": "{bundle} --check --source {policy}",
+    "deploy": "{toy} --store {out} --runs 32",
+    "status": "--store {store}",
+    "rollback": "--store {store}",
+    "sign": "{toy} --key {key} --force",
+    "verify-signature": "{toy} --key {key}.pub",
     "doctor": "",
     "run": "{bundle} --dry-run --steps 20",
     "simulate": "{policy} --profile raspberry-pi-5",
@@ -158,7 +166,17 @@ def places(policy_template, tmp_path_factory) -> SimpleNamespace:
         "original": here / "original.py",
         "gate": here / "gate.yaml",
     }
-    return SimpleNamespace(policy=noisy, **made, here=here)
+    return SimpleNamespace(policy=noisy, **made, **deployed(here), here=here)
+
+
+def deployed(here: Path) -> dict[str, Path]:
+    """Make a bundle that is signed, the key, and a store with a bundle to go back to."""
+    toys = [bundle_of(here / f"toy {value}", value) for value in (1, 2)]
+    for toy in toys:
+        install(Store(here / "store"), toy, trial=None)
+    new_key(here / "key")
+    sign(toys[0], here / "key", 1)
+    return {"toy": toys[0].path.rename(here / "toy"), "key": here / "key", "store": here / "store"}
 
 
 def deeper(policy: Path, folder: Path) -> Path:
@@ -250,6 +268,11 @@ BAD = {
     "inspect": "{nothing}",
     "rebuild": "{nothing} --check",
     "run": "{nothing} --dry-run",
+    "deploy": "{nothing} --store {out}",
+    "status": "--store {nothing}",
+    "rollback": "--store {nothing}",
+    "sign": "{nothing} --key {nothing}",
+    "verify-signature": "{nothing} --key {nothing}",
     "simulate": "{nothing} --profile raspberry-pi-5",
     "telemetry": "--root {nothing}",
     "profiles show": "no-board",

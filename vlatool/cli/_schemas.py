@@ -43,6 +43,11 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "data sample": ("written",),
     "verify": ("report",),
     "inspect": ("manifest", "sensitivity"),
+    "deploy": ("deployment",),
+    "rollback": ("store",),
+    "status": ("store",),
+    "sign": ("signature", "key"),
+    "verify-signature": ("signature",),
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
     "run": ("dry_run",),
@@ -95,6 +100,16 @@ PHASE = record(name=TEXT, runs=INTEGER, ms=NUMBER, shares=by_name(NUMBER), parts
 SHIFT = record(recorded=TEXT, installed=TEXT)
 GAUGE = record(unit=TEXT, min=NUMBER, mean=NUMBER, max=NUMBER, times=many(NUMBER), values=many(NUMBER), note=TEXT)
 COUNTER = record(unit=TEXT, difference=NUMBER, seconds=NUMBER, note=TEXT)
+SLOT = record(
+    bundle=TEXT, identity=TEXT, name=TEXT, version=TEXT, release=INTEGER, key=TEXT, problem=TEXT,
+)  # fmt: skip
+TRIAL = record(ticks=INTEGER, seconds=NUMBER, latency_ms=NUMBER, memory_mb=NUMBER, starts=INTEGER)
+STORE: dict[str, Schema] = {
+    "store": TEXT, "active": TEXT, "slots": by_name(SLOT), "change": INTEGER,
+    "trial": {"anyOf": [TRIAL, {"type": "null"}]}, "highest_release": INTEGER, "highest_version": TEXT,
+    "required_keys": many(TEXT), "last_rollback": TEXT,
+}  # fmt: skip
+SHADOW = record(runs=INTEGER, p50_ms=NUMBER, p95_ms=NUMBER, worst_ms=NUMBER, growth_mb=NUMBER, violation=TEXT)
 CACHE: dict[str, Schema] = {"cache": TEXT, "bytes": INTEGER, "shared_bytes": INTEGER, "unknown": many(TEXT)}
 RAW = record(omitted={"type": "integer", "minimum": 1}, file={"type": ["string", "null"]}, fix=TEXT)
 
@@ -114,6 +129,7 @@ def definitions(report: Schema) -> dict[str, Schema]:
         "profile": {**_inlined(Profile.model_json_schema(mode="serialization")), "description": "A hardware profile."},
         **_documents_of_bundles(),
         **_documents_of_stores(),
+        **_documents_of_deployment(),
         **_documents_of_machines(),
     }
 
@@ -182,6 +198,18 @@ def _documents_of_stores() -> dict[str, Schema]:
                 constant=many(INTEGER), drift_ms=NUMBER)),
             gaps=many(record(episode=INTEGER, step=INTEGER, seconds=NUMBER)), gap_count=INTEGER, findings=many(TEXT),
         ),
+    }  # fmt: skip
+
+
+def _documents_of_deployment() -> dict[str, Schema]:
+    """Return the documents on what is deployed, and on signatures."""
+    return {
+        "store": document("What is deployed; problem: what is wrong with the files of a slot.", **STORE),
+        "deployment": document("What is deployed, and how the new bundle answered in its shadow run.", **STORE,
+                               shadow=SHADOW),
+        "signature": document("A signature of a bundle.", path=TEXT, schema=INTEGER, bundle=TEXT, release=INTEGER,
+                              key=TEXT, signature=TEXT),
+        "key": document("A key that was made.", private=TEXT, public=TEXT, key=TEXT),
     }  # fmt: skip
 
 

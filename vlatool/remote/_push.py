@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 import re
 import tarfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle, digest_of, manifest_bytes
-from vlatool.errors import BundleError
+from vlatool.deployment.signature import SIGNATURE
+from vlatool.errors import BundleError, DataError
 from vlatool.files.verified_read import COPY_AGAIN
 
 PIECE = 8 << 20
@@ -87,9 +89,12 @@ class Payload:
         yield _tar(pieces), size
 
 
-def payload_of(bundles: Sequence[Bundle], package: Path, further: Iterable[Path] = ()) -> Payload:
-    """Return what to push: each bundle once, by its content hash, after the package and further single modules."""
+def payload_of(
+    bundles: Sequence[Bundle], package: Path, further: Iterable[Path] = (), files: Mapping[str, Path] | None = None
+) -> Payload:
+    """Return what to push: each bundle once, by its content hash, after the package, single modules and other files."""
     items = {item.name: item for item in _package(package)}
+    items |= {name: _file(name, path) for name, path in (files or {}).items()}
     items |= {f"package/{path.name}": Item(f"package/{path.name}", path.stat().st_size, path) for path in further}
     folders: dict[str, str] = {}
     for bundle in bundles:
@@ -121,9 +126,18 @@ def _bundle(bundle: Bundle, folder: str) -> Iterator[Item]:
         if path.stat().st_size != record.bytes:
             raise BundleError(f"{path} has {path.stat().st_size} bytes; the manifest says {record.bytes}.", COPY_AGAIN)
         yield Item(f"{folder}/{name}", record.bytes, path, sha256=record.sha256)
+    if os.path.lexists(bundle.path / SIGNATURE):
+        yield _file(f"{folder}/{SIGNATURE}", bundle.path / SIGNATURE)
     content = manifest_bytes(bundle.manifest)
     for name, text in ((MANIFEST, content), (DIGEST, digest_of(content))):
         yield Item(f"{folder}/{name}", len(text), content=text)
+
+
+def _file(name: str, path: Path) -> Item:
+    """Return a file that no manifest records."""
+    if path.is_symlink() or not path.is_file():
+        raise DataError(f"{path} is missing, or not a regular file.", "name a file")
+    return Item(name, path.stat().st_size, path)
 
 
 def _tar(pieces: Sequence[tuple[str, bytes]]) -> bytes:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from vlatool.remote._validate_replies import AgentExit, DiskFull, Python, invali
 from vlatool.stage.base import OnProgress
 
 AGENT = "vlatool.measurement.agent"
+"""Module that runs a benchmark on the target."""
 PACKAGE = Path(vlatool.__file__).parent
 FURTHER_MODULES: tuple[Path, ...] = ()
 """Single modules that are pushed beside the package."""
@@ -68,11 +70,47 @@ def measure_on(
         OutputError: when the target's disk is full or read-only.
         VlatoolError: what the agent raises, of the same class.
     """
+    return run_on(Task(AGENT), target, job, bundles, tell, python=python, ssh_options=ssh_options,
+                  connect_timeout_s=connect_timeout_s)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Task:
+    """What runs on the target.
+
+    Args:
+        module: module of vlatool, run as ``python -m``; it reads a job and answers as ``vlatool.measurement.child``.
+        name: its name in messages.
+        doing: when it runs, as the end of a sentence.
+        packages: packages that it needs beside numpy and the engine of the bundles.
+        files: path below the directory of the run -> file to send beside the bundles.
+    """
+
+    module: str
+    name: str = "benchmark"
+    doing: str = "while it measured"
+    packages: tuple[str, ...] = ()
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+
+def run_on(
+    task: Task,
+    target: str,
+    job: Mapping[str, Any],
+    bundles: Sequence[Path],
+    tell: OnProgress,
+    *,
+    python: str = "",
+    ssh_options: Sequence[str] = (),
+    connect_timeout_s: float = 15,
+) -> dict[str, Any]:
+    """Run a task on another machine and return its result, as ``measure_on`` does."""
     _check(target, python)
     opened = [Bundle.open(path, verify=False) for path in bundles]
     engine = str(job.get("engine") or "")
-    packages = _probe.packages_of([engine] if engine else [bundle.manifest.engine for bundle in opened] or [""])
-    load = _push.payload_of(opened, PACKAGE, FURTHER_MODULES)
+    engines = [engine] if engine else [bundle.manifest.engine for bundle in opened] or [""]
+    packages = (*_probe.packages_of(engines), *task.packages)
+    load = _push.payload_of(opened, PACKAGE, FURTHER_MODULES, task.files)
     tell(f"connecting to {target}", None)
     connection = Connection(target, ssh_options, connect_timeout_s)
     connection.allow(float(job.get("duration") or 0))
@@ -81,10 +119,10 @@ def measure_on(
         there = _find_python(connection, target, python, packages, connect_timeout_s)
         tell(_about(target, there), None)
         directory = _send(connection, target, load, tell)
-        connection.doing = "while it measured"
+        connection.doing = task.doing
         paths = {f"{directory}/{name}": str(path) for name, path in zip(load.bundles, bundles, strict=True)}
-        connection.tell({"module": AGENT, "job": {**job, "bundles": []}, "bundles": load.bundles})
-        result = _follow(connection, target, paths, tell)
+        connection.tell({"module": task.module, "job": {**job, "bundles": []}, "bundles": load.bundles})
+        result = _follow(connection, target, task.name, paths, tell)
     finally:
         connection.dispose()
     known = {name: getattr(there, name) for name in ("architecture", "kernel", "packages")}
@@ -169,10 +207,12 @@ def _target_error(target: str, answer: Mapping[str, Any]) -> VlatoolError:
         return OutputError(f"The disk of {target} became full: {text}.", "free some space there")
     if word == "corrupt":
         return TargetError(f"What was sent to {target} did not arrive whole: {text}.", "run it again")
-    return TargetError(f"{target} could not run the benchmark: {text or one_line(str(answer))}.", RUN_AGAIN)
+    return TargetError(f"{target} could not run what was sent: {text or one_line(str(answer))}.", RUN_AGAIN)
 
 
-def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell: OnProgress) -> dict[str, Any]:
+def _follow(
+    connection: Connection, target: str, name: str, paths: Mapping[str, str], tell: OnProgress
+) -> dict[str, Any]:
     """Pass on what the agent tells until it has ended, and return its result."""
     answer: Result | Raised | None = None
     while True:
@@ -191,10 +231,10 @@ def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell:
                 tell(f"{target} could not remove {one_line(str(heard['left']))}", None)
             if "refused" in heard:
                 raise _target_error(target, heard)
-            return _result(target, answer, read(AgentExit, heard["ended"], target, "ended"))
+            return _result(target, name, answer, read(AgentExit, heard["ended"], target, "ended"))
 
 
-def _result(target: str, answer: Result | Raised | None, ended: AgentExit) -> dict[str, Any]:
+def _result(target: str, name: str, answer: Result | Raised | None, ended: AgentExit) -> dict[str, Any]:
     """Return the agent's result, or raise what it raised or why there is none."""
     if isinstance(answer, Raised):
         raise error_of(answer, otherwise=TargetError)
@@ -203,14 +243,14 @@ def _result(target: str, answer: Result | Raised | None, ended: AgentExit) -> di
     last = last[-LOG_CHARACTERS:]
     if code == -signal.SIGKILL:
         raise TargetError(
-            f"The benchmark on {target} was killed (SIGKILL), as it is when memory runs out; its last line: {last}",
+            f"The {name} on {target} was killed (SIGKILL), as it is when memory runs out; its last line: {last}",
             f"look for it with: ssh {target} dmesg; free memory there, or choose a smaller bundle",
         )
     if code < 0:
-        raise TargetError(f"The benchmark on {target} was ended by {signal_name(code)}; its last line: {last}", CRASHES)
+        raise TargetError(f"The {name} on {target} was ended by {signal_name(code)}; its last line: {last}", CRASHES)
     if code or answer is None or not isinstance(answer.value, dict):
         raise TargetError(
-            f"The benchmark on {target} ended with code {code} and without a result; its last line: {last}",
-            "run it on the target itself to see more: vlatool benchmark latency BUNDLE",
+            f"The {name} on {target} ended with code {code} and without a result; its last line: {last}",
+            f"run the {name} on the target itself to see more",
         )
     return {**answer.value, "log": f"{log}{answer.value.get('log', '')}"}

@@ -13,9 +13,10 @@ import resource
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from vlatool import errors
 from vlatool.bundle.bundle import Bundle
@@ -39,6 +40,10 @@ class Job:
     threads: int | None
     first_run_s: float
     memory_mb: float
+    seconds: float
+
+
+T = TypeVar("T", bound=Job)
 
 
 def probe(
@@ -68,27 +73,42 @@ def probe(
         VlatoolError: what the bundle raises, of the same class.
     """
     allowed = allowed_mb(Bundle.open(path, verify=False).manifest, memory_mb)
-    job = Job(path, engine, threads, first_run_s, allowed)
+    job = Job(path, engine, threads, first_run_s, allowed, START_S + first_run_s)
+    return {"memory_mb": allowed, **ask(CHILD, job)}
+
+
+def ask(code: str, job: Job) -> dict[str, Any]:
+    """Run code, which calls ``respond``, in a fresh process under the limits of a job, and return what it answers.
+
+    Raises:
+        GraphError: when the process is ended by a limit or a signal; says how to raise the limit.
+        VlatoolError: what the code raises, of the same class.
+    """
     try:
         done = subprocess.run(
-            python_code(CHILD), input=json.dumps(to_json(job)), timeout=START_S + first_run_s,
+            python_code(code), input=json.dumps(to_json(job)), timeout=job.seconds,
             capture_output=True, text=True, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        raise _too_long(path, START_S + first_run_s) from None
-    return {"memory_mb": allowed, **_answer(path, done, allowed)}
+        raise _too_long(job.path, job.seconds) from None
+    return _answer(job.path, done, job.memory_mb)
 
 
 def main() -> None:
     """Answer one question: the child's side."""
-    job = from_json(Job, json.loads(sys.stdin.readline()))
+    respond(Job, _run)
+
+
+def respond(kind: type[T], run: Callable[[T], dict[str, Any]]) -> None:
+    """Run the job on standard input under its limits, and print the answer."""
+    job = from_json(kind, json.loads(sys.stdin.readline()))
     size = int(job.memory_mb * 1e6)
     resource.setrlimit(resource.RLIMIT_DATA, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    seconds = math.ceil((START_S + job.first_run_s) * len(os.sched_getaffinity(0)))
+    seconds = math.ceil(job.seconds * len(os.sched_getaffinity(0)))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))  # should the parent not live to end this process
     try:
-        answer = _run(job)
+        answer = run(job)
     except VlatoolError as error:
         answer = {"error": type(error).__name__, "message": error.message, "fix": error.fix}
     except MemoryError:
