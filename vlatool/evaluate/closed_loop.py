@@ -99,8 +99,9 @@ class ClosedLoop(Measure):
     )
     controller: tuple[str, ...] = Field(
         (),
-        description="controller that plays the chunks, and wrappers: chunked, late, or those of other packages, such "
-        "as smooth,late; when not given, late with --latency-in-the-loop, and chunked without",
+        description="controller that plays the chunks, and wrappers, with options: chunked, late, rtc:delay=8, "
+        "temporal-ensemble, or those of other packages, such as smooth,late; when not given, late with "
+        "--latency-in-the-loop, and chunked without",
     )
     board: str = Field(
         "", description="profile whose predicted latency that is; --profile sets it; measured here when empty"

@@ -2,62 +2,127 @@
 
 The name of an entry's first parameter says what it wraps, ``policy`` or ``controller``. An entry with ``infer`` is
 itself a policy, one with ``act`` a controller. A controller that acts while its policy infers also takes ``delay``: the
-number of control steps that an inference takes.
+number of control steps that an inference takes. An entry that takes ``spec`` gets that of the policy. Its other
+parameters with a default are options, which follow the name: ``rtc:delay=8:blend=4``.
 """
 
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 from vlatool import registry
 from vlatool.errors import PluginError, UsageError
 from vlatool.runtime.interface import Controller, Policy
 
 KIND, DEFAULT_PLAYER, PLAYER_WITH_DELAY = "control", "chunked", "late"
+TRUTH = {"true": True, "false": False}
+
+
+class _Layer(NamedTuple):
+    """An entry, with the options that were given behind its name."""
+
+    entry: type
+    options: dict[str, Any]
 
 
 def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
     """Return the classes around a policy, innermost first: policy wrappers, one player, controller wrappers.
 
     Args:
-        names: Names of entries of the kind ``control``; ``chunked`` or ``late`` is added if none plays the policy.
+        names: Names of entries of the kind ``control``, which options may follow (``rtc:delay=8``); ``chunked`` or
+            ``late`` is added if none plays the policy.
         delayed: Whether the controller should act while the policy infers.
 
     Raises:
-        UsageError: when a name is unknown, two entries play the policy, or the player does not support a delay.
+        UsageError: when a name, an option or a value is unknown, two entries play the policy, or the player does not
+            support a delay.
     """
-    entries = {name: registry.load(KIND, name) for name in names}
-    players = [name for name, entry in entries.items() if _layer(entry) == 1]
-    if len(players) > 1:
-        raise UsageError(f"Both {players[0]} and {players[1]} play the chunks of the policy.", "name one of them")
-    player = players[0] if players else PLAYER_WITH_DELAY if delayed else DEFAULT_PLAYER
-    entries[player] = registry.load(KIND, player)
-    if delayed and not _takes(entries[player], "delay"):
-        raise UsageError(f"The controller {player} waits for each inference: its actions cannot come late.",
-                         f"use {PLAYER_WITH_DELAY}, or leave the latency out")  # fmt: skip
-    return sorted(entries.values(), key=_layer)
+    return [layer.entry for layer in _layers(names, delayed)]
 
 
 def build_controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) -> Controller:
     """Return a controller that acts with a policy: ``chunked``, ``late`` if there is a delay, or the named one.
 
     Args:
-        names: Names of entries of the kind ``control``, inner ones first; policy wrappers are always innermost.
+        names: As ``layers`` takes them, inner ones first; policy wrappers are always innermost.
         delay: Number of control steps that an inference takes.
 
     Raises:
-        UsageError: as ``layers`` does.
+        UsageError: as ``layers`` does, and as the entries do for their options.
         PluginError: when an entry lacks a method of the protocols.
     """
     made: Any = policy
-    for entry in layers(names, delayed=delay > 0):
-        made = entry(made, delay=delay) if delay and _takes(entry, "delay") else entry(made)
+    for entry, options in _layers(names, delay > 0):
+        given = {"spec": policy.spec, **({"delay": delay} if delay else {}), **options}
+        made = entry(made, **{name: value for name, value in given.items() if _takes(entry, name)})
         if not isinstance(made, Controller if _layer(entry) else Policy):
             raise PluginError(f"{entry.__name__}, an entry of vlatool.{KIND}, lacks methods or properties.",
                               "give it those of a protocol in vlatool/runtime/interface.py")  # fmt: skip
     return made  # type: ignore[no-any-return]
+
+
+def _layers(names: Sequence[str], delayed: bool) -> list[_Layer]:
+    found = {name.partition(":")[0]: _parsed(name) for name in names}
+    players = [name for name, layer in found.items() if _layer(layer.entry) == 1]
+    if len(players) > 1:
+        raise UsageError(f"Both {players[0]} and {players[1]} play the chunks of the policy.", "name one of them")
+    player = players[0] if players else PLAYER_WITH_DELAY if delayed else DEFAULT_PLAYER
+    found.setdefault(player, _parsed(player))
+    if delayed and not _takes(found[player].entry, "delay"):
+        raise UsageError(f"The controller {player} waits for each inference: its actions cannot come late.",
+                         f"use {PLAYER_WITH_DELAY}, or leave the latency out")  # fmt: skip
+    if delayed and "delay" in found[player].options:
+        raise UsageError(f"The delay of {player} is given, and it is that of the latency.", "leave one of them out")
+    return sorted(found.values(), key=lambda layer: _layer(layer.entry))
+
+
+def _parsed(named: str) -> _Layer:
+    """Return the entry and the options of ``NAME:KEY=VALUE:KEY=VALUE``."""
+    name, *given = named.split(":")
+    entry = registry.load(KIND, name)
+    types = _option_types(entry) if given else {}
+    options: dict[str, Any] = {}
+    for option in given:
+        key, equals, value = option.partition("=")
+        if key not in types:
+            raise UsageError.unknown(f"The controller {name} has no option '{key}'", key, sorted(types))
+        if not equals or key in options:
+            raise UsageError(f"'{named}' gives {key} {'twice' if equals else 'no value'}.", f"write {name}:{key}=VALUE")
+        options[key] = _value(f"{name}:{key}", value, types[key])
+    return _Layer(entry, options)
+
+
+def _option_types(entry: type) -> dict[str, tuple[type, ...]]:
+    """Return the parameters of an entry that have a default and a type that can be written -> their types."""
+    hints = get_type_hints(entry.__init__)  # type: ignore[misc]
+    defaults = {
+        name for name, parameter in inspect.signature(entry).parameters.items()
+        if parameter.default is not inspect.Parameter.empty
+    }  # fmt: skip
+    types = {name: get_args(hints[name]) or (hints[name],) for name in defaults if name in hints}
+    return {name: kinds for name, kinds in types.items() if {bool, int, float, str} & set(kinds)}
+
+
+def _value(where: str, text: str, types: tuple[type, ...]) -> Any:
+    """Return the value that a text says, of the first of some types that it can be; raises UsageError for none."""
+    if bool in types and text in TRUTH:
+        return TRUTH[text]
+    for kind in (int, float):
+        if kind in types:
+            try:
+                number = kind(text)
+            except ValueError:
+                continue
+            if math.isfinite(number):
+                return number
+    if str in types:
+        return text
+    allowed = {bool: "true or false", int: "a whole number", float: "a number"}
+    words = " or ".join(word for kind, word in allowed.items() if kind in types)
+    raise UsageError(f"{where} is '{text}'; allowed: {words}.", f"write {where}=VALUE with such a value")
 
 
 def _layer(entry: type) -> int:
