@@ -23,6 +23,8 @@ from vlatool.bundle import image, manifest, prompt, spec
 from vlatool.cli._schemas import COMMANDS, definitions
 from vlatool.gate import config
 from vlatool.hardware.profile import load_profile, profile_names
+from vlatool.hardware.robots import robots_json, robots_page
+from vlatool.runtime.envelope.limits import ROBOTS
 from vlatool.stage.base import Stage
 from vlatool.stage.build import stage_kinds
 
@@ -43,12 +45,14 @@ def main() -> None:
         "measures.md": measures_page(),
         "errors.md": errors_page(),
         "profiles.md": profiles_page(),
+        "robots.md": robots_page(),
         "gate.md": gate_page(),
         "json.md": json_page(),
     }  # fmt: skip
     pages = {name: NOTE + text for name, text in pages.items()}
     pages["report.schema.json"] = schema_page()
     pages["output.schema.json"] = output_schema_page()
+    pages[os.path.relpath(ROBOTS, REFERENCE)] = robots_json()  # what a robot reads, as it has no YAML
     if "--check" not in sys.argv:
         REFERENCE.mkdir(exist_ok=True)
         for name, text in pages.items():

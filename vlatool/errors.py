@@ -8,6 +8,7 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── SourceError              a policy source: factory, weights, ONNX file
 │   ├── DataError                calibration / evaluation data or an observation
 │   ├── GraphError               a graph that an engine refuses, or that computes wrong values
+│   │   └── DeadlineMissed          an inference did not end by its deadline
 │   ├── ProfileError             a hardware profile
 │   ├── RecipeError              a recipe or stage options
 │   ├── OutputError              the output: exists already, read-only, disk full
@@ -105,6 +106,12 @@ class DataError(InputError):
 
 class GraphError(InputError):
     """A graph that an engine refuses, or that does not compute what it should."""
+
+
+class DeadlineMissed(GraphError):
+    """An inference did not end by its deadline; its result is not used, and the policy is as it was before."""
+
+    remedy = "act without it: the last action again, a fallback or a stop; the policy may infer at the next step"
 
 
 class ProfileError(InputError):

@@ -17,11 +17,13 @@ import pkgutil
 import traceback
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
-from importlib import metadata
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import PluginError, UsageError, VlatoolError
+
+if TYPE_CHECKING:
+    from importlib import metadata
 
 PACKAGE_OF_KIND = {
     "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
@@ -75,7 +77,7 @@ def names(kind: str) -> list[str]:
 def plugins(kind: str) -> dict[str, metadata.EntryPoint]:
     """Return the entries of a kind from other packages: name -> entry point; vlatool's own names are not replaced."""
     own = _builtin_names(kind)
-    entries = {entry.name.replace("-", "_"): entry for entry in metadata.entry_points(group=f"vlatool.{kind}")}
+    entries = {entry.name.replace("-", "_"): entry for entry in _entry_points().select(group=f"vlatool.{kind}")}
     return {name: entry for name, entry in entries.items() if name not in own}
 
 
@@ -187,7 +189,7 @@ def entry_of(entry_class: type) -> str:
 def all_plugins() -> dict[str, list[str]]:
     """Return the other packages that extend vlatool: ``acme 1.2`` -> its entries as ``kind.name``."""
     added: dict[str, list[str]] = {}
-    for group in sorted(metadata.entry_points().groups):
+    for group in sorted(_entry_points().groups):
         for entry in plugins(group.partition(".")[2]).values() if group.startswith("vlatool.") else ():
             added.setdefault(_title(entry), []).append(f"{group.partition('.')[2]}.{entry.name}")
     return added
@@ -200,8 +202,9 @@ def plugin_of(module_name: str) -> str:
         module_name: name of any module of that package.
     """
     top = module_name.partition(".")[0]
-    groups = (group for group in metadata.entry_points().groups if group.startswith("vlatool.") and top != "vlatool")
-    entries = (entry for group in groups for entry in metadata.entry_points(group=group))
+    points = _entry_points()
+    groups = (group for group in points.groups if group.startswith("vlatool.") and top != "vlatool")
+    entries = (entry for group in groups for entry in points.select(group=group))
     return next((_title(entry) for entry in entries if entry.module.partition(".")[0] == top), "")
 
 
@@ -216,6 +219,13 @@ def plugin_failure(package: str, kind: str, message: str) -> tuple[str, str]:
     """Return the message and the fix for an exception that another package's code raised."""
     words = f"The package {package}, which adds to vlatool, fails: {kind}: {message}."
     return words, "report it to its authors, with the traceback of VLATOOL_DEBUG=1"
+
+
+def _entry_points() -> Any:
+    """Return the entry points of all packages. Their library is imported only here: a robot waits for it at start."""
+    from importlib import metadata
+
+    return metadata.entry_points()
 
 
 def _builtin_names(kind: str) -> list[str]:

@@ -199,7 +199,7 @@ def gone(pid: int) -> bool:
     ("number", "status", "says"),
     [
         (signal.SIGINT, 130, "interrupted; finished stages are kept\n"),
-        (signal.SIGTERM, 143, ""),
+        *small_or_full([], [(signal.SIGTERM, 143, "")]),
         (signal.SIGKILL, -9, ""),
     ],
 )

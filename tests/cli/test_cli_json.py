@@ -20,6 +20,7 @@ import typer
 from _acts import POLICY_YAML, policy
 from _arithmetic import computes_bfloat16
 from _flow import write_flow
+from _full import small_or_full
 from safetensors.torch import load_file, save_file
 
 from vlatool.cli import app, main
@@ -78,6 +79,7 @@ LINES = {
     "inspect": "{bundle} --probe",
     "rebuild": "{bundle} --check --source {policy}",
     "doctor": "",
+    "run": "{bundle} --dry-run --steps 20",
     "simulate": "{policy} --profile raspberry-pi-5",
     "telemetry": "--seconds 0.1",
     "profiles list": "",
@@ -247,6 +249,7 @@ BAD = {
     "verify": "{nothing} --against {nothing}:act",
     "inspect": "{nothing}",
     "rebuild": "{nothing} --check",
+    "run": "{nothing} --dry-run",
     "simulate": "{nothing} --profile raspberry-pi-5",
     "telemetry": "--root {nothing}",
     "profiles show": "no-board",
@@ -351,7 +354,8 @@ def test_the_end_of_the_process_adds_nothing(places) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "kind", "status"), [(signal.SIGINT, "Interrupted", 130), (signal.SIGTERM, "Terminated", 143)]
+    ("number", "kind", "status"),
+    [*small_or_full([], [(signal.SIGINT, "Interrupted", 130)]), (signal.SIGTERM, "Terminated", 143)],
 )
 def test_a_signal_is_a_document(tmp_path, number, kind: str, status: int) -> None:
     mark, mine = tmp_path / "hangs", tmp_path / "mine"

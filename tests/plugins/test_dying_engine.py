@@ -13,12 +13,14 @@ from pathlib import Path
 import pytest
 from _console import Console
 from _environment import environment_beside
+from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle
 
 HERE = Path(__file__).parent
 INT8 = "MatMulIntegerToFloat"
 HANGS = "engine_seconds=2"
+FEW = ("--iterations", "20", "--duration", "0")
 Run = Callable[..., subprocess.CompletedProcess[str]]
 ENDS = {
     "abort": "ended its process with SIGABRT",
@@ -77,8 +79,10 @@ def refused(done: subprocess.CompletedProcess[str], how: str, where: Path) -> st
     return error
 
 
-@pytest.mark.parametrize("how", ENDS)
-@pytest.mark.parametrize("when", ["open", "run"])
+@pytest.mark.parametrize(("how", "when"), [
+    *((how, "run") for how in ENDS), ("abort", "open"),
+    *small_or_full([], [(how, "open") for how in ENDS if how != "abort"]),
+])  # fmt: skip
 def test_quantize_says_what_the_engine_did(run: Run, float_bundle: Bundle, tmp_path: Path, how: str, when: str):
     line = ("quantize", "static-int8", str(float_bundle.path), "--samples", "4", "-o", str(tmp_path / "out"))
     error = refused(run(f"{how}:{when}", INT8, *line), how, tmp_path / "out")
@@ -108,7 +112,7 @@ def test_an_onnx_file_is_refused(run: Run, onnx_file: Path, tmp_path: Path):
 def test_what_opens_a_bundle_from_elsewhere_survives(fresh: Run, int8_bundle: Bundle, tmp_path: Path):
     made = str(int8_bundle.path)
     for line in (
-        ("evaluate", "recorded", made), ("benchmark", made, "--iterations", "20"), ("explain", made),
+        ("evaluate", "recorded", made), ("benchmark", made, *FEW), ("explain", made),
         ("benchmark", "overhead", made),
     ):  # fmt: skip
         done = fresh("abort:run", INT8, *line, "-o", str(tmp_path / "report"))
@@ -131,7 +135,7 @@ def test_no_command_dies_of_the_products_that_an_engine_is_asked_for(
     made = str(int8_bundle.path)
     for line in (
         ("quantize", "static-int8", str(float_bundle.path), "--samples", "4", "-o", str(tmp_path / "out")),
-        ("evaluate", "recorded", made), ("benchmark", made, "--iterations", "20"), ("inspect", made, "--probe"),
+        ("evaluate", "recorded", made), ("benchmark", made, *FEW), ("inspect", made, "--probe"),
     ):  # fmt: skip
         done = fresh("abort:probe", "", *line)
         assert done.returncode in (0, 3), (line, done.stdout + done.stderr)

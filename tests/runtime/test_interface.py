@@ -16,7 +16,7 @@ from vlatool.episodes.disturbances import DELAY, DROPPED_FRAMES, DisturbedContro
 from vlatool.episodes.frames import FrameRecorder, Noisy
 from vlatool.runtime import ChunkQueue, load
 from vlatool.runtime.control.late import LateController
-from vlatool.runtime.interface import Action, Controller, Policy
+from vlatool.runtime.interface import CHUNK, HOLD, POLICY, Action, Controller, Origin, Policy, origin_of
 from vlatool.runtime.observation import EncodedObservation
 from vlatool.runtime.policy import BundlePolicy
 
@@ -49,7 +49,9 @@ def test_an_open_bundle_is_a_policy_and_gives_actions(float_bundle, observation)
     policy = load(float_bundle.path, threads=1)
     assert isinstance(policy, Policy)
     assert not isinstance(policy, Controller)
-    assert isinstance(policy.infer(observation), Action)
+    action = policy.infer(observation)
+    assert isinstance(action, Action)
+    assert action.origin() == Origin(POLICY, action.latency_ms)
 
 
 WRAPPERS = (
@@ -73,6 +75,8 @@ def test_wrappers_compose_in_any_order(order: tuple[int, ...], player: Any, tmp_
     for _ in range(2):
         acting.reset(3)
         episodes.append([(acting.act({"t": t}).tolist(), acting.fresh) for t in range(12)])
+        assert origin_of(acting).source == POLICY
+        assert origin_of(acting).age_ms > 0
     assert episodes[0] == episodes[1], "the seed decides all that is drawn"
     assert policy.seeds == [3, 3]
     with recorder.recording(tmp_path / "frames"):
@@ -90,3 +94,12 @@ def test_a_blind_controller_draws_by_the_seed_of_the_episode():
         blind.reset(seed)
         drawn.append([blind.act({}).tolist() for _ in range(20)])
     assert drawn[0] == drawn[2] != drawn[1]
+
+
+def test_a_controller_that_does_not_say_where_its_action_comes_from_claims_nothing():
+    assert origin_of(Blind("constant", SPEC.action, ANSWERS)) == Origin("", None, ())
+
+
+def test_a_wrapper_extends_where_an_action_comes_from():
+    assert Origin(HOLD, 3.0, ("speed",)).altered_by("jerk", "stop") == Origin(HOLD, 3.0, ("speed", "jerk", "stop"))
+    assert Action(ANSWERS, (), 1.0, 0, {}, CHUNK, 4.0, ("speed",)).origin(2.5) == Origin(CHUNK, 6.5, ("speed",))

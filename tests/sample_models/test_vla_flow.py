@@ -186,7 +186,7 @@ def test_the_folder_stays_small() -> None:
     assert sum(file.stat().st_size for file in FLOW.iterdir() if file.is_file()) <= 16_000_000
 
 
-@pytest.mark.parametrize("folder", [FLOW, METAWORLD], ids=lambda folder: folder.name)
+@pytest.mark.parametrize("folder", small_or_full([METAWORLD], [FLOW, METAWORLD]), ids=lambda folder: folder.name)
 @pytest.mark.parametrize("script", small_or_full(["train.py"], ["train.py", "evaluate.py"]))
 def test_the_scripts_find_what_the_folders_share(folder: Path, script: str) -> None:
     done = subprocess.run(

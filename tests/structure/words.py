@@ -36,6 +36,7 @@ ALLOWED = {
     "chunked": "controller: the term of the field for executing a whole chunk of actions",
     "disturbed": "claim `disturbed` of a gate: its module is found by this name",
     "interleaved": "kind of measurement: variants in turns",
+    "named": "`RobotLimits.named`: the limits of a robot by its name",
     "paced": "kind of measurement: at a fixed rate",
     "recorded": "command `evaluate recorded`: its module is found by this name",
     "sorted": "as in the standard library",

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from vlatool.graph.layers import find_layers
 from vlatool.module.to_onnx import quiet_exporter
+from vlatool.module.torchlib import shared_table
 from vlatool.training import recurrent_steps
 from vlatool.training.fake_quantization import fake_quantization, in_blocks, per_channel, per_tensor
 
@@ -65,7 +66,7 @@ CASES = {
 def test_a_training_rounds_what_static_int8_rounds(case: str):
     torch.manual_seed(0)
     module, sequence = Written(*CASES[case]).eval(), torch.randn(1, 5, 8)
-    with quiet_exporter():
+    with quiet_exporter(), shared_table():
         graph = torch.onnx.export(module, (sequence,), dynamo=True, opset_version=20, verbose=False).model_proto
         traced = torch.export.unflatten(torch.export.export(module, (sequence,)))
     whole, int8 = module(sequence), bool(find_layers(graph, ("MatMul", "Gemm", "Conv")))

@@ -15,6 +15,10 @@ NUMBER: Schema = {"type": ["number", "null"]}
 INTEGER: Schema = {"type": "integer"}
 FLAG: Schema = {"type": "boolean"}
 ANY_OBJECT: Schema = {"type": "object"}
+SPREAD: Schema = {
+    "type": "object", "properties": {"p50": NUMBER, "p99": NUMBER, "samples": INTEGER},
+    "required": ["p50", "p99", "samples"], "additionalProperties": False,
+}  # fmt: skip
 ERROR: Schema = {"$ref": "#/$defs/error"}
 
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -41,6 +45,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "inspect": ("manifest", "sensitivity"),
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
+    "run": ("dry_run",),
     "simulate": ("simulation",),
     "telemetry": ("telemetry",),
     "profiles list": ("profiles",),
@@ -186,6 +191,12 @@ def _documents_of_machines() -> dict[str, Schema]:
     both = {"type": "array", "items": NUMBER}
     return {
         "checks": many(record(name=TEXT, status=status, finding=TEXT, fix=TEXT)),
+        "dry_run": document(
+            "Layers from the robot to the graphs; times in ms, of a rung only where it infers.",
+            bundle=TEXT, robot=TEXT, period_ms=NUMBER, deadline_ms=NUMBER, layers=many(record(layer=TEXT, does=TEXT)),
+            inference=SPREAD, answer=SPREAD, missed=NUMBER,
+            rungs=many(record(source=TEXT, time={"anyOf": [SPREAD, {"type": "null"}]})),
+        ),
         "simulation": document(
             "Predicted, not measured; latency_ms: value, low, high.",
             source=TEXT, profile=TEXT, mode=TEXT, engine=TEXT, precision=TEXT, origin={"const": "predicted"},

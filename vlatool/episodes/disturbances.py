@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.spec import PolicySpec
-from vlatool.runtime.interface import Array, Controller
+from vlatool.runtime.interface import Array, Controller, Origin, origin_of
 
 DELAY, DROPPED_FRAMES = "delay", "dropped_frames"
 BUILT_IN_DISTURBANCES = (DELAY, DROPPED_FRAMES)
@@ -32,7 +32,7 @@ class DisturbedController:
     """
 
     def __init__(self, controller: Controller, spec: PolicySpec, kind: str, strength: float) -> None:
-        self._controller, self.fresh = controller, False
+        self._controller, self.fresh, self.origin = controller, False, Origin("")
         self._names = [tensor.name for tensor in spec.inputs]
         self._delay = max(1, round(DELAY_S * strength * spec.rate)) if kind == DELAY and strength else 0
         self._lost = min(MAX_DROPPED_SHARE, DROPPED_SHARE * strength) if kind == DROPPED_FRAMES else 0.0
@@ -49,6 +49,7 @@ class DisturbedController:
                 self._observed.append({name: _copy(observation[name]) for name in self._names if name in observation})
             observation = self._observed[0]
         action, self.fresh = self._controller.act(observation), self._controller.fresh
+        self.origin = origin_of(self._controller)
         return action
 
     def reset(self, seed: int | None = None) -> None:

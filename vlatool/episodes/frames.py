@@ -12,7 +12,7 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import BEGINS
-from vlatool.runtime.interface import Action, Array, Controller, Policy, observer_of
+from vlatool.runtime.interface import Action, Array, Controller, Origin, Policy, observer_of, origin_of
 from vlatool.runtime.observation import ObservationEncoder
 
 
@@ -79,11 +79,12 @@ class Noisy:
         self._labels = len(action.labels) if action.kind == "discrete" else 0
         self._spread = answers.std(axis=0) * noise
         self._random = np.random.default_rng((0, 21))
-        self.fresh = False
+        self.fresh, self.origin = False, Origin("")
 
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the next action: (A,) float32, or a 0-d int64 index."""
         action, self.fresh = self._controller.act(observation), self._controller.fresh
+        self.origin = origin_of(self._controller)
         if self._labels:
             random = self._random.integers(self._labels)
             return np.asarray(random) if self._random.random() < self._noise else action

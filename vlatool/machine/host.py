@@ -11,7 +11,6 @@ import platform
 import re
 import time
 from collections.abc import Iterable, Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -326,6 +325,8 @@ def virtual_machine(root: Path = ROOT) -> bool | None:
 
 def versions(distributions: Iterable[str] = DISTRIBUTIONS) -> dict[str, str]:
     """Versions of the packages that are installed, without importing any."""
+    from importlib import metadata  # a robot does without
+
     installed = {}
     for name in distributions:
         try:

@@ -6,7 +6,8 @@ Needs numpy and one inference engine; never torch, onnx, pydantic, typer, rich o
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, overload
 
 from vlatool.errors import refuse_two_distributions
 from vlatool.runtime.arguments import check_load
@@ -14,7 +15,49 @@ from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
+if TYPE_CHECKING:
+    from vlatool.runtime.stack import Fallback, Sink, Stack, Wrapper
+
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
+AUTO = "auto"
+"""Name that stands for the engine that a bundle was made for."""
+
+
+@overload
+def load(
+    path: str | os.PathLike[str],
+    *,
+    engine: str = ...,
+    threads: int | None = ...,
+    seed: int | None = ...,
+    warmup: int = ...,
+    golden_tolerance: float | None = ...,
+    accept: Iterable[str] = ...,
+    first_run_s: float = ...,
+    memory_mb: float | None = ...,
+    probe: bool = ...,
+) -> Policy: ...
+
+
+@overload
+def load(
+    path: str | os.PathLike[str],
+    *,
+    engine: str = ...,
+    threads: int | None = ...,
+    seed: int | None = ...,
+    warmup: int = ...,
+    golden_tolerance: float | None = ...,
+    accept: Iterable[str] = ...,
+    first_run_s: float = ...,
+    memory_mb: float | None = ...,
+    probe: bool = ...,
+    controllers: Sequence[str] | None = ...,
+    envelope: str | Wrapper | None = ...,
+    deadline_ms: float | None = ...,
+    fallback: Any = ...,
+    telemetry: Sink | None = ...,
+) -> Policy | Stack: ...
 
 
 def load(
@@ -29,12 +72,20 @@ def load(
     first_run_s: float = FIRST_RUN_S,
     memory_mb: float | None = None,
     probe: bool = False,
-) -> Policy:
+    controllers: Sequence[str] | None = None,
+    envelope: str | Wrapper | None = None,
+    deadline_ms: float | None = None,
+    fallback: str | os.PathLike[str] | Fallback | Any = None,
+    telemetry: Sink | None = None,
+) -> Policy | Stack:
     """Load a bundle, verify it, open its graphs and warm them up.
+
+    The last five arguments put layers around the policy, as ``vlatool.runtime.stack`` orders them; with any of them, a
+    controller is returned (``Stack``: ``act`` for each control step, ``reset``), else the policy.
 
     Args:
         path: The bundle directory.
-        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty.
+        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty or ``auto``.
         threads: Intra-op threads of the engine; the cores that this process may use when None.
         seed: Seed of the noise that a program draws; fresh entropy when None.
         warmup: Inferences on the golden observation before this returns (the first is the slowest).
@@ -50,6 +101,14 @@ def load(
         probe: Do the first run in a child process, limited in time and memory, before this process opens a graph: for
             bundles of others. Whatever the child does, it is killed after ``first_run_s`` and 60 s for its start. Takes
             as long as loading twice and starting Python.
+        controllers: Names of entries of the kind ``control``: what plays the policy, and wrappers.
+        envelope: Robot whose limits no action leaves, by name; or a controller wrapper, called with the controller.
+        deadline_ms: Time until ``act`` returns, in milliseconds, whatever the engine does: a late inference is stopped
+            and never used, and a fallback answers. Lowers Python's switch interval and freezes its garbage collector
+            (``stack.prepare_process``).
+        fallback: What acts without an action in time, beside the rest of the last chunk, a hold and a stop: a second
+            bundle, by its directory, another policy, or a ``vlatool.runtime.stack.Fallback``.
+        telemetry: Called with a ``vlatool.runtime.stack.TickRecord`` after each control step.
 
     Raises:
         BundleError: the directory is missing, incomplete, changed or too new.
@@ -69,6 +128,7 @@ def load(
 
     refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
+    engine = "" if engine == AUTO else engine
     bundle = Bundle.open_lazily(path)
     refuse_findings(bundle, accept)
     bundle.verify("data/")
@@ -79,4 +139,13 @@ def load(
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
     bundle.verify()
     policy.warm_up(warmup, golden_tolerance, first_run_s)
-    return policy
+    if all(layer is None for layer in (controllers, envelope, deadline_ms, fallback, telemetry)):
+        return policy
+    from vlatool.runtime.stack import build_stack, prepare_process
+
+    if isinstance(fallback, str | os.PathLike):
+        fallback = load(fallback, threads=threads, seed=seed, accept=accept)
+    if deadline_ms is not None:
+        prepare_process()
+    return build_stack(policy, controllers=controllers or (), envelope=envelope, deadline_ms=deadline_ms,
+                       fallback=fallback, telemetry=telemetry)  # fmt: skip

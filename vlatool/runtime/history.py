@@ -25,6 +25,7 @@ class History:
     def __init__(self, spec: PolicySpec) -> None:
         self.lengths = {tensor.name: tensor.history for tensor in spec.inputs if tensor.history}
         self._before: dict[str, Array] = {}
+        self._count = 0
         self._turn = threading.RLock()
 
     def window(self, name: str, moment: Array) -> Array:
@@ -50,6 +51,7 @@ class History:
         with self._turn:
             values, earlier = encode(observation), self._before
             kept = self._before = {name: values[name][:, 1:].copy() for name in self.lengths}
+            self._count += 1
         try:
             yield values
         except BaseException:
@@ -58,7 +60,20 @@ class History:
                     self._before = earlier
             raise
 
+    @property
+    def snapshot(self) -> tuple[int, dict[str, Array]]:
+        """What ``restore`` takes: how many moments there were, and the last of them."""
+        with self._turn:
+            return self._count, self._before
+
+    def restore(self, snapshot: tuple[int, dict[str, Array]]) -> None:
+        """Forget the one moment that was kept since a snapshot; nothing where there were more."""
+        with self._turn:
+            if self._count == snapshot[0] + 1:
+                self._before = snapshot[1]
+
     def forget(self) -> None:
         """Start a new episode."""
         with self._turn:
             self._before = {}
+            self._count += 2

@@ -15,6 +15,31 @@ from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import PluginError
 
 Array = NDArray[Any]
+POLICY, CHUNK, FALLBACK, HOLD, STOP = "policy", "chunk", "fallback", "hold", "stop"
+"""Sources of an action: the policy, as planned; the rest of an earlier chunk, because no new one came in time; a second
+policy; the last command again or no motion; a stop. A wrapper that computes actions of its own adds its own word."""
+
+
+class Origin(NamedTuple):
+    """Where one action came from.
+
+    A controller has that of its last action as ``origin``; a wrapper starts from ``origin_of`` the controller inside it
+    and passes it on, extended (``altered_by``) or replaced.
+
+    Args:
+        source: What computed it: ``POLICY`` and the words beside it; empty where a controller does not say.
+        age_ms: Time from the observation that it answers to the return of the action, in milliseconds; None where
+            nobody says.
+        checks: Names of the checks and limits that altered it, in the order in which they did.
+    """
+
+    source: str = POLICY
+    age_ms: float | None = None
+    checks: tuple[str, ...] = ()
+
+    def altered_by(self, *checks: str) -> Origin:
+        """Return the same with further checks that altered the action."""
+        return self._replace(checks=(*self.checks, *checks))
 
 
 class Action(NamedTuple):
@@ -26,6 +51,9 @@ class Action(NamedTuple):
         latency_ms: Time from the call of ``infer`` to this result, in milliseconds.
         sequence: Number of this inference since the last reset, from 0.
         outputs: Every output of the spec by name, as the graph returned it (not un-normalised).
+        source: What computed the chunk: ``POLICY`` and the words beside it.
+        age_ms: Time from the observation that it answers to this result, in milliseconds.
+        checks: Names of the checks and limits that altered it, in the order in which they did.
     """
 
     chunk: Array
@@ -33,6 +61,13 @@ class Action(NamedTuple):
     latency_ms: float
     sequence: int
     outputs: Mapping[str, Array]
+    source: str = POLICY
+    age_ms: float = 0.0
+    checks: tuple[str, ...] = ()
+
+    def origin(self, later_ms: float = 0.0) -> Origin:
+        """Return where an action of this chunk comes from that is returned ``later_ms`` milliseconds after it."""
+        return Origin(self.source, self.age_ms + later_ms, self.checks)
 
 
 @runtime_checkable
@@ -71,6 +106,20 @@ class Controller(Protocol):
 
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode, with noise of this seed; that of the policy when None."""
+
+
+def layers_of(layer: Any) -> list[Any]:
+    """Return a layer and all those inside it, the outermost first: what it has as ``controller`` or ``policy``."""
+    found = [layer]
+    while (inner := getattr(found[-1], "controller", None) or getattr(found[-1], "policy", None)) is not None:
+        found.append(inner)
+    return found
+
+
+def origin_of(controller: Controller) -> Origin:
+    """Return where the last action of a controller came from; without a source and an age if it does not say."""
+    origin = getattr(controller, "origin", None)
+    return origin if isinstance(origin, Origin) else Origin("")
 
 
 def observer_of(policy: Policy) -> Observer | None:

@@ -116,6 +116,7 @@ class BundlePolicy:
             GraphError: when the engine fails or takes longer than ``limit_s``, or an output or a kept value is not
                 finite or not as declared.
             UsageError: when another inference is in progress, of a policy that keeps values or in the same thread.
+            TimeoutError: when ``stop`` is called.
         """
         start = time.perf_counter_ns()
         if not self._history.lengths:
@@ -159,13 +160,41 @@ class BundlePolicy:
                 self._sequence += 1
             finally:
                 self._busy = False
-        return Action(chunk, labels, (time.perf_counter_ns() - start) / 1e6, sequence, outputs)
+        taken_ms = (time.perf_counter_ns() - start) / 1e6
+        return Action(chunk, labels, taken_ms, sequence, outputs, age_ms=taken_ms)
 
     def _answer(
         self, state: Array | None, values: dict[str, Any]
     ) -> tuple[dict[str, Array], tuple[Array, tuple[str, ...]]]:
         outputs = self._outputs(values)
         return outputs, self._decode(outputs[self._action], state)
+
+    def stop(self) -> None:
+        """End the inference in progress, from another thread; it and later ones raise TimeoutError until ``resume``.
+
+        An engine stops between two nodes of a graph. It does so from the first call of ``resume`` on.
+        """
+        for session in self.program.sessions.values():
+            if hasattr(session, "stop"):
+                session.stop()
+
+    def resume(self) -> None:
+        """Allow inferences again after ``stop``."""
+        for session in self.program.sessions.values():
+            if hasattr(session, "resume"):
+                session.resume()
+
+    @property
+    def snapshot(self) -> tuple[Any, ...]:
+        """What ``restore`` takes: the sequence number, kept values, noise and earlier moments."""
+        return self._sequence, self.program.snapshot, self._history.snapshot
+
+    def restore(self, snapshot: tuple[Any, ...]) -> None:
+        """Take back the last inference: all is as it was when the snapshot was taken. Moments observed since stay."""
+        with self._turn:
+            self._sequence, program, history = snapshot
+            self.program.restore(program)
+            self._history.restore(history)
 
     def decode(self, raw: Array, encoded: EncodedObservation | None = None) -> Array:
         """Return the chunk of the graph's raw action: (T, A) in the units of the spec, or (T,) indices.

@@ -26,7 +26,8 @@ class Session(Protocol):
         """Run the graph: input name -> array, output name -> array, both of NumPy and in the memory of the host.
 
         In whose memory they are meanwhile is the session's affair; later runs do not change what it gave. A session
-        with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
+        with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it. One with ``stop()`` does so
+        when that is called from another thread, and again at each run until ``resume()``.
         """
 
 
@@ -67,7 +68,8 @@ class Program:
 
     def reset(self, seed: int | None = None) -> None:
         """Zero the kept values and restart the noise: from this seed, or from that of the program when None."""
-        self._random = np.random.default_rng(self._seed if seed is None else seed)
+        if self._noisy:  # NumPy imports its generators here, for which a robot without noise need not wait
+            self._random = np.random.default_rng(self._seed if seed is None else seed)
         self._kept = {
             name: np.zeros(kept["shape"], kept.get("dtype", "float32"))
             for step in self.steps
@@ -92,6 +94,17 @@ class Program:
     @kept_values.setter
     def kept_values(self, values: Mapping[str, Array]) -> None:
         self._kept = dict(values)
+
+    @property
+    def snapshot(self) -> tuple[dict[str, Array], Any]:
+        """What ``restore`` takes: the kept values, and the state of the noise where any is drawn."""
+        return self._kept, self._random.bit_generator.state if self._noisy else None
+
+    def restore(self, snapshot: tuple[dict[str, Array], Any]) -> None:
+        """Go back to the kept values and the noise of a snapshot."""
+        self._kept, noise = snapshot
+        if noise is not None:
+            self._random.bit_generator.state = noise
 
     def run(
         self,

@@ -8,6 +8,7 @@ from _numbered import NumberedPolicy, spec_of
 
 from vlatool.bundle.spec import TensorSpec
 from vlatool.runtime import Action, ChunkQueue, load
+from vlatool.runtime.interface import CHUNK, POLICY, Origin
 
 
 def play(queue: ChunkQueue, steps: int) -> list[float]:
@@ -65,3 +66,35 @@ def test_a_discrete_action_is_a_scalar():
 @pytest.mark.parametrize("execute", [5, 9])
 def test_more_than_the_chunk_is_the_chunk(execute):
     assert play(ChunkQueue(NumberedPolicy(spec_of(chunk=2)), execute), 3) == [0, 1, 200]
+
+
+class Aged(NumberedPolicy):
+    """Takes 4 ms for each chunk."""
+
+    def infer(self, observation, *, noise=None) -> Action:
+        return super().infer(observation)._replace(age_ms=4.0, checks=("bounds",))
+
+
+def test_an_action_says_how_old_the_observation_is_that_it_answers():
+    times = iter([1.0, 1.0, 1.05, 1.15, 1.2, 1.2])
+    queue = ChunkQueue(Aged(spec_of(chunk=3)), clock=lambda: next(times))
+    origins = []
+    for step in range(4):
+        queue.act({"t": step})
+        origins.append(queue.origin)
+    assert [origin.age_ms for origin in origins] == pytest.approx([4, 54, 154, 4])
+    assert {(origin.source, origin.checks) for origin in origins} == {(POLICY, ("bounds",))}
+
+
+def test_the_rest_of_a_chunk_is_there_for_steps_without_an_inference():
+    queue = ChunkQueue(NumberedPolicy(spec_of(chunk=4, execute=2)), clock=lambda: 0.0)
+    assert queue.rest() is None
+    assert play(queue, 1) == [0]
+    assert [queue.rest()[0].item() for _ in range(3)] == [1, 2, 3]
+    assert (queue.origin, queue.fresh) == (Origin(CHUNK, 0.0), False)
+    assert queue.rest() is None
+    assert queue.act({"t": 7})[0] == 700
+    queue.drop()
+    assert queue.rest() is None
+    assert queue.policy.seeds == []
+    assert queue.act({"t": 8})[0] == 800

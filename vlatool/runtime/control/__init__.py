@@ -9,16 +9,38 @@ parameters with a default are options, which follow the name: ``rtc:delay=8:blen
 from __future__ import annotations
 
 import inspect
+import itertools
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple, get_args, get_type_hints
+from collections.abc import Mapping, Sequence
+from types import UnionType
+from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from vlatool import registry
+from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import PluginError, UsageError
 from vlatool.runtime.interface import Controller, Policy
 
 KIND, DEFAULT_PLAYER, PLAYER_WITH_DELAY = "control", "chunked", "late"
+RANKS = {"deadline": 1, "fallback": 3, "envelope": 5}
+"""Entry -> its place between others: policy wrappers are 0, a player 2, controller wrappers 4."""
+OUTSIDE = {
+    1: "the deadline does not limit the time of what is outside of it",
+    2: "a wrapper of a policy needs a policy, and a player is a controller",
+    3: "a wrapper of a policy, a player and a deadline have to be inside of the fallback, which answers for them",
+    4: "the actions of a fallback would pass by the wrapper inside of it",
+    5: "it would change an action after the envelope has checked it",
+}
+"""Place of a layer -> why nothing that belongs further inside may be around it."""
+SINGLE = {
+    1: "there is one deadline for an action",
+    2: "one player plays the chunks of the policy",
+    3: "one fallback answers for the policy",
+    5: "an action is checked once, by what moves the robot last",
+}
+
+
 TRUTH = {"true": True, "false": False}
+WRITABLE = (bool, int, float, str)
 
 
 class _Layer(NamedTuple):
@@ -40,28 +62,64 @@ def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
         UsageError: when a name, an option or a value is unknown, two entries play the policy, or the player does not
             support a delay.
     """
-    return [layer.entry for layer in _layers(names, delayed)]
+    return check_order([layer.entry for layer in _layers(names, delayed)])
+
+
+def check_order(entries: Sequence[type]) -> list[type]:
+    """Return layers around a policy, the innermost first, if their order makes sense.
+
+    Raises:
+        UsageError: when one would not do what it is for: it says which, and why.
+    """
+    order = list(entries)
+    for inner, outer in itertools.combinations(order, 2):
+        ranks = _rank(inner), _rank(outer)
+        if ranks[0] > ranks[1] or (ranks[0] == ranks[1] and ranks[0] in SINGLE):
+            reason = SINGLE[ranks[1]] if ranks[0] == ranks[1] else OUTSIDE[ranks[0]]
+            raise UsageError(f"{outer.__name__} cannot be around {inner.__name__}: {reason}.",
+                             "name each once; from the inside: wrappers of the policy, deadline, the player, fallback, "
+                             "wrappers of the controller, envelope")  # fmt: skip
+    return order
 
 
 def build_controller(policy: Policy, names: Sequence[str] = (), delay: int = 0) -> Controller:
     """Return a controller that acts with a policy: ``chunked``, ``late`` if there is a delay, or the named one.
 
     Args:
-        names: As ``layers`` takes them, inner ones first; policy wrappers are always innermost.
+        names: Names of entries of the kind ``control``, inner ones first; policy wrappers are always innermost.
         delay: Number of control steps that an inference takes.
 
     Raises:
         UsageError: as ``layers`` does, and as the entries do for their options.
         PluginError: when an entry lacks a method of the protocols.
     """
-    made: Any = policy
-    for entry, options in _layers(names, delay > 0):
-        given = {"spec": policy.spec, **({"delay": delay} if delay else {}), **options}
-        made = entry(made, **{name: value for name, value in given.items() if _takes(entry, name)})
-        if not isinstance(made, Controller if _layer(entry) else Policy):
-            raise PluginError(f"{entry.__name__}, an entry of vlatool.{KIND}, lacks methods or properties.",
-                              "give it those of a protocol in vlatool/runtime/interface.py")  # fmt: skip
-    return made  # type: ignore[no-any-return]
+    acting: Any = policy
+    chosen = options_of(names)
+    for entry in layers(names, delayed=delay > 0):
+        acting = build_layer(entry, acting, delay, spec=policy.spec, options=chosen.get(entry, {}))
+    return acting  # type: ignore[no-any-return]
+
+
+def options_of(names: Sequence[str]) -> dict[type, dict[str, Any]]:
+    """Return the options behind names of entries; raises UsageError as ``layers`` does."""
+    return dict(_parsed(name) for name in names)
+
+
+def build_layer(
+    entry: type, inner: Any, delay: int = 0, *, spec: PolicySpec | None = None, options: Mapping[str, Any] | None = None
+) -> Any:
+    """Return a layer around another, with what it takes of these; raises PluginError as ``build_controller``."""
+    given = {**({"spec": spec} if spec else {}), **({"delay": delay} if delay else {}), **(options or {})}
+    layer = entry(inner, **{name: value for name, value in given.items() if _takes(entry, name)})
+    if not isinstance(layer, Controller if _layer(entry) else Policy):
+        raise PluginError(f"{entry.__name__}, an entry of vlatool.{KIND}, lacks methods or properties.",
+                          "give it those of a protocol in vlatool/runtime/interface.py")  # fmt: skip
+    return layer
+
+
+def takes_delay(entry: type) -> bool:
+    """Return whether a controller acts while its policy infers."""
+    return _takes(entry, "delay")
 
 
 def _layers(names: Sequence[str], delayed: bool) -> list[_Layer]:
@@ -95,18 +153,22 @@ def _parsed(named: str) -> _Layer:
     return _Layer(entry, options)
 
 
-def _option_types(entry: type) -> dict[str, tuple[type, ...]]:
+def _option_types(entry: type) -> dict[str, tuple[Any, ...]]:
     """Return the parameters of an entry that have a default and a type that can be written -> their types."""
     hints = get_type_hints(entry.__init__)  # type: ignore[misc]
     defaults = {
         name for name, parameter in inspect.signature(entry).parameters.items()
         if parameter.default is not inspect.Parameter.empty
     }  # fmt: skip
-    types = {name: get_args(hints[name]) or (hints[name],) for name in defaults if name in hints}
-    return {name: kinds for name, kinds in types.items() if {bool, int, float, str} & set(kinds)}
+    types = {name: _union(hints[name]) for name in defaults if name in hints}
+    return {name: kinds for name, kinds in types.items() if any(kind in WRITABLE for kind in kinds)}
 
 
-def _value(where: str, text: str, types: tuple[type, ...]) -> Any:
+def _union(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def _value(where: str, text: str, types: tuple[Any, ...]) -> Any:
     """Return the value that a text says, of the first of some types that it can be; raises UsageError for none."""
     if bool in types and text in TRUTH:
         return TRUTH[text]
@@ -128,6 +190,10 @@ def _value(where: str, text: str, types: tuple[type, ...]) -> Any:
 def _layer(entry: type) -> int:
     """Return 0 for a policy wrapper, 1 for a player of a policy, 2 for a controller wrapper."""
     return hasattr(entry, "act") * (1 + (not _takes(entry, "policy")))
+
+
+def _rank(entry: type) -> int:
+    return RANKS.get(registry.entry_of(entry).rpartition(".")[2], 2 * _layer(entry))
 
 
 def _takes(entry: type, parameter: str) -> bool:

@@ -13,7 +13,7 @@ from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.control._elements import ActionElements
 from vlatool.runtime.control._inference import BackgroundInference, Inference, PlayedInference
 from vlatool.runtime.control.chunked import ChunkQueue
-from vlatool.runtime.interface import Array, Policy
+from vlatool.runtime.interface import CHUNK, HOLD, POLICY, Array, Origin, Policy
 
 
 class AsynchronousController(ChunkQueue):
@@ -58,6 +58,8 @@ class AsynchronousController(ChunkQueue):
         super()._forget()
         self._inference.cancel()
         self._last: Array | None = None
+        self._asked_at = self._observed = 0.0
+        """When the inference started, and when the one did whose chunk is executed."""
         self._steps = 0
         """Control steps since the inference started that runs, or that ran last."""
         self._executed = 0.0
@@ -84,6 +86,7 @@ class AsynchronousController(ChunkQueue):
         if chunk is None:
             return False
         self._delays.append(self._steps)
+        self._observed = self._asked_at
         self._begin(chunk)
         return True
 
@@ -94,9 +97,12 @@ class AsynchronousController(ChunkQueue):
     def _start(self, observation: Mapping[str, Any]) -> bool:
         """Start an inference; return whether its chunk is there at once: the first one is waited for."""
         self._inference.start(self._asked(observation))
+        self._asked_at = self._clock()
         self._steps, self._executed = 0, 0.0
         if self._last is None:
-            self._begin(self._inference.wait())
+            chunk = self._inference.wait()
+            self._observed = self._asked_at
+            self._begin(chunk)
             return True
         return self._arrival()
 
@@ -108,7 +114,19 @@ class AsynchronousController(ChunkQueue):
         self._pending = list(chunk[int(self._executed) :])
         self._position = self._executed
 
+    def rest(self) -> Array | None:
+        """Return the next action of the last chunk; None when there is none. It answers a step that has no other."""
+        with self._turn:
+            if not self._pending:
+                return None
+            self.fresh = False
+            self._steps += 1
+            self._last = self._next()
+            self.origin = self.origin._replace(source=CHUNK)
+            return self._last
+
     def _next(self) -> Array:
+        self.origin = Origin(POLICY if self._pending else HOLD, (self._clock() - self._observed) * 1e3)
         if not self._pending:
             if self._last is None:
                 raise UsageError("The policy gives a chunk without actions.", "let it give one action at least")

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from vlatool.errors import UsageError
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.interface import Array, Policy, observer_of
+from vlatool.runtime.interface import CHUNK, Action, Array, Origin, Policy, observer_of
 
 
 class ChunkQueue:
@@ -21,25 +22,30 @@ class ChunkQueue:
 
     Args:
         execute: Number of actions to execute from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
+        clock: Returns seconds; the age of actions is measured with it.
 
     Raises:
         UsageError: when ``execute`` is not a whole number from 0.
         PluginError: when inputs of the policy hold several moments, and it has no ``observe``.
     """
 
-    def __init__(self, policy: Policy, execute: int = 0) -> None:
+    def __init__(self, policy: Policy, execute: int = 0, *, clock: Callable[[], float] = time.monotonic) -> None:
         check_whole("execute", execute, 0)
         self.policy = policy
         self._observer = observer_of(policy)
         self.execute = execute or policy.spec.execute or policy.spec.chunk
         self.fresh = False
         """Whether the last action was the first of a chunk."""
+        self.origin = Origin("")
+        """Where the last action came from."""
+        self._clock = clock
         self._turn = threading.RLock()  # a signal may arrive between acquiring the lock and setting the owner
         self._owner = 0
         self._forget()
 
     def _forget(self) -> None:
         self._pending: list[Array] = []
+        self._rest: Iterator[Array] = iter(())
 
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step: (A,) float32, or a 0-d int64 index of a discrete action.
@@ -63,10 +69,40 @@ class ChunkQueue:
     def _step(self, observation: Mapping[str, Any]) -> Array:
         self.fresh = not self._pending
         if self.fresh:
-            self._pending = list(self.policy.infer(observation).chunk[: self.execute])
+            self._play(self.policy.infer(observation), self._clock())
         elif self._observer is not None:
             self._observer.observe(observation)
+        self._note()
         return self._pending.pop(0)
+
+    def _play(self, action: Action, arrived: float, skip: int = 0) -> None:
+        """Take the actions of a chunk from now on, without the first ``skip``; it arrived at a time of the clock."""
+        last = skip + self.execute
+        self._pending, self._rest = list(action.chunk[skip:last]), iter(action.chunk[last:])
+        self._played, self._arrived = action, arrived
+
+    def _note(self, source: str = "") -> None:
+        """Store where the action of this step comes from: the chunk that is played, or ``source`` with its age."""
+        origin = self._played.origin((self._clock() - self._arrived) * 1e3)
+        self.origin = origin._replace(source=source) if source else origin
+
+    def rest(self) -> Array | None:
+        """Return the next action of the last chunk, also beyond those to execute; None when there is none.
+
+        It answers a control step for which no inference came in time.
+        """
+        with self._turn:
+            action = self._pending.pop(0) if self._pending else next(self._rest, None)
+            if action is None:
+                return None
+            self.fresh = False
+            self._note(CHUNK)
+            return np.asarray(action)
+
+    def drop(self) -> None:
+        """Discard the pending actions, so that the next step infers; the policy keeps its values."""
+        with self._turn:
+            self._forget()
 
     def reset(self, seed: int | None = None) -> None:
         """Discard the pending actions and the values that the policy keeps from step to step.

@@ -11,7 +11,7 @@ from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError, fix_for, suggest
 from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.control._elements import ActionElements, minimum_jerk
-from vlatool.runtime.interface import Array, Controller
+from vlatool.runtime.interface import Array, Controller, Origin, origin_of
 
 METHODS: dict[str, Callable[[float], float]] = {"linear": float, "minimum_jerk": minimum_jerk}
 """Name -> share of the way at a share of the time."""
@@ -56,6 +56,11 @@ class InterpolatingController:
         self._steps = 0
         self._before: Array | None = None
         self._target: Array | None = None
+
+    @property
+    def origin(self) -> Origin:
+        """Where the last action came from, as the controller says it."""
+        return origin_of(self.controller)
 
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this step of the faster control loop: (A,) float32.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from vlatool.bundle.spec import TensorSpec
 from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.control.chunked import ChunkQueue
-from vlatool.runtime.interface import Array, Policy
+from vlatool.runtime.interface import CHUNK, HOLD, Action, Array, Policy
 
 STOPPABLE_MODES = ("delta", "velocity")
 """Action modes in which 0 means no motion."""
@@ -28,43 +29,48 @@ class LateController(ChunkQueue):
     Args:
         execute: Number of actions to execute from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
         delay: Number of whole control steps that an inference takes; 0 if it ends within the step in which it starts.
+        clock: Returns seconds; the age of actions is measured with it.
 
     Raises:
         UsageError: when ``execute`` or ``delay`` is not a whole number from 0.
     """
 
-    def __init__(self, policy: Policy, execute: int = 0, *, delay: int = 0) -> None:
+    def __init__(
+        self, policy: Policy, execute: int = 0, *, delay: int = 0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         check_whole("delay", delay, 0)
         self._delay = delay
-        super().__init__(policy, execute)
+        super().__init__(policy, execute, clock=clock)
 
     def _forget(self) -> None:
         super()._forget()
-        self._rest: list[Array] = []
-        self._coming: Array | None = None
+        self._coming: tuple[Action, float] | None = None
         self._wait = self._taken = 0
         self._last: Array | None = None
 
     def _step(self, observation: Mapping[str, Any]) -> Array:
         if not self._pending and self._coming is None:
-            self._coming = self.policy.infer(observation).chunk
+            self._coming = self.policy.infer(observation), self._clock()
             self._wait, self._taken = (0 if self._last is None else self._delay), 0
         elif self._observer is not None:
             self._observer.observe(observation)
         self.fresh = self._coming is not None and self._wait == 0
         if self._coming is not None and self._wait == 0:
-            chunk = list(self._coming[self._taken :])
-            self._pending, self._rest, self._coming = chunk[: self.execute], chunk[self.execute :], None
+            self._play(*self._coming, self._taken)
+            self._coming = None
         self._last = np.asarray(self._next())
         return self._last
 
     def _next(self) -> Array:
         if self._pending:
+            self._note()
             return self._pending.pop(0)
         self._wait -= 1
-        if self._rest:
+        if (row := next(self._rest, None)) is not None:
             self._taken += 1
-            return self._rest.pop(0)
+            self._note(CHUNK)
+            return row
+        self._note(HOLD)
         return hold(self.policy.spec.action, self._last)
 
 

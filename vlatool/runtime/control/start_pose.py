@@ -13,7 +13,7 @@ from vlatool.errors import DataError, UsageError
 from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.control._elements import ActionElements, minimum_jerk
 from vlatool.runtime.converter import newest_moment
-from vlatool.runtime.interface import Array, Controller
+from vlatool.runtime.interface import Array, Controller, Origin, origin_of
 
 MODES = ("delta", "velocity", "absolute")
 LONGEST = 2.0
@@ -66,6 +66,11 @@ class StartPose:
         """Whether the next step belongs to the way to the start pose."""
         self._start: Array | None = None
         self._step = 0
+
+    @property
+    def origin(self) -> Origin:
+        """Where the last action came from: the controller, or ``start_pose`` on the way."""
+        return Origin("start_pose") if self.moving else origin_of(self.controller)
 
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step: on the way to the pose, or that of the controller.

@@ -52,8 +52,9 @@ class TemporalEnsemble(ChunkQueue):
         self._counts = np.empty(0, np.int64)
 
     def _step(self, observation: Mapping[str, Any]) -> Array:
-        chunk = np.asarray(self.policy.infer(observation).chunk, np.float32)
-        self.fresh = True
+        action = self.policy.infer(observation)
+        chunk = np.asarray(action.chunk, np.float32)
+        self.fresh, self.origin = True, action.origin()
         earlier = len(self._mean)
         mean = np.concatenate([self._updated(chunk[:earlier]), chunk[earlier:]]) if earlier else chunk
         counts = np.concatenate([self._counts + 1, np.ones(len(chunk) - earlier, np.int64)])

@@ -78,6 +78,7 @@ class OnnxRuntimeSession(Engine):
         self._check_providers(path)
         self.path = path
         self.deadline: float | None = None
+        self._options: Any = None
         self._run = self._session.run
         self.outputs = [node.name for node in self._session.get_outputs()]
         self.takes = {node.name: port_of(node) for node in self._session.get_inputs()}
@@ -166,18 +167,34 @@ class OnnxRuntimeSession(Engine):
 
         Raises:
             GraphError: when ONNX Runtime fails on these inputs.
-            TimeoutError: when ``deadline`` (seconds of ``time.monotonic``; none when None) passes.
+            TimeoutError: when ``deadline`` (seconds of ``time.monotonic``; none when None) passes, or after ``stop``.
         """
         try:
             if self.deadline is not None:
                 return self._run_until(self.deadline, feeds)
-            return self._call(feeds)
+            return self._call(feeds, self._options)
         except TimeoutError:
             raise
         except Exception as error:
+            if self._options is not None and self._options.terminate:
+                raise TimeoutError from None
             raise GraphError(
                 f"ONNX Runtime failed in {self.path.name}: {_first_line(error)}", REMEDY.format(package="onnxruntime")
             ) from error
+
+    def stop(self) -> None:
+        """End the run in progress before its next node; it and later ones raise TimeoutError until ``resume``.
+
+        Nothing happens before the first call of ``resume``, which gives runs the options that this needs.
+        """
+        if self._options is not None:
+            self._options.terminate = True
+
+    def resume(self) -> None:
+        """Allow runs again, which ``stop`` can end from now on."""
+        if self._options is None:
+            self._options = quiet_run_options()
+        self._options.terminate = False
 
     def leave_on_device(self, outputs: Collection[str], inputs: Collection[str]) -> None:
         """Leave outputs in this session's memory from now on, and expect inputs that others left there.
@@ -206,8 +223,7 @@ class OnnxRuntimeSession(Engine):
         left = deadline - time.monotonic()
         if left <= 0:
             raise TimeoutError
-        options = require("onnxruntime", "ort").RunOptions()
-        options.log_severity_level = 4
+        options = quiet_run_options()
         timer = threading.Timer(left, setattr, (options, "terminate", True))
         timer.daemon = True
         timer.start()
@@ -320,6 +336,13 @@ def session_options(ort: Any, threads: int | None) -> Any:
     options.log_severity_level = 3
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
     options.inter_op_num_threads = 1
+    return options
+
+
+def quiet_run_options() -> Any:
+    """Return options of a run that logs nothing but fatal errors: being stopped is none."""
+    options = require("onnxruntime", "ort").RunOptions()
+    options.log_severity_level = SILENT
     return options
 
 

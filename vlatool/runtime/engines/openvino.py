@@ -109,6 +109,7 @@ class OpenvinoSession(Engine):
         self.takes = {name: _port(port) for name, port in self._inputs.items()}
         self.gives = {name: _port(port) for name, port in outputs.items()}
         self.deadline: float | None = None
+        self._stoppable = self._stopped = False
         self._buffers = self._bound(openvino)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -116,11 +117,13 @@ class OpenvinoSession(Engine):
 
         Raises:
             GraphError: when an input is missing or of another dtype, or OpenVINO fails on these inputs.
-            TimeoutError: when ``deadline`` (seconds of ``time.monotonic``; none when None) passes.
+            TimeoutError: when ``deadline`` (seconds of ``time.monotonic``; none when None) passes, or after ``stop``.
         """
         try:
             if self.deadline is not None:
                 self._run_until(self.deadline, feeds)
+            elif self._stoppable:
+                self._run_stoppable(feeds)
             elif self._buffers and self._fill(feeds):
                 self._request.infer()
             else:
@@ -143,11 +146,7 @@ class OpenvinoSession(Engine):
         left = deadline - time.monotonic()
         if left <= 0:
             raise TimeoutError
-        if self._buffers and self._fill(feeds):
-            self._request.start_async()
-        else:
-            self._check(feeds)
-            self._request.start_async(feeds)
+        self._start(feeds)
         if self._request.wait_for(max(1, int(left * 1e3))):
             self._request.wait()
             return
@@ -157,6 +156,40 @@ class OpenvinoSession(Engine):
                 ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
             raise TimeoutError(", but OpenVINO goes on with it until this process ends")
         raise TimeoutError
+
+    def _run_stoppable(self, feeds: Mapping[str, Any]) -> None:
+        """Run as a request that another thread can cancel, which ``infer`` is not (2026.4: it ignores ``cancel``)."""
+        if self._stopped:
+            raise TimeoutError
+        self._start(feeds)
+        if self._stopped:  # between the two lines above
+            self._request.cancel()
+        try:
+            self._request.wait()
+        except RuntimeError:
+            if self._stopped:
+                raise TimeoutError from None
+            raise
+
+    def _start(self, feeds: Mapping[str, Any]) -> None:
+        if self._buffers and self._fill(feeds):
+            self._request.start_async()
+        else:
+            self._check(feeds)
+            self._request.start_async(feeds)
+
+    def stop(self) -> None:
+        """End the run in progress between two nodes; it and later ones raise TimeoutError until ``resume``.
+
+        A loop within the graph goes on. Nothing happens before the first call of ``resume``.
+        """
+        self._stopped = self._stoppable
+        if self._stopped:
+            self._request.cancel()
+
+    def resume(self) -> None:
+        """Allow runs again, which ``stop`` can end from now on."""
+        self._stoppable, self._stopped = True, False
 
     def _bound(self, openvino: Any) -> dict[str, NDArray[Any]]:
         """Set our own arrays as the request's inputs, once; none when a shape is dynamic or a type not numpy's.

@@ -12,7 +12,7 @@ from mutations import mutated, read
 
 
 def test_mutants_are_refused_or_answer_as_before():
-    count = small_or_full(120, 300)
+    count = small_or_full(60, 300)
     found = mutants.soak(count, seed=7, workers=1)
     assert {name: found.counts[name] for name in mutants.ZERO} == dict.fromkeys(mutants.ZERO, 0), found.examples
     told = sum(count for name, count in found.counts.items() if name.startswith(mutants.REFUSED))

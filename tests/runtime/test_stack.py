@@ -1,0 +1,334 @@
+"""The layers between a policy and a robot: in their one order, each asked for by an argument of ``load``."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from _fake_clock import FakeClock, FakeWorker, SlowPolicy
+from _numbered import MOVES, NumberedPolicy, spec_of
+from _written import written
+
+from vlatool import registry
+from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.errors import DeadlineMissed, GraphError, ProfileError, UsageError
+from vlatool.runtime import Policy, load
+from vlatool.runtime.control import check_order, layers
+from vlatool.runtime.control.checked import CheckedPolicy
+from vlatool.runtime.control.chunked import ChunkQueue
+from vlatool.runtime.control.deadline import Deadline
+from vlatool.runtime.control.fallback import FallbackLadder
+from vlatool.runtime.control.late import LateController
+from vlatool.runtime.envelope import RobotLimits
+from vlatool.runtime.interface import CHUNK, FALLBACK, HOLD, POLICY, STOP, Action, Controller, Origin, origin_of
+from vlatool.runtime.stack import SWITCH_S, Fallback, Stack, TickRecord, build_stack, prepare_process
+
+POSITIONS = TensorSpec("a", (1, 1, 2), labels=("x", "gripper"), mode="absolute")
+
+
+class Bounded:
+    """An envelope: no action above 150."""
+
+    def __init__(self, controller: Controller) -> None:
+        self.controller = controller
+        self.origin = Origin("")
+
+    fresh = property(lambda self: self.controller.fresh)
+
+    def act(self, observation: Any) -> Any:
+        action = self.controller.act(observation)
+        within = np.minimum(action, np.float32(150))
+        self.origin = origin_of(self.controller)
+        if (within != action).any():
+            self.origin = self.origin.altered_by("bounds")
+        return within
+
+    def reset(self, seed: int | None = None) -> None:
+        self.controller.reset(seed)
+
+
+class Stopping(Bounded):
+    """Also knows how to stop."""
+
+    stops = 0
+
+    def stop(self) -> Any:
+        self.stops += 1
+        return np.full(2, -self.stops, np.float32)
+
+
+def fake(stack: Stack, clock: FakeClock) -> Stack:
+    for deadline in stack.deadlines:
+        deadline._worker = FakeWorker(clock)
+    return stack
+
+
+def built(delays_ms: list[float] = [], **more: Any) -> tuple[Any, Stack, FakeClock]:  # noqa: B006 - not changed
+    clock = FakeClock()
+    policy = SlowPolicy(spec_of(2, 1, POSITIONS), clock, delays_ms)
+    return policy, fake(build_stack(policy, clock=clock, **more), clock), clock
+
+
+def names(stack: Stack) -> list[str]:
+    return [type(layer).__name__ for layer in stack.layers]
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [({}, "ChunkQueue CheckedPolicy"), ({"deadline_ms": 10}, "FallbackLadder ChunkQueue Deadline CheckedPolicy"),
+     ({"envelope": Bounded}, "Bounded ChunkQueue CheckedPolicy"),
+     ({"fallback": Fallback()}, "FallbackLadder ChunkQueue CheckedPolicy"),
+     ({"envelope": Bounded, "deadline_ms": 50, "controllers": ["late"]},
+      "Bounded FallbackLadder LateController Deadline CheckedPolicy")],
+)  # fmt: skip
+def test_each_layer_is_where_it_belongs(asked: dict[str, Any], expected: str):
+    policy, stack, _ = built(**asked)
+    assert names(stack) == [*expected.split(), "SlowPolicy"]
+    assert isinstance(stack, Controller)
+    assert (stack.policy, stack.spec) == (policy, policy.spec)
+
+
+def test_an_action_goes_through_all_layers_and_says_so():
+    records: list[TickRecord] = []
+    _, stack, clock = built([4.0, 2.0, 99.0, 99.0], deadline_ms=10, envelope=Bounded, telemetry=records.append)
+    for step in range(4):
+        clock.now = step * 0.05 + 0.001
+        action = stack.act({"t": step}, scheduled=step * 0.05)
+        assert action[0] == [0, 100, 101, 101][step]
+        assert records[-1].action is action
+    assert [record.origin.source for record in records] == [POLICY, POLICY, CHUNK, HOLD]
+    assert [record.missed for record in records] == [False, False, True, True]
+    assert [record.answer_ms for record in records] == pytest.approx([5, 3, 10, 10]), "from when it was to begin"
+    assert [record.waited_ms for record in records] == pytest.approx([1] * 4)
+    assert "no action within 10 ms" in records[2].error
+    assert [(record.step, record.rung, record.level) for record in records[2:]] == [(2, 1, 0), (3, 2, 0)]
+    _, stack, _ = built(envelope=Bounded)
+    stack.act({"t": 7})
+    assert stack.origin.checks == ("bounds",)
+
+
+def test_an_envelope_stops_the_robot_itself_where_it_can():
+    records: list[TickRecord] = []
+    _, stack, clock = built([0.0, 0.0, *[99.0] * 3], deadline_ms=10, envelope=Stopping, telemetry=records.append)
+    first = [float(stack.act({"t": step})[0]) for step in range(6) for clock.now in [step * 0.05]]
+    assert first == [0, 100, 101, -1, -2, -3], "the third miss escalates, and recovery takes five"
+    assert [record.origin.source for record in records] == [POLICY, POLICY, CHUNK, STOP, STOP, STOP]
+
+
+def test_a_second_policy_has_its_part_of_the_deadline():
+    clock = FakeClock()
+    first, second = (SlowPolicy(spec_of(1, action=POSITIONS), clock, [late, 4.0]) for late in (99.0, 4.0))
+    options = Fallback(second, policy_ms=4.0)
+    stack = fake(build_stack(first, deadline_ms=10, fallback=options, clock=clock), clock)
+    assert [deadline.deadline_ms for deadline in stack.deadlines] == [6, 10]
+    assert stack.act({"t": 3})[0] == 300
+    assert (stack.origin, clock.now) == (Origin(FALLBACK, 4.0), pytest.approx(0.01))
+    with pytest.raises(UsageError, match=r"10 of 10 ms are kept for the second policy; nothing is left"):
+        build_stack(first, deadline_ms=10, fallback=Fallback(second, policy_ms=10.0))
+    assert build_stack(first, deadline_ms=10, fallback=second).deadlines[0].deadline_ms == 5
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [(spec_of(2), "has the mode 'delta', that of the first 'absolute'"),
+     (spec_of(2, action=TensorSpec("a", (1, 1, 2), labels=("y", "gripper"), mode="absolute")), "has the labels"),
+     (spec_of(2, action=TensorSpec("a", (1, 1, 3), mode="absolute")), "has the labels"),
+     (spec_of(2, action=POSITIONS, hz=10.0), "at 10.0 Hz"),
+     (spec_of(2, action=TensorSpec("a", (1, 1, 2), labels=("x", "gripper"), mode="absolute", unit="mm")), "acts in")],
+)  # fmt: skip
+def test_a_second_policy_whose_actions_mean_something_else_is_refused(other: PolicySpec, message: str):
+    with pytest.raises(UsageError, match=message):
+        built(fallback=NumberedPolicy(other))
+
+
+def test_what_a_policy_of_others_gives_wrong_never_reaches_the_robot():
+    random = np.random.default_rng(0)
+
+    class Wrong(NumberedPolicy):
+        def infer(self, observation: Any, *, noise: Any = None) -> Any:
+            action = super().infer(observation)
+            return action if observation["t"] % 7 == 0 else action._replace(chunk=_corrupted(action.chunk, random))
+
+    stack = build_stack(Wrong(spec_of(2, 1, POSITIONS)), fallback=Fallback(misses=10**6, window=10**6, hold_s=1e6))
+    for step in range(2000):
+        action = stack.act({"t": step})
+        assert (action.shape, action.dtype) == ((2,), np.float32)
+        assert int(action[0]) // 100 % 7 == 0
+    assert stack.ladder is not None
+    assert stack.ladder.level == 0
+
+
+def _corrupted(chunk: Any, random: np.random.Generator) -> Any:
+    kind = random.integers(6)
+    if kind < 3:
+        worse = chunk.copy()
+        worse[random.integers(len(chunk)), random.integers(2)] = [np.nan, np.inf, -np.inf][kind]
+        return worse
+    return (chunk[:, :1], chunk[:1], chunk.astype([np.float64, np.float16, np.int64][random.integers(3)]))[kind - 3]
+
+
+def test_a_sink_that_fails_does_not_stop_the_robot():
+    def full(record: TickRecord) -> None:
+        raise OSError("no space left on device")
+
+    _, stack, _ = built(telemetry=full)
+    assert stack.act({"t": 1})[0] == 100
+    assert stack.failed_records == 1
+
+
+def test_an_error_is_recorded_and_raised_where_nothing_answers():
+    records: list[TickRecord] = []
+    _, stack, _ = built([99.0], deadline_ms=10, telemetry=records.append)
+    with pytest.raises(DeadlineMissed):
+        stack.act({"t": 0})
+    assert (records[0].missed, records[0].action, records[0].origin) == (True, None, Origin(""))
+
+
+@pytest.mark.parametrize("wrong", [0, -5, float("inf") * -1, "10"])
+def test_a_deadline_that_is_none_is_refused(wrong: Any):
+    with pytest.raises(UsageError, match="deadline_ms"):
+        built(deadline_ms=wrong)
+
+
+def test_a_deadline_longer_than_a_step_is_refused_where_the_step_waits_for_it():
+    with pytest.raises(UsageError, match="60 ms is longer than the control period of 50 ms") as caught:
+        built(deadline_ms=60)
+    assert "up to 50" in caught.value.fix
+    assert built(deadline_ms=60, controllers=["late"])[1].deadlines[0].deadline_ms == 60
+
+
+def test_an_order_that_makes_no_sense_is_refused_with_the_reason(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(registry, "entry_of", lambda kind: "control.envelope" if kind is Bounded else
+                        f"control.{kind.__module__.rpartition('.')[2]}")  # fmt: skip
+    right = [CheckedPolicy, Deadline, ChunkQueue, FallbackLadder, Bounded]
+    assert check_order(right) == right
+    for wrong, reason in (
+        ([Deadline, CheckedPolicy], "CheckedPolicy cannot be around Deadline: the deadline does not limit the time"),
+        ([Deadline, Deadline], "there is one deadline"), ([ChunkQueue, LateController], "one player plays"),
+        ([ChunkQueue, Deadline], "a wrapper of a policy needs a policy"),
+        ([ChunkQueue, Bounded, FallbackLadder], "would change an action after the envelope has checked it"),
+        ([ChunkQueue, FallbackLadder, FallbackLadder], "one fallback answers"),
+        ([ChunkQueue, Bounded, Bounded], "an action is checked once"),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=reason):
+            check_order(wrong)
+
+
+def test_layers_by_name_are_put_in_their_order():
+    with pytest.raises(UsageError, match="CheckedPolicy cannot be around Deadline"):
+        layers(["deadline", "checked"])
+    assert layers(["fallback", "checked", "deadline"]) == [CheckedPolicy, Deadline, ChunkQueue, FallbackLadder]
+
+
+@pytest.mark.parametrize("twice", ["deadline", "fallback"])
+def test_a_layer_that_is_named_and_asked_for_is_there_twice_and_refused(twice: str):
+    with pytest.raises(UsageError, match=f"one {twice}"):
+        built(deadline_ms=10, controllers=[twice])
+
+
+def test_load_gives_the_policy_unless_a_layer_is_asked_for(tmp_path: Path):
+    path = written(tmp_path, "g (float[1,2] x) => (float[1,2] y) { y = Neg(x) }").path
+    assert type(load(path, threads=1, engine="auto")) is Policy
+    interval = sys.getswitchinterval()
+    try:
+        hold = Fallback(start=[0.0, 0.0])
+        stack = load(path, threads=1, deadline_ms=50, fallback=hold, envelope=Bounded, telemetry=print)
+        assert isinstance(stack, Stack)
+        assert names(stack) == ["Bounded", "FallbackLadder", "ChunkQueue", "Deadline", "BundlePolicy"]
+        assert stack.act({"x": [1, 2]}).tolist() == [-1, -2]
+        assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+        stack.reset(3)
+        stack.close()
+        backed = load(path, threads=1, deadline_ms=50, fallback=path)
+        assert isinstance(backed, Stack)
+        assert [deadline.deadline_ms for deadline in backed.deadlines] == [25, 50]
+        assert isinstance(load(path, threads=1, controllers=["late"]).controller, LateController)
+    finally:
+        sys.setswitchinterval(interval)
+        gc.unfreeze()
+
+
+def test_a_shorter_switch_interval_is_left_as_it_is():
+    interval = sys.getswitchinterval()
+    try:
+        sys.setswitchinterval(1e-4)
+        prepare_process()
+        assert sys.getswitchinterval() < 1.1e-4
+        assert gc.get_freeze_count() > 0
+    finally:
+        sys.setswitchinterval(interval)
+        gc.unfreeze()
+
+
+JOINTS = tuple(joint.name for joint in RobotLimits.named("franka-panda").joints)
+READY = [0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8]
+"""A pose within the limits, rad."""
+
+
+class Reaching(NumberedPolicy):
+    """Moves the first joint by a hundredth of a rad each step, until it fails."""
+
+    fails_from = 30
+
+    def infer(self, observation: Any, *, noise: Any = None) -> Action:
+        step = observation["t"]
+        if step >= self.fails_from:
+            raise GraphError("not finite")
+        pose = np.array([READY], np.float32)
+        pose[0, 0] += 0.01 * min(step, 10) ** 2 / 20 + 0.01 * max(0, step - 10)
+        return Action(pose, JOINTS, 0.0, step, {})
+
+
+def panda(**labels: Any) -> Any:
+    action = TensorSpec("a", (1, 1, 7), labels=JOINTS, mode="absolute", unit="rad")
+    seen = TensorSpec("q", (1, 7), **{"labels": JOINTS, **labels})
+    return Reaching(PolicySpec((seen,), (action,), 50.0))
+
+
+def test_a_robot_by_name_is_stopped_as_its_envelope_has_proven_where_the_policy_fails():
+    stack = build_stack(panda(), fallback=Fallback(misses=3), envelope="franka-panda")
+    played = [stack.act({"t": step, "q": np.array(READY)}) for step in range(60) if not pace(stack)]
+    sources = [type(stack.controller).__name__, stack.origin.source]
+    assert sources == ["EnvelopeController", STOP]
+    place = np.array(played)[:, 0]
+    speeds = np.diff(place) * 50
+    assert place[28] < place[29] <= place[30] <= place[59], "it slows down and does not go back"
+    assert abs(speeds[-5:]).max() < 1e-6, "and stands still"
+    assert abs(np.diff(speeds) * 50).max() < 15.1, "rad/s^2"
+
+
+def pace(stack: Any) -> None:
+    """Let the envelope see a control period go by."""
+    envelope = stack.controller.envelope
+    envelope.clock = lambda: envelope._time + 0.02 if envelope.ready else 0.0
+
+
+@pytest.mark.parametrize(
+    ("robot", "policy", "error", "message"),
+    [("no-such-robot", panda(), ProfileError, "no-such-robot"),
+     ("franka-panda", NumberedPolicy(spec_of()), UsageError, "has 2 elements"),
+     ("franka-panda", panda(labels=()), UsageError, "0 inputs have the labels of the action")],
+    ids=["robot", "width", "position"],
+)  # fmt: skip
+def test_limits_that_do_not_fit_are_refused(robot: str, policy: Any, error: type, message: str):
+    with pytest.raises(error, match=message):
+        build_stack(policy, envelope=robot)
+
+
+def test_velocities_ramp_down_in_the_time_that_is_asked_for():
+    clock = FakeClock()
+    speeds = TensorSpec("a", (1, 1, 2), labels=("x", "y"), mode="velocity")
+    policy = SlowPolicy(spec_of(1, action=speeds), clock, [0.0, 0.0, *[99.0] * 9])
+    stack = fake(build_stack(policy, deadline_ms=10, fallback=Fallback(ramp_s=0.2, misses=99), clock=clock), clock)
+    assert [stack.act({"t": step})[0] for step in range(6) for clock.now in [step * 0.05]] == [0, 100, 75, 50, 25, 0]
+
+
+def test_moves_are_zero_without_an_action():
+    clock = FakeClock()
+    policy = SlowPolicy(spec_of(1, action=MOVES), clock, [99.0])
+    stack = fake(build_stack(policy, deadline_ms=10, clock=clock), clock)
+    assert stack.act({"t": 0}).tolist() == [0, 0]

@@ -1,0 +1,167 @@
+"""A thread for one task at a time: what comes too late has no effect, and no second thread is started."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+
+import pytest
+
+from vlatool.errors import UsageError
+from vlatool.runtime.worker import Worker
+
+
+class Steps:
+    """A task that goes on until it is stopped or may end."""
+
+    def __init__(self, result: object = 1, *, ends: bool = True, stops: bool = True) -> None:
+        self.result, self.stops = result, stops
+        self.done, self.running = threading.Event(), threading.Event()
+        self.calls: list[str] = []
+        self.thread = ""
+        if ends:
+            self.done.set()
+
+    def begin(self) -> None:
+        self.calls.append("begin")
+
+    def run(self) -> object:
+        self.thread = threading.current_thread().name
+        self.running.set()
+        self.done.wait(20)
+        if isinstance(self.result, BaseException):
+            raise self.result
+        return self.result
+
+    def stop(self) -> None:
+        self.calls.append("stop")
+        if self.stops:
+            self.done.set()
+
+    def undo(self) -> None:
+        self.calls.append("undo")
+
+
+def soon(seconds: float = 10.0) -> float:
+    return time.monotonic() + seconds
+
+
+def free(worker: Worker) -> bool:
+    """Whether the worker gets free."""
+    end = soon()
+    while worker.busy and time.monotonic() < end:
+        time.sleep(0.001)
+    return not worker.busy
+
+
+def test_results_and_errors_come_from_one_thread_that_is_kept():
+    worker, tasks = Worker("w"), [Steps(number) for number in range(3)]
+    assert [worker.call(task, soon()) for task in tasks] == [0, 1, 2]
+    assert {task.thread for task in tasks} == {"w"}
+    assert [task.calls for task in tasks] == [["begin"]] * 3
+    with pytest.raises(KeyError, match="x"):
+        worker.call(Steps(KeyError("x")), soon())
+    assert worker.call(Steps(4), soon()) == 4
+    assert [thread.name for thread in threading.enumerate()].count("w") == 1
+    worker.close()
+    assert worker.call(Steps(5), soon()) == 5, "it starts again"
+    worker.close()
+
+
+@pytest.mark.parametrize("result", [1, KeyError("too late, too")])
+def test_what_does_not_end_in_time_is_stopped_and_taken_back(result: object):
+    worker, task = Worker(), Steps(result, ends=False)
+    with pytest.raises(TimeoutError, match="it was stopped"):
+        worker.call(task, soon(0.02))
+    assert free(worker)
+    assert task.calls == ["begin", "stop", "undo"][: 3 if result == 1 else 2]
+    assert worker.call(Steps(2), soon()) == 2
+    worker.close()
+
+
+def test_what_cannot_be_stopped_is_not_waited_for_and_no_thread_is_added():
+    worker, task = Worker("stuck"), Steps(ends=False, stops=False)
+    with pytest.raises(TimeoutError, match="it was stopped"):
+        worker.call(task, soon(0.02))
+    for _ in range(5):
+        with pytest.raises(TimeoutError, match="has not ended yet"):
+            worker.call(Steps(), soon())
+    assert worker.busy
+    assert [thread.name for thread in threading.enumerate()].count("stuck") == 1
+    assert task.calls == ["begin", *["stop"] * 6], "it is stopped again and again"
+    task.done.set()
+    assert free(worker)
+    assert task.calls[-1] == "undo"
+    assert worker.call(Steps(3), soon()) == 3
+    worker.close()
+
+
+def test_without_time_nothing_begins():
+    worker, task = Worker(), Steps()
+    with pytest.raises(TimeoutError, match="no time is left"):
+        worker.call(task, time.monotonic())
+    assert task.calls == []
+
+
+def test_what_ends_after_its_time_is_not_returned_even_if_the_caller_wakes_late():
+    times = [0.0, 2.0]
+    worker, task = Worker(clock=lambda: times.pop(0)), Steps()
+    with pytest.raises(TimeoutError, match="it ended too late"):
+        worker.call(task, 1.0)
+    assert task.calls == ["begin", "undo"]
+    worker.close()
+
+
+def test_two_callers_at_once_are_refused():
+    worker, task = Worker(), Steps(ends=False)
+    first = threading.Thread(target=lambda: worker.call(task, soon()))
+    first.start()
+    assert task.running.wait(10)
+    with pytest.raises(UsageError, match="Another caller waits"):
+        worker.call(Steps(), soon())
+    task.done.set()
+    first.join()
+    worker.close()
+
+
+def test_a_caller_who_is_interrupted_gives_the_task_up():
+    worker, task = Worker(), Steps(ends=False)
+    run, caller = task.run, threading.get_ident()
+
+    def interrupting() -> object:
+        signal.pthread_kill(caller, signal.SIGUSR1)
+        return run()
+
+    def interrupt(*_: object) -> None:
+        raise InterruptedError
+
+    task.run = interrupting  # type: ignore[method-assign]
+    before = signal.signal(signal.SIGUSR1, interrupt)
+    try:
+        with pytest.raises(InterruptedError):
+            worker.call(task, soon())
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert free(worker)
+    assert task.calls == ["begin", "stop", "undo"]
+    worker.close()
+
+
+def test_closing_stops_what_runs_and_waits_for_its_end():
+    worker, task = Worker("closing"), Steps(ends=False)
+    with pytest.raises(TimeoutError):
+        worker.call(Steps(ends=False, stops=False), time.monotonic() - 1)
+
+    def wait() -> None:
+        with pytest.raises(TimeoutError):
+            worker.call(task, soon(0.5))
+
+    caller = threading.Thread(target=wait)
+    caller.start()
+    assert task.running.wait(10)
+    worker.close()
+    caller.join()
+    assert task.calls == ["begin", "stop", "undo"]
+    assert not worker.busy
+    assert "closing" not in [thread.name for thread in threading.enumerate()]

@@ -1,0 +1,109 @@
+"""What the whole stack adds to ONNX Runtime's own ``run()``, call by call in turn, in one process.
+
+    python tests/validation/stack/overhead.py BUNDLE --pairs 20000
+    python tests/validation/stack/overhead.py --small --pairs 20000     # a product of 7 x 7, within a robot's envelope
+
+Deadline, fallback and telemetry are on. Both calls of a pair get the same observation; who goes first alternates. A
+pair counts where the stack infers. The processor's time is that of all threads of the process, which neighbours do not
+lengthen; the rest is by the clock.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "runtime"))
+from _written import written
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import TensorSpec
+from vlatool.data import observations_for
+from vlatool.runtime import load
+from vlatool.runtime.envelope import RobotLimits
+from vlatool.runtime.stack import Fallback, Stack
+
+SHARES = (10, 50, 99, 99.9)
+ROBOT = "franka-panda"
+
+
+def small_bundle(folder: Path) -> str:
+    """Write a policy that holds the pose of an arm of seven joints."""
+    joints = tuple(joint.name for joint in RobotLimits.named(ROBOT).joints)
+    pose = TensorSpec("q", (1, 7), labels=joints)
+    action = TensorSpec("y", (1, 7), labels=joints, mode="absolute")
+    text = f"g (float[1,7] q) => (float[1,7] y) <float[7,7] w = {{{', '.join(map(str, np.eye(7).ravel()))}}}>"
+    return str(written(folder / "bundle", f"{text} {{ y = MatMul(q, w) }}", (pose,), (action,)).path)
+
+
+def differences(
+    path: str, pairs: int, deadline_ms: float | None = None, robot: str | None = None, seen: Any = None
+) -> dict[str, np.ndarray]:
+    """Return microseconds of the bare calls, of the stack's, and stack minus bare of each pair.
+
+    Args:
+        robot: Whose envelope is around the stack; its clock goes on by a control period with each step.
+        seen: Observations; recorded or random ones when None.
+    """
+    plain = load(path, threads=1, seed=0)
+    spec = plain.spec
+    neutral = spec.action.labels[-1] if spec.action.kind == "discrete" else ""
+    hold = Fallback(start=np.zeros(spec.action.robot_width), neutral=neutral)
+    sink: deque[Any] = deque(maxlen=1000)
+    limit = 0.9e3 / spec.rate if deadline_ms is None else deadline_ms
+    stack = load(path, threads=1, seed=0, envelope=robot, deadline_ms=limit, fallback=hold, telemetry=sink.append)
+    assert isinstance(stack, Stack)
+    if robot is not None:
+        envelope = stack.controller.envelope
+        envelope.clock = lambda: envelope._time + 1 / spec.rate if envelope.ready else 0.0
+    observations = observations_for(Bundle.open(path), 16) if seen is None else seen
+    step = plain.program.steps[0]
+    session = getattr(plain.program.sessions[step.graph], "_session")  # noqa: B009
+    feeds = [{name: plain.encode(each)[value] for name, value in step.feeds.items()} for each in observations]
+    calls = ((lambda index: session.run(None, feeds[index])), (lambda index: stack.act(observations[index])))
+    taken: tuple[list[float], ...] = ([], [], [], [])
+    for pair in range(pairs + 200):
+        times, counts = [0.0] * 4, True
+        for kind in (0, 1) if pair % 2 else (1, 0):
+            used, begin = time.process_time_ns(), time.perf_counter_ns()
+            calls[kind](pair % len(observations))
+            times[kind] = (time.perf_counter_ns() - begin) / 1e3
+            times[2 + kind] = (time.process_time_ns() - used) / 1e3
+            counts &= kind == 0 or (stack.fresh and not sink[-1].missed)
+        if pair >= 200 and counts:
+            for values, value in zip(taken, times, strict=True):
+                values.append(value)
+    bare, whole, bare_used, whole_used = map(np.array, taken)
+    return {"bare run()": bare, "stack": whole, "stack minus bare, in pairs": whole - bare,
+            "the same of the processor's time": whole_used - bare_used}  # fmt: skip
+
+
+def main() -> None:
+    """Print percentiles."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("bundle", nargs="?", default="")
+    parser.add_argument("--small", action="store_true", help="the small policy in the place of a bundle")
+    parser.add_argument("--pairs", type=int, default=20_000)
+    parser.add_argument("--deadline-ms", type=float)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        if options.small:
+            pose = {"q": np.array([0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8], np.float32)}
+            found = differences(small_bundle(Path(folder)), options.pairs, options.deadline_ms, ROBOT, [pose])
+        else:
+            found = differences(options.bundle, options.pairs, options.deadline_ms)
+    for name, values in found.items():
+        shown = ", ".join(f"p{share:g} {np.percentile(values, share):.1f}" for share in SHARES)
+        print(f"{name}: {shown} us ({len(values)} pairs)")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+"""The scripts beside this file in their small form."""
+
+from __future__ import annotations
+
+import pytest
+from bad_outputs import graph_outputs, wrong_outputs
+from endless import endless
+from ticks import run
+
+
+@pytest.mark.parametrize("stubborn", [False, True])
+def test_every_step_is_answered_by_its_deadline_and_no_late_action_is_used(stubborn: bool):
+    found = run(2000, real=False, stubborn=stubborn)
+    assert (found["answered"], found["late actions used"]) == (2000, 0)
+    assert found["of which late"] > 300
+    assert found["answers more than 1 ms beyond"] == 0
+
+
+def test_by_the_clock_of_this_machine_too():
+    found = run(40, real=True)
+    assert (found["answered"], found["late actions used"]) == (40, 0)
+    assert found["of which late"] > 3
+
+
+def test_a_graph_without_end_is_stopped():
+    found = endless(2)
+    assert (found["stopped"], found["right afterwards"]) == (2, 2)
+
+
+def test_no_wrong_output_reaches_the_robot():
+    found = wrong_outputs(700)
+    assert (found["wrong"], found["reached the robot"]) == (600, 0)
+    assert found["kinds"] == 17
+    found = graph_outputs(100)
+    assert found["wrong"] > 50
+    assert found["reached the robot"] == 0

@@ -1,0 +1,79 @@
+"""``vlatool run``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vlatool.cli import _complete
+from vlatool.cli._document import answer
+from vlatool.cli._options import AsJson, BundlePath
+from vlatool.errors import UsageError
+
+if TYPE_CHECKING:
+    from vlatool.measurement.dry_run import DryRun
+
+
+def run(
+    bundle: BundlePath,
+    robot: Annotated[str, typer.Option(help="robot whose limits no action leaves; none when not given")] = "",
+    deadline_ms: Annotated[
+        float | None,
+        typer.Option("--deadline-ms", help="ms in which a control step is answered; the control period when not given"),
+    ] = None,
+    fallback: Annotated[
+        Path | None, typer.Option(help="bundle that acts where this one has no action in time", show_default=False)
+    ] = None,
+    neutral: Annotated[str, typer.Option(help="label of the discrete action without motion")] = "",
+    controller: Annotated[str, typer.Option(help="controller and wrappers, by name, with commas between")] = "",
+    engine: Annotated[
+        str, typer.Option(help="engine; the bundle's when not given", autocompletion=_complete.engines)
+    ] = "",
+    threads: Annotated[int | None, typer.Option(min=1, help="threads; all cores when not given")] = None,
+    steps: Annotated[int, typer.Option(min=20, max=100_000, help="control steps that are measured")] = 200,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="show the layers and their times; no robot moves")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Show the layers between a bundle and a robot, and what they leave of its control period on this machine.
+
+    Exits with 1 when the median inference takes longer than the deadline.
+    """
+    if not dry_run:
+        raise UsageError(
+            "There is no connection to a robot yet: vlatool cannot send the actions anywhere.",
+            "add --dry-run to see the layers and their times; on the robot, call vlatool.load(..., deadline_ms=...)",
+        )
+    from vlatool.measurement.dry_run import dry_run as measure
+
+    found = measure(
+        bundle,
+        robot=robot,
+        deadline_ms=deadline_ms,
+        fallback=fallback,
+        neutral=neutral,
+        controllers=[name for name in controller.split(",") if name],
+        engine=engine,
+        threads=threads,
+        steps=steps,
+    )
+    answer(as_json, found.to_dict(), lines(found))
+    found.check()
+
+
+def lines(found: DryRun) -> Iterator[str]:
+    """Return what a person reads: the layers from the robot inwards, then the times."""
+    yield f"{found.bundle}{f' on {found.robot}' if found.robot else ''}, from the robot to the graphs:"
+    width = max(len(note.layer) for note in found.layers)
+    for note in found.layers:
+        yield f"  {note.layer:{width}}  {note.does}"
+    yield f"control period {found.period_ms:g} ms, deadline {found.deadline_ms:g} ms"
+    yield f"  inference  p50 {found.inference.p50:.3f} ms, p99 {found.inference.p99:.3f} ms"
+    share = f"{found.missed:.1%} of {found.answer.samples} steps without an action of the policy in time"
+    yield f"  act        p50 {found.answer.p50:.3f} ms, p99 {found.answer.p99:.3f} ms; {share}"
+    yield "a control step is answered by the first of these that has an action:"
+    for number, rung in enumerate(found.rungs):
+        time = "" if rung.time is None else f"  p50 {rung.time.p50:.3f} ms, p99 {rung.time.p99:.3f} ms"
+        yield f"  {number}  {rung.source:10}{time}".rstrip()

@@ -1,0 +1,374 @@
+"""The layers between a policy and a robot, built in the one order that makes sense.
+
+From the inside: wrappers of the policy, the check of what they give, the deadline, the player of chunks, the fallback
+ladder, wrappers of the controller, the envelope. ``Stack`` is the controller around all of them, which measures each
+control step and gives a record of it to a sink.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vlatool.bundle.spec import PolicySpec
+from vlatool.errors import UsageError
+from vlatool.runtime.arguments import check_positive
+from vlatool.runtime.control import build_layer, check_order, layers, options_of, takes_delay
+from vlatool.runtime.control.checked import CheckedPolicy
+from vlatool.runtime.control.chunked import ChunkQueue
+from vlatool.runtime.control.deadline import Deadline
+from vlatool.runtime.control.fallback import HOLD_S, FallbackLadder
+from vlatool.runtime.interface import FALLBACK, STOP, Array, Controller, Origin, Policy, layers_of, origin_of
+from vlatool.runtime.policy import BundlePolicy
+from vlatool.runtime.rungs import ChunkRung, Hold, PolicyRung, Rung, Stop
+
+SWITCH_S = 0.0005
+"""Longest that one Python thread may keep another from running, where there is a deadline: Python's own 5 ms would be
+added to the answer when an inference is in Python code at its deadline (``sys.setswitchinterval``)."""
+Wrapper = Callable[[Controller], Controller]
+
+
+@dataclass(frozen=True)
+class Fallback:
+    """What acts where the policy has no action in time.
+
+    Args:
+        policy: A second policy, such as a smaller bundle or a client of another machine; none when None.
+        policy_ms: Part of the deadline that is kept for it, in milliseconds; half of the deadline when None.
+        max_age_ms: Age above which the rest of a chunk is not used, in milliseconds.
+        hold_s: How long the robot holds or slows down before it counts as stopped, in seconds.
+        ramp_s: Time in which a velocity falls to 0, in seconds.
+        misses: Control steps without an action, of the last ``window``, until the ladder stays on a lower rung.
+        window: See ``misses``.
+        recover: Control steps in a row with an action until the policy has the robot again.
+        latch: Whether a stopped robot waits for ``reset``.
+        start: Pose that is held before the first action, (A,), where an action is a position.
+        neutral: Label of the discrete action without motion.
+    """
+
+    policy: Policy | None = None
+    policy_ms: float | None = None
+    max_age_ms: float | None = None
+    hold_s: float = HOLD_S
+    ramp_s: float = 0.5
+    misses: int = 3
+    window: int = 10
+    recover: int = 5
+    latch: bool = False
+    start: Any = None
+    neutral: str = ""
+
+
+class TickRecord(NamedTuple):
+    """What one control step was like.
+
+    Args:
+        step: Number of the step since the stack was built, from 0.
+        started: Time at which it was to begin, in seconds of the clock.
+        waited_ms: Time until the call of ``act``.
+        answer_ms: Time from when it was to begin until its action was there.
+        missed: Whether the policy had no action.
+        rung: Index of the rung that answered, 0 for the policy.
+        level: Index of the rung that the ladder stands on afterwards.
+        origin: Where the action comes from.
+        error: Why the policy had no action; empty where it had one.
+        action: The action.
+    """
+
+    step: int
+    started: float
+    waited_ms: float
+    answer_ms: float
+    missed: bool
+    rung: int
+    level: int
+    origin: Origin
+    error: str
+    action: Array | None
+
+
+Sink = Callable[[TickRecord], Any]
+
+
+class Stack:
+    """A controller of several layers.
+
+    Args:
+        controller: The outermost layer.
+        telemetry: Called with the record of each control step. What it raises is counted, not passed on.
+        clock: Returns seconds.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        *,
+        telemetry: Sink | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.controller = controller
+        self.layers = layers_of(controller)
+        self.policy = self.layers[-1]
+        self.spec: PolicySpec = self.policy.spec
+        self.ladder = next((layer for layer in self.layers if isinstance(layer, FallbackLadder)), None)
+        self.deadlines = [layer for layer in self._all() if isinstance(layer, Deadline)]
+        self.failed_records = 0
+        """Records that the sink did not take."""
+        self._sink, self._clock, self._step = telemetry, clock, 0
+        self._stop = (
+            None
+            if self.ladder is None
+            else next(
+                (layer.stop for layer in self.layers[: self.layers.index(self.ladder)] if hasattr(layer, "stop")), None
+            )
+        )
+        self._stopped = False
+
+    def _all(self) -> list[Any]:
+        """Return the layers, those of a second policy after them."""
+        below = [] if self.ladder is None else self.ladder.rungs[1:]
+        return self.layers + [layer for rung in below if isinstance(rung, PolicyRung)
+                              for layer in layers_of(rung.controller)]  # fmt: skip
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the last action was the first of a chunk."""
+        return self.controller.fresh
+
+    @property
+    def origin(self) -> Origin:
+        """Where the last action came from."""
+        origin = origin_of(self.controller)
+        return origin._replace(source=STOP) if self._stopped else origin
+
+    def act(self, observation: Mapping[str, Any], *, scheduled: float | None = None) -> Array:
+        """Return the action of this control step: (A,) float32, or a 0-d int64 index of a discrete action.
+
+        Args:
+            observation: As ``infer`` takes it.
+            scheduled: Time of the clock at which the step was to begin, from which the deadline counts; now when None.
+
+        Raises:
+            Exception: what the policy raised, where no layer has an action.
+        """
+        called = self._clock() if scheduled is None or self._sink is not None else scheduled
+        started = called if scheduled is None else scheduled
+        for deadline in self.deadlines:
+            deadline.started = started
+        if self._sink is None:
+            return self._act(observation)
+        action, error = None, ""
+        try:
+            action = self._act(observation)
+            return action
+        except Exception as caught:
+            error = f"{type(caught).__name__}: {caught}"
+            raise
+        finally:
+            self._record(started, called, action, error)
+
+    def _act(self, observation: Mapping[str, Any]) -> Array:
+        """Return the action of the controller, or the next of the envelope's proven stop where it has none."""
+        self._stopped = False
+        try:
+            return self.controller.act(observation)
+        except Exception as error:
+            if self._stop is None:
+                raise
+            self._stopped = True
+            try:
+                return np.asarray(self._stop())
+            except UsageError:  # the envelope does not know yet where the robot is
+                raise error from None
+
+    def _record(self, started: float, called: float, action: Array | None, error: str) -> None:
+        rung, level, cause = 0, 0, error
+        if self.ladder is not None:
+            rung, level = self.ladder.rung, self.ladder.level
+            cause = cause or ("" if self.ladder.error is None else str(self.ladder.error))
+        now = self._clock()
+        waited_ms, answer_ms = (called - started) * 1e3, (now - started) * 1e3
+        origin = self.origin if action is not None else Origin("")
+        record = TickRecord(self._step, started, waited_ms, answer_ms, bool(cause), rung, level, origin, cause, action)
+        self._step += 1
+        try:
+            self._sink(record)  # type: ignore[misc]
+        except Exception:  # the seam: a full disk is no reason to stop the robot
+            self.failed_records += 1
+
+    def reset(self, seed: int | None = None) -> None:
+        """Start a new episode of every layer; see ``Controller.reset``."""
+        self.controller.reset(seed)
+
+    def close(self) -> None:
+        """End the threads of the deadlines."""
+        for deadline in self.deadlines:
+            deadline.close()
+
+
+def build_stack(
+    policy: Policy,
+    *,
+    controllers: Sequence[str] = (),
+    envelope: str | Wrapper | None = None,
+    deadline_ms: float | None = None,
+    fallback: Fallback | Policy | None = None,
+    telemetry: Sink | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> Stack:
+    """Return the layers around a policy; see ``vlatool.runtime.load``.
+
+    Raises:
+        UsageError: when a value or a name is not allowed, or the layers make no sense together.
+        SpecError: when the rate of the spec is unknown, and something needs it.
+    """
+    options = fallback if isinstance(fallback, Fallback) else Fallback(fallback)
+    entries, chosen = layers(controllers), options_of(controllers)
+    check_deadline(policy.spec, deadline_ms, waits=not any(takes_delay(entry) for entry in entries))
+    own_ms = policy_ms(deadline_ms, options) if options.policy is not None else 0.0
+    falls_back = deadline_ms is not None or fallback is not None
+    wrappers = [entry for entry in entries if not hasattr(entry, "act")]
+    player, *outer = entries[len(wrappers) :]
+    check_order([*wrappers, *[Deadline] * (deadline_ms is not None), player, *[FallbackLadder] * falls_back, *outer])
+    inner: Any = policy
+    for entry in wrappers:
+        inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry))
+    limited = _limited(inner, None if deadline_ms is None else deadline_ms - own_ms, clock)
+    inner = build_layer(player, limited, spec=policy.spec, options=chosen.get(player))
+    ladder = _ladder(inner, policy.spec, options, deadline_ms, clock) if falls_back else None
+    inner = ladder or inner
+    for entry in outer:
+        inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry))
+    if envelope is not None:
+        inner = (robot_envelope(policy.spec, envelope) if isinstance(envelope, str) else envelope)(inner)
+        if ladder is not None and hasattr(inner, "stop"):
+            for rung in ladder.rungs:
+                if isinstance(rung, Hold):
+                    rung.leave_to_envelope()
+    return Stack(inner, telemetry=telemetry, clock=clock)
+
+
+def _limited(policy: Policy, deadline_ms: float | None, clock: Callable[[], float]) -> Policy:
+    """Return a policy with the check of its actions, which an open bundle has already, and with its deadline."""
+    checked = policy if isinstance(policy, BundlePolicy) else CheckedPolicy(policy)
+    return checked if deadline_ms is None else Deadline(checked, deadline_ms, clock=clock)
+
+
+def _ladder(
+    player: Any, spec: PolicySpec, options: Fallback, deadline_ms: float | None, clock: Callable[[], float]
+) -> FallbackLadder:
+    rungs: list[Rung] = [ChunkRung(player, options.max_age_ms)] if hasattr(player, "rest") else []
+    if options.policy is not None:
+        check_same_actions(spec, options.policy.spec)
+        second = ChunkQueue(_limited(options.policy, deadline_ms, clock), clock=clock)
+        rungs.append(PolicyRung(second, FALLBACK))
+    ramp = max(1, round(options.ramp_s * spec.rate))
+    steps = max(1, round(options.hold_s * spec.rate))
+    rungs += [Hold(spec.action, steps, ramp=ramp, neutral=options.neutral),
+              Stop(spec.action, ramp=ramp, neutral=options.neutral)]  # fmt: skip
+    return FallbackLadder(player, rungs, misses=options.misses, window=options.window, recover=options.recover,
+                          latch=options.latch, start=options.start, clock=clock)  # fmt: skip
+
+
+def check_deadline(spec: PolicySpec, deadline_ms: float | None, *, waits: bool = True) -> None:
+    """Refuse a deadline that is not a number above 0 or, where a control step waits for it, longer than the step.
+
+    Raises:
+        UsageError: naming the deadline and what is allowed.
+    """
+    check_positive("deadline_ms", deadline_ms, "a number of milliseconds", optional=True)
+    if deadline_ms is not None and waits and spec.control_hz and deadline_ms > (period := 1000 / spec.control_hz):
+        raise UsageError(
+            f"The deadline of {deadline_ms:g} ms is longer than the control period of {period:g} ms, and the "
+            "controller waits for each inference: the next step would come before this one has its action.",
+            f"pass deadline_ms up to {period:g}, or a controller that acts while the policy infers",
+        )
+
+
+def policy_ms(deadline_ms: float | None, options: Fallback) -> float:
+    """Return the part of a deadline that is kept for the second policy, in milliseconds; 0 without a deadline.
+
+    Raises:
+        UsageError: when nothing is left for the first one.
+    """
+    check_positive("policy_ms", options.policy_ms, "a number of milliseconds", optional=True)
+    if deadline_ms is None:
+        return 0.0
+    own = deadline_ms / 2 if options.policy_ms is None else options.policy_ms
+    if own >= deadline_ms:
+        raise UsageError(
+            f"{own:g} of {deadline_ms:g} ms are kept for the second policy; nothing is left for the first.",
+            f"pass Fallback(policy_ms=...) below {deadline_ms:g}",
+        )
+    return own
+
+
+def check_same_actions(first: PolicySpec, second: PolicySpec) -> None:
+    """Refuse a second policy whose actions mean something else to the robot than those of the first.
+
+    Raises:
+        UsageError: naming the first difference.
+    """
+    for what in ("kind", "mode", "labels", "robot_width"):
+        ours, others = getattr(first.action, what), getattr(second.action, what)
+        if ours != others:
+            raise UsageError(
+                f"The second policy's action has the {what} {others!r}, that of the first {ours!r}.",
+                "fall back to a policy with the same action",
+            )
+    if first.action.units() != second.action.units() or first.control_hz != second.control_hz:
+        raise UsageError(
+            f"The second policy acts in {second.action.units()} at {second.control_hz} Hz, the first in "
+            f"{first.action.units()} at {first.control_hz} Hz.",
+            "fall back to a policy with the same units and rate",
+        )
+
+
+def robot_envelope(spec: PolicySpec, robot: str) -> Wrapper:
+    """Return the wrapper that keeps the actions of a policy within the limits of a robot.
+
+    Raises:
+        ProfileError: when no robot has that name.
+        UsageError: when the limits do not fit the action, or no input is known to be the measured position.
+    """
+    from vlatool.runtime.control.envelope import EnvelopeController
+    from vlatool.runtime.envelope import RobotLimits, envelope_of
+
+    limits = RobotLimits.named(robot)
+    envelope = envelope_of(spec, limits)
+    bounded = any(joint.low is not None for joint in limits.joints)
+    position = measured_position(spec) if bounded else None
+    return lambda controller: EnvelopeController(controller, envelope, position=position)
+
+
+def measured_position(spec: PolicySpec) -> str:
+    """Return the input that says where the robot is: the one with the labels of the action.
+
+    Raises:
+        UsageError: when there is none, or several.
+    """
+    names = [tensor.name for tensor in spec.inputs if tensor.labels and tensor.labels == spec.action.labels]
+    if len(names) == 1:
+        return names[0]
+    raise UsageError(
+        f"{len(names)} inputs have the labels of the action; one has to be the position at which the robot starts.",
+        "label the input as the action, or pass envelope=lambda controller: EnvelopeController(controller, "
+        "envelope_of(policy.spec, limits), position=NAME)",
+    )
+
+
+def prepare_process() -> None:
+    """Keep Python itself from delaying answers: threads give way sooner, no garbage is looked for in what is loaded.
+
+    ``sys.setswitchinterval`` is lowered to ``SWITCH_S`` where it is longer; ``gc.freeze`` exempts the objects that are
+    there now from garbage collection.
+    """
+    sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_S))
+    gc.collect()
+    gc.freeze()

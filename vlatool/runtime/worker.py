@@ -1,0 +1,169 @@
+"""A thread that runs one task at a time for a caller who waits until a deadline and no longer."""
+
+from __future__ import annotations
+
+import _thread
+import atexit
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from vlatool.errors import UsageError
+
+EXIT_S = 1.0
+"""Seconds for which the process, when it ends, waits for a task that was stopped: a run of ONNX Runtime that returns
+while Python shuts down ends the process with SIGABRT."""
+_WORKERS: weakref.WeakSet[Worker] = weakref.WeakSet()
+
+
+class Task(Protocol):
+    """What a worker runs."""
+
+    def begin(self) -> None:
+        """Prepare to run, so that ``stop`` has an effect from now on."""
+
+    def run(self) -> Any:
+        """Return the result."""
+
+    def stop(self) -> None:
+        """Make ``run`` end early, if it can; called in another thread, once or more often."""
+
+    def undo(self) -> None:
+        """Take back what ``run`` did: it returned too late."""
+
+
+class _Call:
+    """One task on its way: who waits for it, and what became of it."""
+
+    def __init__(self, task: Task, due: float) -> None:
+        self.task, self.due = task, due
+        self.ended = _thread.allocate_lock()
+        self.ended.acquire()
+        self.began = self.abandoned = self.in_time = False
+        self.result: Any = None
+        self.error: BaseException | None = None
+
+
+class Worker:
+    """Runs tasks in one thread, which is started with the first and kept.
+
+    A task that does not end by its time is stopped and taken back, and its result is never returned. One that cannot be
+    stopped keeps the thread: the worker is then ``busy``, takes no other task, and starts no other thread. The thread
+    is a daemon: it does not keep the process from ending.
+
+    Args:
+        name: Name of the thread.
+        clock: Returns seconds.
+    """
+
+    def __init__(self, name: str = "vlatool-worker", clock: Callable[[], float] = time.monotonic) -> None:
+        self._name, self._clock = name, clock
+        self._lock = _thread.allocate_lock()
+        self._wake = _thread.allocate_lock()
+        self._wake.acquire()
+        self._call: _Call | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a task is running."""
+        return self._call is not None
+
+    def call(self, task: Task, due: float) -> Any:
+        """Return the result of a task that ends by a time of the clock.
+
+        Raises:
+            TimeoutError: when it does not, or an abandoned task still runs; the task has no effect then.
+            UsageError: when another caller is waiting.
+        """
+        left = due - self._clock()
+        with self._lock:
+            if self._call is not None:
+                self._refuse(self._call)
+            if left <= 0:
+                raise TimeoutError("no time is left for it")
+            call = self._call = _Call(task, due)
+        if self._thread is None:
+            self._start()
+        self._wake.release()
+        try:
+            in_time = call.ended.acquire(True, left)
+        except BaseException:  # Ctrl-C: nobody waits for it any more
+            self._abandon(call)
+            raise
+        if not in_time and self._abandon(call):
+            raise TimeoutError("it was stopped")
+        if call.error is not None:
+            raise call.error
+        if not call.in_time:
+            raise TimeoutError("it ended too late")
+        return call.result
+
+    def _refuse(self, call: _Call) -> None:
+        """Say why no task can be taken now; a task that should have ended is stopped again."""
+        if not call.abandoned:
+            raise UsageError("Another caller waits for this policy.", "open one policy for each thread")
+        if call.began:
+            call.task.stop()
+        raise TimeoutError("one that was stopped before has not ended yet")
+
+    def _abandon(self, call: _Call) -> bool:
+        """Give a call up unless it has ended; returns whether it was."""
+        with self._lock:
+            if self._call is not call:
+                return False
+            call.abandoned = True
+            if call.began:
+                call.task.stop()
+            return True
+
+    def _start(self) -> None:
+        _WORKERS.add(self)
+        self._thread = threading.Thread(target=self._work, name=self._name, daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        while True:
+            self._wake.acquire()
+            if (call := self._call) is None:
+                return
+            self._perform(call)
+
+    def _perform(self, call: _Call) -> None:
+        with self._lock:
+            if not call.abandoned:
+                call.task.begin()
+                call.began = True
+        try:
+            if call.began:
+                call.result = call.task.run()
+        except BaseException as error:  # the caller's thread raises it
+            call.error = error
+        with self._lock:
+            call.in_time = not call.abandoned and self._clock() <= call.due
+            if not call.in_time and call.began and call.error is None:
+                call.task.undo()
+                call.result = None
+            self._call = None
+        call.ended.release()
+
+    def close(self, seconds: float = EXIT_S) -> None:
+        """End the thread; the next call starts another. A task that runs is stopped, and waited for so many seconds."""
+        call, thread = self._call, self._thread
+        if call is not None:
+            self._abandon(call)
+            call.ended.acquire(True, seconds)
+        if not self.busy and thread is not None:
+            self._thread = None
+            self._wake.release()
+            thread.join()
+
+
+def _close_all() -> None:
+    for worker in list(_WORKERS):
+        worker.close()
+
+
+atexit.register(_close_all)
