@@ -39,7 +39,7 @@ def main() -> None:
         "command-line.md": command_line_page(),
         "manifest.md": fields_page("manifest.json", [
             manifest.Manifest, spec.PolicySpec, spec.TensorSpec, image.Image, image.ImageStep, prompt.Prompt,
-            manifest.ProgramStep, manifest.Graph,
+            prompt.StateText, manifest.ProgramStep, manifest.Graph,
         ]),
         "report.md": report_page(),
         "measures.md": measures_page(),

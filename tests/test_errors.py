@@ -17,6 +17,7 @@ EXIT_CODES = {
     "SourceError": 3,
     "DataError": 3,
     "GraphError": 3,
+    "DeadlineMissed": 3,
     "ProfileError": 3,
     "RecipeError": 3,
     "OutputError": 3,

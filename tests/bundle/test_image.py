@@ -65,7 +65,7 @@ def test_a_manifest_with_an_image_is_of_the_second_version_and_any_other_of_the_
         ({"layout": "hw"}, "layout hw for rgb"),
         ({"channels": "rgba"}, "rgba of rgb frames"),
         ({"range": [1, 0]}, "must be the lower"),
-        ({"range": [0]}, "range of 'image' has 1 numbers"),
+        ({"range": [0]}, "range of 'image' has 1 number;"),
         ({"mean": [0.5, 0.5]}, "mean of 'image' has 2 numbers"),
         ({"std": [1, 0, 1]}, "above 0"),
         ({"std": [1, float("nan"), 1]}, "must be a number"),

@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
@@ -32,7 +34,8 @@ def test_only_what_differs_from_the_defaults_is_written():
 
 
 def test_a_prompt_is_part_of_a_text_input_and_comes_back():
-    prompt = {"template": "In: {}?", "lower": True, "last": 29871}
+    prompt = {"template": "In: {}? {state}", "lower": True, "last": 29871, "strip": True, "replace": {"_": " "},
+              "state": {"input": "joints", "low": -2, "bins": 8}}  # fmt: skip
     text = TensorSpec.from_dict({**TEXT, "prompt": prompt})
     assert text.to_dict()["prompt"] == prompt
     assert TensorSpec.from_dict(text.to_dict()) == text
@@ -43,6 +46,16 @@ def test_a_prompt_is_part_of_a_text_input_and_comes_back():
     ({"template": "In"}, "it has {} once"), ({"template": "{} {}"}, "it has {} once"), ({"lower": 1}, "has lower 1"),
     ({"last": -1}, "last id of a prompt"), ({"last": 2.5}, "last id of a prompt"), ("In: {}", "must be a mapping"),
     ({"templat": "{}"}, "did you mean 'template'"), ({"template": None}, "template of a prompt must be text"),
+    ({"strip": "no"}, "has strip 'no'"), ({"replace": {"ab": "c"}}, "one character"), ({"replace": {"a": 1}}, "one"),
+    ({"replace": ["_"]}, "What a prompt replaces must be a mapping"),
+    ({"state": {"input": "x"}}, r"it has \{state\} once, for the state"),
+    ({"template": "{} {state} {state}", "state": {"input": "x"}}, r"it has \{state\} once"),
+    *(({"template": "{} {state}", "state": state}, words) for state, words in [
+        ({}, "input of a prompt's state"), ({"input": "x", "bins": 0}, "bins of a prompt's state"),
+        ({"input": "x", "bins": 1 << 20}, "allowed: 1 to 65536"), ({"input": "x", "low": 2}, "low below high"),
+        ({"input": "x", "low": float("nan")}, "low of a prompt's state"), ("x", "must be a mapping"),
+        ({"inputs": "x"}, "did you mean 'input'"),
+    ]),
 ])  # fmt: skip
 def test_an_impossible_prompt_is_refused(prompt: object, words: str):
     with pytest.raises(SpecError, match=words):
@@ -52,6 +65,23 @@ def test_an_impossible_prompt_is_refused(prompt: object, words: str):
 def test_only_a_text_has_a_prompt():
     with pytest.raises(SpecError, match="belongs to kind: text"):
         TensorSpec.from_dict({"name": "state", "shape": [1, 3], "prompt": {"template": "{}"}})
+
+
+IN_PROMPT = {**TEXT, "prompt": {"template": "{} {state}", "state": {"input": "joints"}}}
+
+
+@pytest.mark.parametrize(("joints", "words"), [
+    ({"name": "joint", "shape": [1, 3]}, "which is not an input; did you mean 'joint'"),
+    ({"name": "joints", "shape": [1, 3], "dtype": "int64"}, r"int64 \[1, 3\]; wanted: floats of one moment"),
+    ({"name": "joints", "shape": [1, 2, 3], "history": 2}, r"float32 \[1, 2, 3\]; wanted"),
+    ({**TEXT, "name": "joints"}, "int64"),
+])  # fmt: skip
+def test_a_prompt_has_a_vector_of_the_spec_in_it_or_is_refused(joints: dict[str, Any], words: str):
+    outputs = [{"name": "y", "shape": [1, 1]}]
+    right = {"name": "joints", "shape": [1, 3]}
+    PolicySpec.from_dict({"inputs": [IN_PROMPT, right], "outputs": outputs, "control_hz": 10})
+    with pytest.raises(SpecError, match=words):
+        PolicySpec.from_dict({"inputs": [IN_PROMPT, joints], "outputs": outputs, "control_hz": 10})
 
 
 def test_a_text_input_sees_ids_of_its_width():
@@ -252,3 +282,11 @@ def test_a_spec_needs_its_rate():
 def test_a_step_count_of_a_wrong_type_is_a_spec_error_and_no_traceback():
     with pytest.raises(SpecError):
         PolicySpec.from_dict({**SPECS[0], "execute": "all"})
+
+
+@pytest.mark.parametrize(("name", "got"), [("unit", "1 unit"), ("labels", "1 label")])
+def test_one_of_a_kind_is_singular(name: str, got: str):
+    with pytest.raises(SpecError, match=f"has {got} for a last axis of 2"):
+        TensorSpec("y", (1, 2), **{name: ("m",)})
+    with pytest.raises(SpecError, match=f"has 3 {got[2:]}s for a last axis of 2"):
+        TensorSpec("y", (1, 2), **{name: ("m", "n", "o")})

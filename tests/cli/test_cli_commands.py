@@ -19,13 +19,14 @@ from _arithmetic import weights_of_this_host
 
 from vlatool import __version__, cli, registry
 from vlatool.bundle.bundle import Bundle, seal
-from vlatool.cli import main
+from vlatool.cli import main, new
 from vlatool.cli._console import command_line, progress, raise_verdict
 from vlatool.cli._stages import DEFAULTS
 from vlatool.cli.optimize import share
 from vlatool.errors import GateFailed, GraphError, Inconclusive, UsageError
 from vlatool.files.npz import open_npz
 from vlatool.hardware.profile import profile_names
+from vlatool.module.description import read_description
 from vlatool.report import Measurement, Report, Row, read_report
 from vlatool.runtime import load
 from vlatool.runtime.identity import policy_identity
@@ -523,3 +524,22 @@ def test_a_flag_in_both_of_its_forms_is_refused(vlatool, float_bundle, line, sai
 @pytest.mark.parametrize("line", ["inspect {b} --json --json", "inspect {b} --memory 1 --memory 9000"])
 def test_a_flag_that_is_repeated_is_no_contradiction_and_the_last_value_counts(vlatool, float_bundle, line):
     assert vlatool(*line.format(b=float_bundle.path).split())[0] == 0
+
+
+def test_an_impossible_choice_is_named_without_the_kind_of_error(vlatool, tmp_path):
+    code, out, err = vlatool("export", "onnx", "x", "-o", tmp_path / "out", "--exporter", "nope")
+    assert (code, out) == (2, "")
+    assert "Value error" not in err
+    assert "'nope' is not one of 'auto', 'dynamo'" in err
+
+
+@pytest.mark.parametrize("name", ["my-act", "with space", "#1: act"])
+def test_a_new_policy_has_the_name_of_its_directory(policy_dir, tmp_path, name):
+    new._copy(policy_dir, tmp_path / name, None)
+    assert read_description(tmp_path / name).name == name
+
+
+def test_a_directory_whose_name_no_policy_may_have_keeps_that_of_the_source(policy_dir, tmp_path):
+    own = read_description(policy_dir).name
+    new._copy(policy_dir, tmp_path / "a\tb", None)
+    assert read_description(tmp_path / "a\tb").name == own

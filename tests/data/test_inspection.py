@@ -36,14 +36,14 @@ ROWS = np.arange(COUNT)
 @pytest.mark.parametrize(
     ("times", "sentence"),
     [
-        (TIMES + (ROWS >= 7) * 0.5, "1 gaps: time goes on by 0.600 s before step 7 of episode 3, otherwise by 0.100 s"),
+        (TIMES + (ROWS >= 7) * 0.5, "1 gap: time goes on by 0.600 s before step 7 of episode 3, otherwise by 0.100 s"),
         (
             TIMES - (ROWS >= 25) * 0.1,
-            "1 gaps: time goes on by 0.000 s before step 5 of episode 4, otherwise by 0.100 s",
+            "1 gap: time goes on by 0.000 s before step 5 of episode 4, otherwise by 0.100 s",
         ),
         (
             TIMES - (ROWS >= 30) * 2,
-            "1 gaps: time goes on by -1.900 s before step 10 of episode 4, otherwise by 0.100 s",
+            "1 gap: time goes on by -1.900 s before step 10 of episode 4, otherwise by 0.100 s",
         ),
         (
             np.where(ROWS == 30, 0, TIMES),
@@ -84,5 +84,5 @@ def test_a_short_episode_and_a_lack_of_actions_are_mentioned():
     episodes = np.repeat(np.arange(4), [13, 13, 13, 1])
     found = inspect_steps(replace(steps(), episodes=episodes, action="", times=None), "made")
     assert found.measured_hz is None
-    assert found.findings[0] == "episode 3 has 1 steps; half of them have 13 or more"
+    assert found.findings[0] == "episode 3 has 1 step; half of them have 13 or more"
     assert "no column of actions" in found.findings[1]

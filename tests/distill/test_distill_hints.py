@@ -232,7 +232,7 @@ def test_blocks_that_run_in_each_step_of_a_flow_are_compared_where_both_take_as_
     made = distilled(fewer, tmp_path / "one", features=1.0, steps=3)
     features = training_of(made)["hints"]["features"]
     assert {stack for _, stack, *_ in features["blocks"]} == {"seeing"}
-    assert features["left_out"][0][2] == "the student runs its blocks 1 times in an inference, the teacher 4 times"
+    assert features["left_out"][0][2] == "the student runs its blocks 1 time in an inference, the teacher 4"
 
 
 def unlike(place: Path) -> Bundle:

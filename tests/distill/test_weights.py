@@ -67,7 +67,7 @@ def test_what_does_not_fit_is_named(source_bundle: Bundle, tuned: Path, tmp_path
 STRAYS = {
     "unknown": (
         lambda state, name: {"more.weight": torch.zeros(2)},
-        "1 tensors that the policy has not: 'more",
+        "1 tensor that the policy has not: 'more",
         "else",
     ),
     "adapters": (lambda state, name: {f"{name}.lora_A.weight": torch.zeros(2)}, "holds adapters", "merge the adapters"),

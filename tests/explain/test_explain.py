@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import app
-from vlatool.data import recorded_observations
-from vlatool.errors import BundleError
+from vlatool.data import named_recording, recorded_observations
+from vlatool.errors import BundleError, DataError
 from vlatool.explain import Options, _Findings, _times, explain, explanation
 from vlatool.explain._candidates import measure
 from vlatool.explain._float_roundtrips import QuantizedGraph, fallbacks, with_times
@@ -362,3 +362,14 @@ def test_the_command_writes_report_and_json(fragile, made, tmp_path):
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["kind"] == "explain"
     assert (tmp_path / "report/report.html").is_file()
+
+
+def test_recorded_observations_may_have_other_names(float_bundle, policy_dir, tmp_path):
+    arrays = dict(np.load(policy_dir / "evaluation.npz"))
+    arrays["joints"] = arrays.pop("proprio")
+    np.savez(tmp_path / "other.npz", **arrays)
+    named = named_recording(tmp_path / "other.npz", ["proprio=joints"])
+    found = observations_of(float_bundle, None, named, 2)
+    assert (len(found.values), found.words) == (2, "other.npz")
+    with pytest.raises(DataError, match="proprio"):
+        observations_of(float_bundle, None, named_recording(tmp_path / "other.npz", []), 2)

@@ -1,6 +1,6 @@
 import pytest
 
-from vlatool.files.printable import MAX_CHARACTERS, mask_passwords, message_of, one_line, printable
+from vlatool.files.printable import MAX_CHARACTERS, mask_passwords, message_of, one_line, printable, reason_of
 
 
 @pytest.mark.parametrize(
@@ -65,3 +65,10 @@ def test_no_address_tells_its_password(address: str):
 ])  # fmt: skip
 def test_what_has_no_password_stays(text: str):
     assert mask_passwords(text) == text
+
+
+@pytest.mark.parametrize(("message", "reason"), [
+    ("Value error, a b", "a b"), ("Assertion failed, a", "a"), ("A Value error, a", "A Value error, a"), ("", ""),
+])  # fmt: skip
+def test_the_kind_of_error_is_left_out_of_a_reason(message: str, reason: str):
+    assert reason_of(message) == reason

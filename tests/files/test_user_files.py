@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import fcntl
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -146,3 +147,9 @@ def test_nothing_is_written_through_a_link(tmp_path: Path, target: str) -> None:
     for force in (False, True):
         with pytest.raises(OutputError, match="is a link"):
             write_own_file(tmp_path / "link", "a: 2\n", force=force)
+
+
+@pytest.mark.parametrize("path", ["/proc/x.html", "/proc/self/x.npz"])
+def test_a_file_that_cannot_be_created_is_named_not_its_draft(path: str):
+    with pytest.raises(OSError, match=re.escape(f"'{path}'")), atomic_file(Path(path)):
+        pass

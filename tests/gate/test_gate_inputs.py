@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import read_drawn
-from vlatool.errors import DataError
+from vlatool.cli.gate import _gate
+from vlatool.data import NamedRecording, read_drawn
+from vlatool.errors import DataError, UsageError
 from vlatool.gate import inputs
+from vlatool.gate.claims.accuracy import Accuracy
 from vlatool.gate.inputs import AGREEMENT, TIMING, Inputs
+from vlatool.gate.plan import Plan
 
 
 def states(drawn) -> list[list[float]]:
@@ -62,3 +65,32 @@ def test_data_of_another_policy_are_an_error(float_bundle: Bundle, tmp_path: Pat
     np.savez(tmp_path / "own.npz", image=np.zeros((3, 8, 8, 3), np.uint8))
     with pytest.raises(DataError, match="has no 'proprio'"):
         _ = Inputs(float_bundle, tmp_path / "own.npz", 0).recordings
+
+
+def renamed(recording: Path, out: Path) -> Path:
+    arrays = dict(np.load(recording))
+    arrays["joints"] = arrays.pop("proprio")
+    np.savez(out, **arrays)
+    return out
+
+
+def test_the_data_of_a_gate_may_have_other_names(float_bundle: Bundle, policy_dir: Path, tmp_path: Path) -> None:
+    data = renamed(policy_dir / "evaluation.npz", tmp_path / "other.npz")
+    named = NamedRecording(data, {"proprio": "joints"})
+    assert len(Inputs(float_bundle, named, 0).recordings[0]) == 16
+    with pytest.raises(DataError, match="proprio"):
+        _ = Inputs(float_bundle, data, 0).recordings
+    plan = Accuracy(data=data, map=named.names).extend_plan(Plan())
+    assert (plan.data, plan.names) == (data, named.names)
+
+
+def test_map_of_a_gate_is_that_of_its_data(tmp_path: Path) -> None:
+    (tmp_path / "gate.yaml").write_text("accuracy: {data: a.npz, map: {proprio: x}}\n")
+    gate = _gate(tmp_path / "gate.yaml", None, ["proprio=joints"])
+    assert gate.claims["accuracy"].map == {"proprio": "joints"}
+    assert _gate(tmp_path / "gate.yaml", None, []).claims["accuracy"].map == {"proprio": "x"}
+    (tmp_path / "gate.yaml").write_text("accuracy: {max_drop: 0.1}\n")
+    with pytest.raises(UsageError, match="none is given"):
+        _gate(tmp_path / "gate.yaml", None, ["proprio=joints"])
+    with pytest.raises(DataError, match="maps names of recorded data"):
+        Accuracy(map={"proprio": "x"}).check(None, Plan())

@@ -19,7 +19,7 @@ from vlatool.runtime import load
 from vlatool.runtime.arithmetic import SATURATING
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
-from vlatool.runtime.golden import load_golden, load_goldens
+from vlatool.runtime.golden import conversion_error, load_golden, load_goldens
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.finish import GOLDEN, save_npz, write_golden
 
@@ -155,6 +155,53 @@ def test_other_statistics_of_a_small_element_show_beside_a_large_one(float_bundl
     file.write_text(json.dumps(table))
     with pytest.raises(GraphError, match="a different golden action in physical units"):
         load(resealed(bundle).path)
+
+
+NEGATED = {"op": "scale", "parts": [0], "factor": -1}
+RELATIVE = {"op": "relative", "to": "x", "parts": ["arm"]}
+OTHER_CONVERSIONS = {
+    "another sign": (NEGATED, [{**NEGATED, "factor": 1}], {}),
+    "another part": (NEGATED, [{**NEGATED, "parts": [1]}], {}),
+    "another bound": ({"op": "clip", "low": -1.5, "high": 1.5}, [{"op": "clip", "low": -1.5, "high": 1.4}], {}),
+    "another order": ([NEGATED, {"op": "scale", "factor": 1, "offset": 2}],
+                      [{"op": "scale", "factor": 1, "offset": 2}, NEGATED], {}),
+    "a name of another part": (RELATIVE, [RELATIVE], {"arm": [1, 2]}),
+    "absolute, no longer relative": (RELATIVE, [], {}),
+    "one where there was none": ([], [NEGATED], {}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", OTHER_CONVERSIONS)
+def test_another_conversion_of_the_action_shows_in_the_golden_file(tmp_path: Path, kind: str):
+    """Also where a tolerance allows another action: the conversion is the same on each machine."""
+    first, then, places = OTHER_CONVERSIONS[kind]
+    x = TensorSpec("x", (1, 2), parts={"arm": (0, 1)})
+    y = TensorSpec("y", (1, 2), parts={"arm": (0, 1)}, convert=tuple(first if isinstance(first, list) else [first]))
+    sealed = seal(tmp_path, replace(recurrent(tmp_path).manifest, spec=replace(SPEC, inputs=(x,), outputs=(y,))))
+    write_golden(sealed, OBSERVATIONS, tmp_path)
+    bundle = seal(tmp_path, replace(sealed.manifest, golden=GOLDEN, golden_tolerance=0.5))
+    right = load(bundle.path)
+    assert right.golden_conversion_error == 0
+    changed = replace(y, convert=tuple(then), parts=places or y.parts)
+    seal(tmp_path, replace(bundle.manifest, spec=replace(SPEC, inputs=(x,), outputs=(changed,))))
+    with pytest.raises(BundleError, match="makes another action of the golden one than recorded") as caught:
+        load(bundle.path)
+    assert "policy.yaml" in caught.value.fix
+
+    def drop(arrays: dict[str, Any]) -> None:
+        del arrays["robot_chunk.y"]
+
+    assert load(rewritten(bundle, drop).path).golden_conversion_error is None  # as it was before it was recorded
+
+
+@pytest.mark.parametrize(("got", "error"), [
+    ([[1, 100], [2, -100]], 0), ([[1, 100], [2, -90]], 0.1), ([[1, 100], [1.8, -100]], 0.1), ([[1, 100]], np.inf),
+    ([[1, 100, 0], [2, -100, 0]], np.inf),
+])  # fmt: skip
+def test_a_conversion_is_compared_element_by_element(got: list[list[float]], error: float):
+    assert conversion_error(np.array(got), np.array([[1, 100], [2, -100]])) == pytest.approx(error)
+    assert conversion_error(np.array([[1e-6, 100]]), np.array([[0.0, 100]])) == pytest.approx(1e-6)
+    assert conversion_error(np.zeros((1, 2)), np.zeros((1, 2))) == 0
 
 
 def test_chunks_of_other_sizes_differ_without_bound(float_bundle):

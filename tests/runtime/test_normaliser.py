@@ -82,6 +82,24 @@ def test_with_an_epsilon_a_joint_that_never_moved_is_as_in_lerobot(tmp_path: Pat
     assert "epsilon: 1e-8" in caught.value.fix
 
 
+@pytest.mark.parametrize("mode", NORMALISATIONS[1:])
+def test_with_an_epsilon_it_is_lerobots_arithmetic_bit_for_bit(tmp_path: Path, mode: str):
+    random = np.random.default_rng(0)
+    first, second = STATISTICS_OF[mode]
+    for number in range(50):
+        low = random.normal(size=2).astype(np.float32)
+        high = np.abs(low) + random.uniform(0.01, 3, 2).astype(np.float32)
+        rows = {first: low.tolist(), second: high.tolist()}
+        (tmp_path / "stats.json").write_text(json.dumps({"state": rows}))
+        tensor = TensorSpec("state", (1, 2), normalisation=mode, statistics="stats.json#state", epsilon=EPSILON)
+        normaliser = load_normaliser(tensor, tmp_path)
+        assert normaliser is not None
+        for row in (low, high, (low + high) / 2, random.normal(size=2).astype(np.float32)):
+            span = high + np.float32(EPSILON) if mode == "mean_std" else high - low
+            wanted = (row - low) / span if mode == "mean_std" else 2 * (row - low) / span - 1
+            np.testing.assert_array_equal(normaliser.forward(row[None])[0], wanted, err_msg=str(number))
+
+
 @pytest.mark.parametrize("epsilon", [-1e-8, 1, float("nan"), float("inf"), "1e-8", True, None])
 def test_an_impossible_epsilon_is_refused(epsilon):
     with pytest.raises(SpecError, match="epsilon"):

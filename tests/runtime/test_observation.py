@@ -183,3 +183,24 @@ def test_a_normalised_input_has_the_dtype_that_the_graph_takes(tmp_path: Path):
 def test_missing_statistics_are_seen_before_the_first_observation(tmp_path: Path):
     with pytest.raises(SpecError, match="statistics of 'state' are missing"):
         encoder(tmp_path, TensorSpec("state", (1, 2), normalisation="mean_std", statistics="absent.json#state"))
+
+
+def test_a_prompt_has_the_normalised_state_of_its_observation_in_bins(tmp_path: Path):
+    words = {word: index for index, word in enumerate(["lift", "-1", "0", "1", "2", "3"], 10)}
+    (tmp_path / "tokenizer.json").write_text(json.dumps({"kind": "words", "pad": 0, "unknown": 1, "words": words}))
+    low, high = [-0.3, 1, 5], [0.5, 1.7, 5]
+    (tmp_path / "stats.json").write_text(json.dumps({"joints": {"q01": low, "q99": high}}))
+    prompt = {"template": "{} {state}", "strip": True, "replace": {"\n": " "}, "state": {"input": "joints", "bins": 4}}
+    spec = PolicySpec.from_dict({
+        "inputs": [
+            {"name": "task", "kind": "text", "tokenizer": "tokenizer.json", "max_tokens": 5, "prompt": prompt},
+            {"name": "joints", "shape": [1, 3], "normalisation": "quantiles", "epsilon": 1e-8,
+             "statistics": "stats.json#joints"},
+        ],
+        "outputs": [{"name": "y", "shape": [1, 1]}], "control_hz": 10,
+    })  # fmt: skip
+    encode = ObservationEncoder(spec, tmp_path)
+    for joints, bins in ((low, [12, 12, 12]), (high, [15, 15, 12]), ([-9, 1.35, 5], [11, 14, 12])):
+        encoded = encode({"task": " lift\n", "joints": np.array(joints, np.float32)})
+        assert encoded["task"].tolist() == [[10, *bins, 0]]
+        assert encode(encoded)["task"].tolist() == [[10, *bins, 0]]

@@ -18,7 +18,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DeadlineMissed, GraphError, ProfileError, UsageError
 from vlatool.runtime import Policy, load
 from vlatool.runtime.control import check_order, layers
-from vlatool.runtime.control.checked import CheckedPolicy
+from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.control.fallback import FallbackLadder
@@ -220,8 +220,8 @@ def test_an_order_that_makes_no_sense_is_refused_with_the_reason(monkeypatch: py
 
 def test_layers_by_name_are_put_in_their_order():
     with pytest.raises(UsageError, match="CheckedPolicy cannot be around Deadline"):
-        layers(["deadline", "checked"])
-    assert layers(["fallback", "checked", "deadline"]) == [CheckedPolicy, Deadline, ChunkQueue, FallbackLadder]
+        layers(["deadline", "action_check"])
+    assert layers(["fallback", "action_check", "deadline"]) == [CheckedPolicy, Deadline, ChunkQueue, FallbackLadder]
 
 
 @pytest.mark.parametrize("twice", ["deadline", "fallback"])

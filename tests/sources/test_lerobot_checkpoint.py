@@ -26,6 +26,7 @@ from vlatool.runtime.statistics import load_normaliser
 from vlatool.sources import _lerobot_directory as directory
 from vlatool.sources import source_stage
 from vlatool.sources._lerobot_checkpoint import read_checkpoint
+from vlatool.sources._lerobot_conversions import STATE_IN_PROMPT
 from vlatool.sources.lerobot import LerobotCheckpoint
 
 STATE = {"type": "STATE", "shape": [3]}
@@ -176,6 +177,76 @@ def test_an_instruction_that_is_not_processed_is_refused(tmp_path: Path, number:
     pi0(files)
     gone = files["policy_preprocessor.json"]["steps"].pop(number)["registry_name"]
     with pytest.raises(SourceError, match=f"has no step '{gone}'"):
+        read_checkpoint(write(tmp_path / "c", files))
+
+
+def pi05(files: dict[str, Any], **config: Any) -> None:
+    """Make the files those of pi0.5 as LeRobot 0.6.1 saves them: its prompt has the state, once that is normalised."""
+    instruct("pi05")(files)
+    steps = files["policy_preprocessor.json"]["steps"]
+    del steps[2]
+    prompt = {"registry_name": STATE_IN_PROMPT, "config": {"max_state_dim": 32, "task_key": "task", **config}}
+    steps += [prompt, steps.pop(2)]
+
+
+def lerobot_prompt(task: str, state: np.ndarray) -> str:
+    """``Pi05PrepareStateTokenizerProcessorStep`` of LeRobot 0.6.1, of one normalised state."""
+    discretized_states = np.digitize(state, bins=np.linspace(-1, 1, 256 + 1)[:-1]) - 1
+    cleaned_text = task.strip().replace("_", " ").replace("\n", " ")
+    return f"Task: {cleaned_text}, State: {' '.join(map(str, discretized_states))};\nAction: "
+
+
+@pytest.mark.parametrize("robot_key", ["observation.state", "joints"])
+def test_the_prompt_of_pi05_has_the_bins_of_the_state_as_lerobot_writes_them(tmp_path: Path, robot_key: str) -> None:
+    files = parts()
+    pi05(files)
+    files["policy_preprocessor.json"]["steps"][0]["config"] = {"rename_map": {robot_key: "observation.state"}}
+    checkpoint = read_checkpoint(write(tmp_path / "c", files))
+    facts = {"graphs": {}, "program": [], "shapes": {key: [1, 3] for key in checkpoint.inputs}, "action": [1, 4, 2],
+             "chunk": 4, "history": 1, "tokens": 9, "versions": {"lerobot": "0.6.1"}}  # fmt: skip
+    spec = PolicySpec.from_dict(directory._description(checkpoint, facts)["spec"])
+    (text,) = (each for each in spec.inputs if each.kind == "text")
+    assert (text.prompt is not None, text.name_in_prompt) == (True, robot_key)
+    random = np.random.default_rng(0)
+    for task in ("pick {state} up", " open_the\ndrawer {}\n"):
+        state = random.normal(size=3).astype(np.float32)
+        assert text.prompt is not None
+        assert text.prompt.write(task, state[None]) == lerobot_prompt(task, state)
+
+
+def test_another_prompt_of_another_lerobot_is_refused(tmp_path: Path) -> None:
+    files = parts()
+    pi05(files)
+    checkpoint = read_checkpoint(write(tmp_path / "c", files))
+    state = [0.25, -1.0, 1.5]
+    said = {"versions": {"lerobot": "0.4.0"}, "prompts": [("a", state, lerobot_prompt("a", np.float32(state)))]}
+    directory._check_prompts(checkpoint, said)
+    said["prompts"] = [("a", state, lerobot_prompt("a", np.float32([*state, 0, 0])))]
+    with pytest.raises(SourceError, match=r"LeRobot 0\.4\.0 makes another prompt of 'a'.*160 0 255 128 128"):
+        directory._check_prompts(checkpoint, said)
+
+
+def without_state(files: dict[str, Any]) -> None:
+    pi05(files)
+    del files["config.json"]["input_features"]["observation.state"]
+
+
+def before_its_statistics(files: dict[str, Any]) -> None:
+    pi05(files)
+    steps = files["policy_preprocessor.json"]["steps"]
+    steps.insert(1, steps.pop(-2))
+
+
+@pytest.mark.parametrize(("edit", "words"), [
+    (without_state, "has no 'observation.state', which"), (before_its_statistics, "steps in the order"),
+    (lambda files: pi05(files, task_key="goal"), f"has {STATE_IN_PROMPT} with task_key 'goal'"),
+])  # fmt: skip
+def test_a_pi05_that_lerobot_would_not_run_so_is_refused(
+    tmp_path: Path, edit: Callable[[dict[str, Any]], None], words: str
+) -> None:
+    files = parts()
+    edit(files)
+    with pytest.raises(SourceError, match=words):
         read_checkpoint(write(tmp_path / "c", files))
 
 

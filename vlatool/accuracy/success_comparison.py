@@ -11,6 +11,7 @@ from typing import Any
 from vlatool.accuracy.doubt import Cause, Doubt
 from vlatool.accuracy.motion_comparison import compare_motion
 from vlatool.errors import DataError
+from vlatool.files.printable import amount
 from vlatool.measures import series, tables
 from vlatool.measures.motion import mean_of
 from vlatool.measures.success import MCNEMAR_P, SUCCESS, SUCCESS_CHANCE, SUCCESS_DROP
@@ -93,7 +94,7 @@ def _numbered(starts: Sequence[Hashable]) -> list[float]:
 
 def _starts(starts: Sequence[Hashable]) -> str:
     count, worth = distinct_starts(starts), independent_starts(starts)
-    return f"{count} distinct starts" + (f", worth {worth} episodes" if worth < len(starts) else "")
+    return f"{count} distinct starts" + (f", worth {amount(worth, 'episode')}" if worth < len(starts) else "")
 
 
 def few_starts(row: Row) -> Doubt | None:
@@ -109,7 +110,7 @@ def repeated_starts(row: Row) -> tuple[str, ...]:
     if count == len(starts):
         return ()
     return (
-        f"the {len(starts)} episodes have {count} distinct first observations, so that they count as "
+        f"the {amount(len(starts), 'episode')} have {count} distinct first observations, so that they count as "
         f"{size}: let reset(seed=...) draw each episode anew, and show it in the first observation",
     )
 
@@ -130,7 +131,10 @@ def _refused(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
     for name in dict.fromkeys(name for name, _ in reasons):
         episodes = sum(name in outcome.refused for outcome in outcomes)
         why = max((reason for reason in reasons if reason[0] == name), key=reasons.__getitem__)[1]
-        yield {"what": f"motion from info['{name}']", "why": f"{why} ({episodes} of {len(outcomes)} episodes)"}
+        yield {
+            "what": f"motion from info['{name}']",
+            "why": f"{why} ({episodes} of {amount(len(outcomes), 'episode')})",
+        }
 
 
 def _places(table: list[dict[str, Any]], column: str, values: Sequence[str]) -> list[float]:
@@ -180,7 +184,7 @@ def compare_success(baseline: Row, row: Row) -> Row:
     drop, low, high = exact_drop(lost, won, len(pairs), size=size)
     p = mcnemar_exact(*(count * size // len(pairs) for count in (lost, won)))
     test = MCNEMAR_P.measurement(p, samples=len(pairs), note="exact, two-sided")
-    note = f"paired: {lost} lost, {won} won of {len(pairs)} episodes; {_starts(starts)}"
+    note = f"paired: {lost} lost, {won} won of {amount(len(pairs), 'episode')}; {_starts(starts)}"
     difference = SUCCESS_DROP.measurement(drop, samples=len(pairs), low=low, high=high, note=note)
     table = [{"episodes": len(pairs), "lost": lost, "won": won, "drop": round(drop, 4), "McNemar exact p": round(p, 4)}]
     details = {**row.details, tables.PAIRED_SUCCESS: table}

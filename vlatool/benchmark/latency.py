@@ -16,7 +16,7 @@ from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.bundle.module_bundle import export_command
 from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
 from vlatool.files.messages import from_json, to_json
-from vlatool.files.printable import one_line
+from vlatool.files.printable import amount, one_line
 from vlatool.graph.workload import WORKLOAD_TABLE, Workload, summarize_workload, workload
 from vlatool.graph.zeros import zero_share
 from vlatool.machine.host import fingerprint
@@ -239,7 +239,7 @@ class Latency(Measure):
     def _sentence(self, rows: Sequence[Row], host: Mapping[str, Any], valid: str, seen: Sequence[Finding]) -> str:
         if valid == "invalid":
             return f"The measurement is invalid: {seen[0].reason}."
-        where = f"{host.get('cpu') or 'this host'}, {self.threads} thread{'s' if self.threads > 1 else ''}"
+        where = f"{host.get('cpu') or 'this host'}, {amount(self.threads, 'thread')}"
         row, others = rows[0], rows[1:]
         text = f"{row.name}: {_ms(row)} median latency on {where}"
         for other in others:

@@ -12,6 +12,7 @@ from typing import Any
 
 from vlatool.errors import SpecError, suggest
 from vlatool.files.messages import to_json
+from vlatool.files.printable import amount
 from vlatool.files.validate import finite_number, integer, known_keys, mapping, sequence, short_repr, text
 
 OPERATIONS: dict[str, tuple[str, ...]] = {
@@ -138,7 +139,8 @@ class Conversion:
         _one_of(self.frame, FRAMES, f"{self.where} has the frame")
         if self.state and len(self.state) != len(self.parts):
             raise SpecError(
-                f"{self.where} has {len(self.parts)} parts and {len(self.state)} parts of the state.",
+                f"{self.where} has {amount(len(self.parts), 'part')} and {amount(len(self.state), 'part')} of the "
+                "state.",
                 "name one part in 'state' for each of 'parts'",
             )
 
@@ -209,21 +211,22 @@ class Conversion:
         for start, stop in ordered if self.op == "rotation" else ():
             if stop - start != ROTATIONS[str(self.robot)]:
                 raise SpecError(
-                    f"{self.where} is done to {stop - start} elements, [{start}, {stop}); {self.robot} has "
+                    f"{self.where} is done to {amount(stop - start, 'element')}, [{start}, {stop}); {self.robot} has "
                     f"{ROTATIONS[str(self.robot)]}.",
                     "name the part of the robot's vector that is the rotation alone",
                 )
         for start, stop in ordered if self.pose else ():
             if stop - start - ROTATIONS[self.pose] not in (0, 3):
                 raise SpecError(
-                    f"{self.where} has a pose of {stop - start} elements, [{start}, {stop}); {self.pose} has "
+                    f"{self.where} has a pose of {amount(stop - start, 'element')}, [{start}, {stop}); {self.pose} has "
                     f"{ROTATIONS[self.pose]}, and 3 more with a position."
                 )
         elements = sum(stop - start for start, stop in ordered)
         for name in ("factor", "offset", "low", "high"):
             if len(getattr(self, name)) not in (0, 1, elements):
                 raise SpecError(
-                    f"{self.where} has {len(getattr(self, name))} numbers as {name}, for {elements} elements.",
+                    f"{self.where} has {len(getattr(self, name))} numbers as {name}, for "
+                    f"{amount(elements, 'element')}.",
                     "give one number, or one for each element of 'parts', in their order",
                 )
 
@@ -284,7 +287,9 @@ class Layout:
             return self.names[selector]
         start, stop = selector if isinstance(selector, tuple) else (selector, selector + 1)
         if stop > self.width:
-            raise SpecError(f"{where} has the part {short_repr(selector)} of a vector of {self.width} elements.")
+            raise SpecError(
+                f"{where} has the part {short_repr(selector)} of a vector of {amount(self.width, 'element')}."
+            )
         return start, stop
 
     def after(self, conversion: Conversion) -> Layout:

@@ -9,6 +9,7 @@ from typing import Any
 
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
+from vlatool.files.printable import amount
 from vlatool.files.validate import finite_number, integer, known_keys, mapping, sequence, short_repr
 
 ORDERS = {"rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4, "grey": 1}
@@ -197,7 +198,9 @@ class Image:
                 "leave it out; OpenCV shrinks without steps in the picture by the filter area",
             )
         if len(step.value) not in (1, ORDERS[self.channels]):
-            raise SpecError(f"'image' pads {self.channels} with {len(step.value)} numbers; give one, or one a channel.")
+            raise SpecError(
+                f"'image' pads {self.channels} with {amount(len(step.value), 'number')}; give one, or one a channel."
+            )
         if self.like != "torch" and any(number % 1 for number in step.value):
             raise SpecError(
                 f"'image' pads with {short_repr(step.value)} like {self.like}, which has whole numbers.",
@@ -349,7 +352,7 @@ def _pixels(values: Any, count: int, where: str) -> None:
     """Refuse anything but a number of pixels for each of ``count``; the last two are a height and a width."""
     numbers = sequence(values, f"{where} the size", SpecError)
     if len(numbers) != count:
-        raise SpecError(f"{where} has {short_repr(values)}; wanted {count} numbers of pixels.")
+        raise SpecError(f"{where} has {short_repr(values)}; wanted {amount(count, 'number')} of pixels.")
     for at, number in enumerate(numbers):
         integer(number, f"{where} a number of pixels", SpecError, 0 if at < count - 2 else 1)
     check_limit("elements", math.prod(numbers[-2:]), where, SpecError)
@@ -362,5 +365,5 @@ def _numbers(values: Any, where: str, counts: tuple[int, ...]) -> tuple[float, .
     numbers = tuple(finite_number(each, where, SpecError) for each in sequence(values, where, SpecError))
     if len(numbers) not in counts:
         allowed = " or ".join(map(str, counts))
-        raise SpecError(f"{where} has {len(numbers)} numbers; allowed: {allowed}.")
+        raise SpecError(f"{where} has {amount(len(numbers), 'number')}; allowed: {allowed}.")
     return numbers

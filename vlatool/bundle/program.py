@@ -10,6 +10,7 @@ from vlatool.bundle.spec import DTYPES, PolicySpec
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values
+from vlatool.files.printable import amount
 from vlatool.files.validate import (
     Kind,
     element_count,
@@ -60,7 +61,7 @@ def _check_repeat(step: ProgramStep) -> None:
         if not isinstance(numbers, list | tuple):
             raise SpecError(f"The schedule of '{value}' must be a list of numbers; got {short_repr(numbers)}.")
         if len(numbers) != step.repeat:
-            got = f"{len(numbers)} numbers, but '{step.graph}' runs {step.repeat} times"
+            got = f"{amount(len(numbers), 'number')}, but '{step.graph}' runs {amount(step.repeat, 'time')}"
             raise SpecError(f"The schedule of '{value}' has {got}.")
         for entry in numbers:
             finite_number(entry, f"A number in the schedule of '{value}'", SpecError)

@@ -22,6 +22,7 @@ from vlatool.bundle.prompt import Prompt
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values, to_json
+from vlatool.files.printable import amount
 from vlatool.files.validate import finite_number, integer, path_problem, short_repr, text
 
 DTYPES = (
@@ -151,12 +152,16 @@ class TensorSpec:
         check_limit("elements", self.elements, f"'{self.name}'", SpecError)
         width = self.robot_width
         if self.convert and self.width and width < 1:
-            raise SpecError(f"'{self.name}' has {self.width} elements; its rotations alone have more in the network.")
+            raise SpecError(
+                f"'{self.name}' has {amount(self.width, 'element')}; its rotations alone have more in the network."
+            )
         where = "" if width == self.width else ", as the robot has it"
         for name in ("labels", "unit"):
             value = getattr(self, name)
             if isinstance(value, tuple) and value and len(value) != width:
-                raise SpecError(f"'{self.name}' has {len(value)} {name} for a last axis of {width}{where}.")
+                raise SpecError(
+                    f"'{self.name}' has {amount(len(value), name.removesuffix('s'))} for a last axis of {width}{where}."
+                )
 
     def _check_conversions(self) -> None:
         if not self.convert and not self.parts:
@@ -180,7 +185,7 @@ class TensorSpec:
         marks = [index for index, step in enumerate(self.convert) if step.op == "normalisation"]
         if marks and (len(marks) > 1 or self.normalisation == "none"):
             raise SpecError(
-                f"'{self.name}' has {len(marks)} steps 'normalisation' in convert, and normalisation "
+                f"'{self.name}' has {amount(len(marks), 'step')} 'normalisation' in convert, and normalisation "
                 f"{self.normalisation}; allowed: one, with a normalisation."
             )
         if marks and any(step.op == "relative" for step in self.convert[marks[0] :]):
@@ -306,6 +311,11 @@ class TensorSpec:
         return 2 if later or self.normalisation == "quantile10" else 1
 
     @property
+    def name_in_prompt(self) -> str:
+        """The input that the prompt of this one has in it; empty where it has none."""
+        return self.prompt.state.input if self.prompt is not None and self.prompt.state is not None else ""
+
+    @property
     def frame(self) -> str:
         """Order of the channels of the frames that observations have, empty where they have none."""
         return self.image.frame if self.image else ""
@@ -393,6 +403,7 @@ class PolicySpec:
             if tensor.history:
                 raise SpecError(f"The output '{tensor.name}' has a history.", "leave it out there; it is for inputs")
         self._check_conversions()
+        self._check_prompts()
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
         hz = self.control_hz
@@ -423,6 +434,19 @@ class PolicySpec:
             )
         for step in steps:
             self._check_units(step, self.state_spans(step))
+
+    def _check_prompts(self) -> None:
+        """Refuse prompts that have in them what is not a vector of numbers."""
+        known = {tensor.name: tensor for tensor in self.inputs}
+        for tensor in (each for each in self.inputs if each.name_in_prompt):
+            where, state = f"The prompt of '{tensor.name}' has '{tensor.name_in_prompt}' in it", tensor.name_in_prompt
+            if state not in known:
+                raise SpecError(f"{where}, which is not an input; {suggest(state, known)}.")
+            given = known[state]
+            if given.kind != "tensor" or given.image or not given.dtype.startswith("float") or len(given.shape) != 2:
+                raise SpecError(
+                    f"{where}, {given.dtype} {list(given.shape)}; wanted: floats of one moment, [1, WIDTH]."
+                )
 
     def _check_units(self, relative: Conversion, spans: tuple[tuple[Span, Span], ...]) -> None:
         """Refuse a step ``relative`` behind one that changes units which the action and the state have in common."""

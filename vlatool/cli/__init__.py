@@ -151,6 +151,12 @@ def _end_on_signals() -> None:
                 signal.signal(getattr(signal, name), end)
 
 
+def _raise_on_interrupt() -> None:
+    """Make Ctrl-C an exception again, which ``vlatool/__main__.py`` ends at once until here; ignored, it stays so."""
+    if threading.current_thread() is threading.main_thread() and callable(signal.getsignal(signal.SIGINT)):
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit.
 
@@ -163,10 +169,11 @@ def main(arguments: list[str] | None = None) -> None:
     """
     _open_standard_files()
     _end_on_signals()
-    words = _with_root_options_first(sys.argv[1:] if arguments is None else arguments)
     for_good = arguments is None
+    words = _with_root_options_first(sys.argv[1:] if arguments is None else arguments)
     if for_good:
         start_early(words)
+        _raise_on_interrupt()
     with output(words, for_good=for_good) as document:
         code = _run_command(words, document, for_good=for_good)
     unprinted = take_print_failure()

@@ -12,7 +12,7 @@ import typer
 
 from vlatool import registry
 from vlatool.errors import VlatoolError
-from vlatool.files.printable import file_of, message_of
+from vlatool.files.printable import file_of, message_of, reason_of
 
 OK = 0
 INPUT = 3
@@ -96,6 +96,7 @@ def _printing(error: BaseException) -> bool:
 
 def _usage(error: Any) -> Failure:
     """Return click's reason for refusing a command line."""
+    error.message = reason_of(error.message)
     context = getattr(error, "ctx", None)
     fix = f"{context.command_path} --help" if context else ""
     return Failure("UsageError", error.format_message(), fix, int(error.exit_code))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from vlatool.cli import _run
 from vlatool.errors import UsageError
+from vlatool.files.printable import amount
 
 if TYPE_CHECKING:
     from vlatool.stage.base import Transform
@@ -32,7 +33,7 @@ def launch_for(command: str, *, trains: bool) -> Launch | None:
     launch = current_launch()
     if launch is not None and not trains:
         raise UsageError(
-            f"torchrun started {launch.size} processes of {command}, which runs in one.",
+            f"torchrun started {amount(launch.size, 'process')} of {command}, which runs in one.",
             "start it without torchrun, which is for vlatool distill policy, quantize qat and prune gradual; where "
             "nobody meant torchrun, unset RANK and WORLD_SIZE",
         )
@@ -45,7 +46,7 @@ def with_processes(chosen: Mapping[str, Any], launch: Launch | None) -> dict[str
         return dict(chosen)
     if (asked := chosen.get("processes", launch.size)) != launch.size:
         raise UsageError(
-            f"torchrun started {launch.size} processes, and --processes asks for {asked}.",
+            f"torchrun started {amount(launch.size, 'process')}, and --processes asks for {asked}.",
             "leave --processes out: torchrun says how many there are",
         )
     return {**chosen, "processes": launch.size}

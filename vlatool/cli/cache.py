@@ -15,7 +15,7 @@ import typer
 from vlatool.cli._document import answer, document
 from vlatool.cli._options import AsJson
 from vlatool.errors import DataError, UsageError, suggest
-from vlatool.files.printable import printable
+from vlatool.files.printable import amount, printable
 
 if TYPE_CHECKING:
     from vlatool.stage.cache import Contents, Entry
@@ -138,7 +138,7 @@ def _entry_row(held: Contents, entry: Entry) -> dict[str, Any]:
 
 
 def _total(held: Contents) -> Iterator[str]:
-    yield f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries"
+    yield f"{held.cache}: {_human(held.bytes)} in {amount(len(held.entries), 'entry')}"
     if held.unknown:
         more = f" and {len(held.unknown) - 6} more" if len(held.unknown) > 6 else ""
         yield f"not vlatool's, never removed: {', '.join(map(_on_one_line, held.unknown[:6]))}{more}"

@@ -12,7 +12,7 @@ import typer
 from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson, Force, MapNames
 from vlatool.errors import OutputError, UsageError
-from vlatool.files.printable import printable
+from vlatool.files.printable import amount, printable
 
 if TYPE_CHECKING:
     from vlatool.bundle.spec import PolicySpec
@@ -81,7 +81,7 @@ def sample(
     output.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(output) as draft:
         count = sample_columns(named, samples, draft) if spec is None else sample_recording(named, samples, spec, draft)
-    answer(as_json, {"written": [str(output)]}, [f"{output}: {count} samples of {path}"])
+    answer(as_json, {"written": [str(output)]}, [f"{output}: {amount(count, 'sample')} of {path}"])
 
 
 def _spec_of(policy: str) -> PolicySpec:

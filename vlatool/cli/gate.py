@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -18,7 +18,7 @@ from vlatool.cli import _complete
 from vlatool.cli._console import command_line, crew, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document, put
-from vlatool.cli._options import AsJson, Force, Raw, ReportFolder, Workers
+from vlatool.cli._options import AsJson, Force, MapNames, Raw, ReportFolder, Workers
 from vlatool.cli._run import open_with_graphs
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files.outputs import output_errors, refuse_inputs
@@ -59,6 +59,7 @@ def run(
         int | None,
         typer.Option(min=0, help="seed of observations, noise and order; random, and in the report, if unset"),
     ] = None,
+    map_names: MapNames = None,
     output: ReportFolder = None,
     junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
     workers: Workers = None,
@@ -72,7 +73,7 @@ def run(
     """
     from vlatool.gate.run import run_gate
 
-    gate = _gate(config, margin)
+    gate = _gate(config, margin, map_names or ())
     base = baseline or gate.baseline
     if base is None:
         raise UsageError(
@@ -150,11 +151,15 @@ def _folders(files: Iterable[Path]) -> Iterator[None]:
         raise
 
 
-def _gate(config: Path | None, margin: float | None) -> Gate:
+def _gate(config: Path | None, margin: float | None, map_names: Sequence[str]) -> Gate:
+    from vlatool.data import named_recording
     from vlatool.gate.config import Gate, read_gate
 
     gate = read_gate(config or CONFIG) if config or CONFIG.is_file() else Gate()
-    return gate if margin is None else gate.with_options("latency", margin=margin)
+    gate = gate if margin is None else gate.with_options("latency", margin=margin)
+    data = getattr(gate.claims.get("accuracy"), "data", None)
+    named = named_recording(data, map_names)
+    return gate.with_options("accuracy", map=dict(named.names)) if named is not None and map_names else gate
 
 
 def _check_junit(junit: Path, inputs: Iterable[str | Path | None]) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +21,7 @@ from vlatool.cli._options import AsJson
 from vlatool.cli._proposal import proposal
 from vlatool.errors import OutputError, UsageError
 from vlatool.files.directory_writer import write_directory
+from vlatool.files.printable import one_line
 
 Source = Annotated[
     str,
@@ -69,7 +73,7 @@ def _make(
     stage.check(None, None)
     with progress() as context:
         bundle = cached_transform(stage, None, cache_directory(), context).bundle
-    manifest = bundle.manifest
+    manifest = replace(bundle.manifest, name=_name(policy, bundle.manifest.name))
     text = proposal(manifest, stage.model.name)
     with write_directory(policy) as draft:
         for path in stage.inputs():
@@ -92,7 +96,17 @@ def _copy(converted: Path, policy: Path, control_hz: float | None) -> tuple[str,
         left_out = shutil.ignore_patterns(".*", "__pycache__")
         shutil.copytree(converted, draft, symlinks=True, dirs_exist_ok=True, ignore=left_out)  # weights stay in place
         text = (draft / FILE).read_text(encoding="utf-8")
+        name = _name(policy, read_description(draft).name)
+        text = re.sub(r"^name: .*$", lambda _: f"name: {json.dumps(name)}", text, count=1, flags=re.MULTILINE)
         if control_hz is not None:
             text = text.replace(f"control_hz: {UNKNOWN}", f"control_hz: {control_hz:g}")
-            (draft / FILE).write_text(text, encoding="utf-8")
+        (draft / FILE).write_text(text, encoding="utf-8")
     return text, read_description(policy).spec.unknown()
+
+
+def _name(policy: Path, own: str) -> str:
+    """Return the name of the new directory as that of its policy; the source's ``own`` where it cannot be one."""
+    from vlatool.module.description import MAX_LABEL_CHARACTERS
+
+    name = policy.resolve().name
+    return name if one_line(name, MAX_LABEL_CHARACTERS) == name else own

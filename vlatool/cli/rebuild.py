@@ -14,6 +14,7 @@ from vlatool.cli._document import document, put
 from vlatool.cli._options import AsJson, Force
 from vlatool.errors import GateFailed, UsageError
 from vlatool.files.outputs import BUNDLE
+from vlatool.files.printable import amount
 
 if TYPE_CHECKING:
     from vlatool.rebuild.rebuild import RebuildResult
@@ -94,11 +95,11 @@ def _text(rebuilt: RebuildResult, versions: Versions, output: Path | None) -> st
     total = sum(item.bytes for item in rebuilt.files)
     if differing:
         lines.append(
-            f"differs: {len(differing)} of {len(rebuilt.files)} files; "
+            f"differs: {len(differing)} of {amount(len(rebuilt.files), 'file')}; "
             f"{rebuilt.bundle.hash[:19]} is {rebuilt.hash[:19]}"
         )
     else:
-        lines.append(f"identical: {len(rebuilt.files)} files, {total} bytes, {rebuilt.hash}")
+        lines.append(f"identical: {amount(len(rebuilt.files), 'file')}, {total} bytes, {rebuilt.hash}")
     return "\n".join([*lines, *([f"bundle: {output}"] if output else [])]) + "\n"
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vlatool.data._lazy_rows import LazyRows
 from vlatool.data._recording import Values
 from vlatool.data._steps import Steps
+from vlatool.files.printable import amount
 from vlatool.files.rows import blocks
 
 Array = NDArray[Any]
@@ -158,12 +159,14 @@ def _findings(steps: Steps, columns: tuple[Column, ...], period: float, gaps: li
     if gaps:
         worst = max(gaps, key=lambda gap: abs(gap.seconds))
         found.append(
-            f"{len(gaps)} gaps: time goes on by {worst.seconds:.3f} s before step {worst.step} of episode "
+            f"{amount(len(gaps), 'gap')}: time goes on by {worst.seconds:.3f} s before step {worst.step} of episode "
             f"{worst.episode}, otherwise by {period:.3f} s"
         )
     if period and steps.hz and abs(1 / period / steps.hz - 1) > RATE_TOLERANCE:
         found.append(f"the dataset names {steps.hz:g} Hz; its time stamps are those of {1 / period:.3g} Hz")
-    found += [f"'{each.name}' is not finite in {each.not_finite} steps" for each in columns if each.not_finite]
+    found += [
+        f"'{each.name}' is not finite in {amount(each.not_finite, 'step')}" for each in columns if each.not_finite
+    ]
     for each in columns:
         if each.constant:
             listed = ", ".join(map(str, each.constant[:MAX_LISTED]))
@@ -173,7 +176,7 @@ def _findings(steps: Steps, columns: tuple[Column, ...], period: float, gaps: li
     shortest, usual = int(lengths.min()), int(np.median(lengths))
     if shortest < SHORT_EPISODE * usual:
         episode = int(steps.episodes[np.cumsum(lengths)[lengths.argmin()] - 1])
-        found.append(f"episode {episode} has {shortest} steps; half of them have {usual} or more")
+        found.append(f"episode {episode} has {amount(shortest, 'step')}; half of them have {usual} or more")
     if not steps.action:
         found.append("no column of actions was found; --map action=NAME names it")
     return found

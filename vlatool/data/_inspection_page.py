@@ -15,7 +15,7 @@ from vlatool.data._inspection import Column, Inspection
 from vlatool.data._sampling import sampled_rows
 from vlatool.data._steps import Steps
 from vlatool.errors import require
-from vlatool.files.printable import printable
+from vlatool.files.printable import amount, printable
 from vlatool.files.rows import Rows
 
 PICTURES = 8
@@ -49,13 +49,13 @@ def inspection_page(inspection: Inspection, steps: Steps) -> str:
 def inspection_lines(inspection: Inspection) -> list[str]:
     """Return an inspection as lines of text."""
     lengths = np.array(inspection.lengths)
-    spread = f"{lengths.min()} to {lengths.max()} steps each, {np.median(lengths):g} in the middle"
+    spread = f"{lengths.min()} to {amount(lengths.max(), 'step')} each, {np.median(lengths):g} in the middle"
     measured = "no time stamps" if inspection.measured_hz is None else f"{inspection.measured_hz:.3g} Hz by time stamps"
     named = f"{inspection.hz:g} Hz by name, " if inspection.hz else ""
-    tasks = f", {inspection.tasks} tasks" if inspection.tasks else ""
+    tasks = f", {amount(inspection.tasks, 'task')}" if inspection.tasks else ""
     lines = [
         f"{inspection.path}  {inspection.format}",
-        f"  episodes   {inspection.episodes}, {inspection.steps} steps{tasks}: {spread}",
+        f"  episodes   {inspection.episodes}, {amount(inspection.steps, 'step')}{tasks}: {spread}",
         f"  rate       {named}{measured}",
     ]
     lines += [f"  column     {_text(column)}" for column in inspection.columns]

@@ -16,6 +16,7 @@ from vlatool.bundle.image import Image
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._lazy_rows import LazyRows
 from vlatool.errors import DataError, suggest
+from vlatool.files.printable import amount
 from vlatool.files.rows import Rows, blocks, in_memory
 
 Array = NDArray[Any]
@@ -373,7 +374,7 @@ def _indices(where: str, values: Array, labels: int) -> Array:
         sample, step = (int(index) for index in np.argwhere(wrong)[0])
         raise DataError(
             f"{where} must be indices from 0 to {labels - 1}; got {int(values[sample, step])} in sample {sample}"
-            f" (and in {int(wrong.any(axis=1).sum())} of {len(values)} samples such a value).",
+            f" (and in {int(wrong.any(axis=1).sum())} of {amount(len(values), 'sample')} such a value).",
             "store the index of each action in the spec's labels",
         )
     return values
@@ -389,6 +390,6 @@ def _check_finite(where: str, values: Values, fix: str) -> None:
             bad += (start + np.flatnonzero(wrong)).tolist()
     if bad:
         raise DataError(
-            f"{where} is not finite in {len(bad)} of {len(values)} samples; the first is sample {bad[0]}.",
+            f"{where} is not finite in {len(bad)} of {amount(len(values), 'sample')}; the first is sample {bad[0]}.",
             fix,
         )

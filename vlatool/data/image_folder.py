@@ -18,6 +18,7 @@ from vlatool.data._step_reader import StepReader
 from vlatool.data._steps import Steps
 from vlatool.errors import DataError
 from vlatool.files.limits import check_limit
+from vlatool.files.printable import amount
 from vlatool.registry import Claim
 
 Array = NDArray[Any]
@@ -91,7 +92,10 @@ def _read(file: Path) -> tuple[list[str], list[list[str]]]:
     check_limit("recorded_steps", len(rows) - 1, str(file), DataError)
     for number, row in enumerate(rows[1:], 2):
         if len(row) != len(header):
-            raise DataError(f"{file}, line {number}, has {len(row)} cells; it has {len(header)} columns.", CORRECT)
+            raise DataError(
+                f"{file}, line {number}, has {amount(len(row), 'cell')}; it has {amount(len(header), 'column')}.",
+                CORRECT,
+            )
     return header, rows[1:]
 
 

@@ -19,6 +19,7 @@ from vlatool.data._steps import Steps
 from vlatool.errors import DataError, require
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit, limit
+from vlatool.files.printable import amount
 from vlatool.registry import Claim
 
 Array = NDArray[Any]
@@ -90,11 +91,13 @@ class _Feature:
             raise DataError(f"{where} is missing.", COPY_AGAIN)
         if self.text:
             if not isinstance(values, list) or len(values) != length:
-                raise DataError(f"{where} is not a text for each of {length} steps.", COPY_AGAIN)
+                raise DataError(f"{where} is not a text for each of {amount(length, 'step')}.", COPY_AGAIN)
             return np.array([value.decode("utf-8", "replace") for value in values])
         size = length * int(np.prod(self.shape))
         if isinstance(values, list) or len(values) != size:
-            raise DataError(f"{where} has {len(values)} values; {length} steps take {size}.", COPY_AGAIN)
+            raise DataError(
+                f"{where} has {amount(len(values), 'value')}; {amount(length, 'step')} take {size}.", COPY_AGAIN
+            )
         return np.asarray(values, self.dtype).reshape(length, *self.shape)
 
 

@@ -20,6 +20,7 @@ from vlatool.data._step_reader import StepReader
 from vlatool.data._steps import Steps
 from vlatool.errors import DataError, VlatoolError, require
 from vlatool.files.limits import check_limit
+from vlatool.files.printable import amount
 from vlatool.registry import Claim
 
 Array = NDArray[Any]
@@ -249,7 +250,9 @@ def _resample(path: Path, series: Mapping[str, _Series]) -> _Read:
     columns: dict[str, Values] = {name: _column(path, name, one, nearest[name][usable]) for name, one in used.items()}
     columns |= {name: _column(path, name, one, np.zeros(int(usable.sum()), np.intp)) for name, one in once.items()}
     left_out = int((~usable).sum())
-    note = f"{path}: {left_out} of {len(times)} steps are left out: a topic has no message within {MAX_AGE_S} s"
+    note = (
+        f"{path}: {left_out} of {amount(len(times), 'step')} are left out: a topic has no message within {MAX_AGE_S} s"
+    )
     stamps = {name: np.array(one.stamps)[nearest[name][usable]] for name, one in used.items()}
     return _Read(times[usable], columns, stamps, (note,) if left_out else ())
 

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, suggest
+from vlatool.files.printable import amount
 from vlatool.module.edits import load_tensors, read_tensors
 from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.stage.base import Context
@@ -75,7 +76,7 @@ def check_tensors(modules: Mapping[str, nn.Module], stored: Mapping[str, Any], w
         )
     if unknown:
         raise SourceError(
-            f"{where} holds {len(unknown)} tensors that the policy has not: '{unknown[0]}'; "
+            f"{where} holds {amount(len(unknown), 'tensor')} that the policy has not: '{unknown[0]}'; "
             f"{suggest(unknown[0], known)}.",
             "save the state_dict() of the policy's own modules, and nothing else",
         )

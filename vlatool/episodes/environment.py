@@ -13,6 +13,7 @@ from vlatool.accuracy.success import truth_of
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import DataError
 from vlatool.files.limits import LIMITS_VARIABLE, limit
+from vlatool.files.printable import amount
 from vlatool.machine.watched_calls import watched_call
 
 SECONDS = "environment_seconds"
@@ -194,7 +195,7 @@ def _takes_seed(reset: Any) -> bool:
 def _describe(value: Any) -> str:
     """Return what something is, as a part of a sentence."""
     if isinstance(value, tuple | list):
-        return f"{len(value)} values"
+        return f"{amount(len(value), 'value')}"
     if isinstance(value, np.ndarray):
         return f"an array of {value.dtype} with the shape {list(value.shape)}"
     name = type(value).__name__

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from vlatool.accuracy.success_comparison import Outcome
 from vlatool.episodes.play import EpisodesJob, jobs_for
+from vlatool.files.printable import amount
 from vlatool.measures import series
 from vlatool.measures.success import SUCCESS_DROP
 from vlatool.report import Row
@@ -49,7 +50,7 @@ def played_until(
         decision = comparison.judge(lost, won, after, independent_starts(starts))
         if has_too_few_starts(starts) and decision.verdict in ("pass", "fail"):
             decision = replace(decision, verdict=GO_ON if after < comparison.most else "inconclusive")
-        context.progress(f"{after} pairs: {describe_drop(decision)}", after / comparison.most)
+        context.progress(f"{amount(after, 'pair')}: {describe_drop(decision)}", after / comparison.most)
         if decision.over:
             break
     if decision is None:
@@ -68,7 +69,8 @@ def describe_drop(decision: Decision) -> str:
 
 def with_decision(row: Row, decision: Decision) -> Row:
     """Return the row with the interval of its drop that holds over all interim analyses."""
-    note = f"paired: {decision.lost} lost, {decision.won} won of {decision.pairs} episodes, {decision.most} at most"
+    note = f"paired: {decision.lost} lost, {decision.won} won of {amount(decision.pairs, 'episode')}, "
+    note += f"{decision.most} at most"
     note += f"; {distinct_starts(row.raw[series.START])} distinct starts"
     low, high = decision.low, decision.high
     drop = SUCCESS_DROP.measurement(decision.drop, samples=decision.pairs, low=low, high=high, note=note)

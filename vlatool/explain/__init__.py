@@ -11,6 +11,7 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.module_bundle import no_graph_error
+from vlatool.data import named_recording
 from vlatool.errors import VlatoolError
 from vlatool.explain import _tables as tables
 from vlatool.explain._bfloat16 import Phases, measure_phases, phase_sentences
@@ -51,6 +52,7 @@ class Options:
         samples: Largest number of observations.
         suggest: Whether to build and measure candidates.
         seconds: Time limit for measuring the layers, which reduces the number of observations.
+        map: Names in the recorded observations, as ``NAME=RECORDED``.
     """
 
     baseline: Path | None = None
@@ -60,6 +62,7 @@ class Options:
     threads: int = 1
     suggest: bool = True
     seconds: float = 300.0
+    map: tuple[str, ...] = ()
 
 
 @dataclass
@@ -162,7 +165,7 @@ def _find(bundle: Bundle, options: Options, context: Context) -> _Findings:
         raise no_graph_error(bundle, "explain")
     quantization = origin(bundle)
     baseline = find_baseline(bundle, quantization, options.baseline)
-    observations = observations_of(bundle, baseline, options.data, options.samples)
+    observations = observations_of(bundle, baseline, named_recording(options.data, options.map), options.samples)
     findings = _Findings(bundle, baseline, quantization, observations, warnings=list(quantization.notes))
     if not observations.recorded:
         findings.warnings.append("without recorded observations the layers' errors are not measured (--data FILE)")

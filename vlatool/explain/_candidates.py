@@ -14,6 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.explain._float_roundtrips import Fallback
 from vlatool.explain._operators import raw_actions, reference_engine
+from vlatool.files.printable import amount
 from vlatool.measurement.interleaved import Contestant, run_interleaved
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
@@ -115,7 +116,7 @@ def plan_candidates(
         for count in EXCLUDED_LAYERS:
             if count < len(worst):
                 names = tuple(pattern(layer.name) for layer in worst[:count])
-                words = f"without {count} layer{'s' if count > 1 else ''}"
+                words = f"without {amount(count, 'layer')}"
                 changed = fixed.model_copy(update={"exclude": (*fixed.exclude, *names)})
                 candidates.append(Candidate(", ".join(filter(None, (before, words))), changed, count))
     if isinstance(fixed, StaticInt8) and fixed.method == "minmax" and worst:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.data import recorded_observations, recordings_of, synthetic_observations
+from vlatool.data import NamedRecording, recorded_observations, recordings_of, synthetic_observations
 from vlatool.errors import BundleError, VlatoolError
 from vlatool.graph.precision import FLOATS
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -122,10 +122,10 @@ def _cached_bundle(hashes: tuple[str, ...]) -> Bundle | None:
     return None
 
 
-def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, count: int) -> Observations:
+def observations_of(bundle: Bundle, baseline: Bundle | None, data: NamedRecording | None, count: int) -> Observations:
     """Return observations, preferably unused in calibration; raises DataError when the data does not fit the policy."""
     if data is not None:
-        return Observations(recorded_observations(bundle, count, data), data.name)
+        return Observations(recorded_observations(bundle, count, data), data.path.name)
     sources = [candidate for candidate in (bundle, baseline) if candidate is not None]
     for source in sources:
         if (held_out := recordings_of(source).evaluation) is not None:

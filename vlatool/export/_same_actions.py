@@ -10,6 +10,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for, recorded_observations
 from vlatool.errors import GraphError
+from vlatool.files.printable import amount
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.stage.base import Context, Transform
 from vlatool.stage.finish import MAX_COMPARED, carry_over, finish, reference_policy
@@ -63,7 +64,7 @@ def refuse_other_actions(source: Bundle, made: Bundle, allowed: float = ROUNDING
     if not error <= allowed:
         raise GraphError(
             f"The new graphs give other actions than those that they were made of: relative L2 error {error:.3g} on "
-            f"{len(observations)} observations, allowed {allowed:g}.",
+            f"{amount(len(observations), 'observation')}, allowed {allowed:g}.",
             fix or "use the bundle as it is, or export the policy anew in the version that the engine takes",
         )
     return error

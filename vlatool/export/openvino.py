@@ -14,7 +14,7 @@ from vlatool.errors import GraphError, RecipeError
 from vlatool.export._interface import graph_entry, write_interface
 from vlatool.export._same_actions import OBSERVATIONS, finish_rewritten, largest_difference
 from vlatool.files.blob_store import link_or_copy
-from vlatool.files.printable import message_of, one_line
+from vlatool.files.printable import amount, message_of, one_line
 from vlatool.machine.engine_calls import engine_call
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.policy import Policy
@@ -83,8 +83,8 @@ class Openvino(Transform):
         size = sum(file.stat().st_size for file in (out / FOLDER).iterdir()) / 1e6
         count = len(observations)
         return Result(made, (
-            f"OpenVINO {engine_class(ENGINE).version()}: {FOLDER}/ with {len(entries)} graphs, {size:.2f} MB; its "
-            f"actions differ from what the graphs say by up to {error:.2g} on {count} observations",
+            f"OpenVINO {engine_class(ENGINE).version()}: {FOLDER}/ with {amount(len(entries), 'graph')}, {size:.2f} "
+            f"MB; its actions differ from what the graphs say by up to {error:.2g} on {amount(count, 'observation')}",
         ))  # fmt: skip
 
     def _convert(self, original: Path, model: Path) -> None:
@@ -104,7 +104,7 @@ class Openvino(Transform):
         if not error <= allowed:
             raise GraphError(
                 f"OpenVINO gives other actions with the IR than the graphs say: relative L2 error {error:.3g} on "
-                f"{len(observations)} observations, allowed {allowed:g}.",
+                f"{amount(len(observations), 'observation')}, allowed {allowed:g}.",
                 f"{ROUNDS_FIX if made.manifest.engine == ENGINE else INT8_FIX}; or raise --tolerance if you know why",
             )
         return error

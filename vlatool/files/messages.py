@@ -14,6 +14,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
+from vlatool.files.printable import amount
 from vlatool.files.validate import Kind, known_keys, mapping, short_repr
 
 T = TypeVar("T")
@@ -134,7 +135,7 @@ def _items(inside: tuple[Any, ...], value: Any, where: str) -> Iterable[Any]:
     if inside[-1] is ... and _are_numbers(value) and inside[0] in (float, Number):
         return map(float, value) if inside[0] is float else value
     if inside[-1] is not ... and len(value) != len(inside):
-        raise ValueError(f"'{where}' has {len(value)} values, not {len(inside)}")
+        raise ValueError(f"'{where}' has {amount(len(value), 'value')}, not {len(inside)}")
     kinds = inside[:1] * len(value) if inside[-1] is ... else inside
     return [_read(kinds[index], item, f"{where}[{index}]") for index, item in enumerate(value)]
 

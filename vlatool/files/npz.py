@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import DataError, VlatoolError
 from vlatool.files.limits import MIB, check_limit
+from vlatool.files.printable import amount
 from vlatool.files.rows import CompressedSource, OpenFile, PlainSource, Rows
 
 Array = NDArray[Any]
@@ -165,7 +166,7 @@ def _with_small_directory(stream: IO[bytes]) -> IO[bytes]:
         starts = (at for at in _find_all(tail, b"PK\6\6") if at + 48 <= len(tail))
         sizes = [struct.unpack_from("<Q", tail, at + 40)[0] for at in starts]
     if max(sizes, default=0) > MAX_DIRECTORY_BYTES:
-        raise ValueError(f"its table of contents has {max(sizes)} bytes; allowed: {MAX_DIRECTORY_BYTES}")
+        raise ValueError(f"its table of contents has {amount(max(sizes), 'byte')}; allowed: {MAX_DIRECTORY_BYTES}")
     stream.seek(0)
     return stream
 
@@ -242,7 +243,9 @@ def _checked_header(
         raise ValueError(f"'{name}' has the dtype {dtype}, which is neither numbers nor text")
     start = stream.tell()
     if start + math.prod(shape) * dtype.itemsize != entry.file_size:
-        raise ValueError(f"'{name}' declares the shape {str(shape)[:80]}, but has {entry.file_size - start} bytes")
+        raise ValueError(
+            f"'{name}' declares the shape {str(shape)[:80]}, but has {amount(entry.file_size - start, 'byte')}"
+        )
     return shape, fortran, dtype, start
 
 
@@ -254,7 +257,7 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
         raise ValueError("an entry is not an array in the .npy format 1 or 2")
     length = int.from_bytes(stream.read(size), "little")
     if length > MAX_HEADER_BYTES:
-        raise ValueError(f"the header of an array has {length} bytes; allowed: {MAX_HEADER_BYTES}")
+        raise ValueError(f"the header of an array has {amount(length, 'byte')}; allowed: {MAX_HEADER_BYTES}")
     match = HEADER.fullmatch(stream.read(length).decode("latin-1"))
     if match is None:
         raise ValueError("the header of an array is not one of plain numbers or text")

@@ -40,6 +40,30 @@ def truncate(text: str, longest: int = MAX_CHARACTERS) -> str:
     return text if len(text) <= longest else f"{text[:longest]}... ({len(text):,} characters)"
 
 
+def amount(number: int, noun: str) -> str:
+    """Return a number and what it is of, in the singular for 1.
+
+    Example:
+        >>> amount(1, "step"), amount(0, "entry"), amount(2, "process")
+        ('1 step', '0 entries', '2 processes')
+    """
+    if number == 1:
+        return f"{number} {noun}"
+    if noun.endswith("y"):
+        return f"{number} {noun[:-1]}ies"
+    return f"{number} {noun}{'es' if noun.endswith('s') else 's'}"
+
+
+def reason_of(message: str) -> str:
+    """Return what a check said, without the kind of error that pydantic and typer put before it.
+
+    Example:
+        >>> reason_of("Value error, 'nope' is not one of 'auto', 'trace'.")
+        "'nope' is not one of 'auto', 'trace'."
+    """
+    return re.sub(r"^(Value error|Assertion failed), ", "", message)
+
+
 def mask_passwords(text: str) -> str:
     """Return the address of a database, or an option with one, with its passwords masked; other texts as they are.
 

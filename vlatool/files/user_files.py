@@ -45,7 +45,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
     target = path.resolve()
     remove_stale_drafts(target)
     draft = target.with_name(DRAFT.format(target.name, os.getpid(), uuid.uuid4().hex[:8]))
-    lock = os.open(draft, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    with rename_in_errors(draft, str(path)):
+        lock = os.open(draft, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with rename_in_errors(draft, str(path)):

@@ -14,6 +14,7 @@ from pydantic_core import ErrorDetails
 from vlatool import registry
 from vlatool.errors import PluginError, RecipeError, VlatoolError, require, suggest
 from vlatool.files.numbers import Numeric
+from vlatool.files.printable import reason_of
 from vlatool.files.yaml import read_mapping
 from vlatool.gate.claim import KIND, Claim
 from vlatool.gate.plan import Need, Plan
@@ -121,7 +122,7 @@ def _problem(error: ErrorDetails) -> str:
         known = [field.alias or name for name, field in fields.items()]
         return f"{key}: is not a known key; {suggest(str(path[-1]), known)}"
     shown = f" (got {got!r})" if key and isinstance(got, str | int | float) else ""
-    return f"{key or 'gate'}: {error['msg']}{shown}"
+    return f"{key or 'gate'}: {reason_of(error['msg'])}{shown}"
 
 
 def _fix(error: ValidationError) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import recordings_of
+from vlatool.data import NamedRecording, recordings_of
 from vlatool.errors import PluginError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.gate.inputs import Inputs
@@ -46,6 +46,12 @@ class Evidence:
     def recording_path(self) -> Path | None:
         """The recorded observations that both are compared on: those of the gate file, else the baseline's own."""
         return recorded_data(self.baseline, self.plan)
+
+    @property
+    def recording(self) -> NamedRecording | None:
+        """The same, with the names that the gate file maps."""
+        path, plan = self.recording_path, self.plan
+        return None if path is None else NamedRecording(path, plan.names if plan.data else {})
 
     @cached_property
     def episodes(self) -> tuple[Row, Row]:

@@ -11,7 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Drawer, Drawn, Recording, calibration_recording, read_recording, recordings_of, save_drawn
+from vlatool.data import (
+    Drawer,
+    Drawn,
+    NamedRecording,
+    Recording,
+    calibration_recording,
+    read_recording,
+    recordings_of,
+    save_drawn,
+)
 from vlatool.files.scratch import scratch_directory
 
 TIMING, AGREEMENT, MEMORY = range(3)
@@ -32,7 +41,7 @@ class Inputs:
     """
 
     baseline: Bundle
-    data: Path | None
+    data: Path | NamedRecording | None
     seed: int
 
     @cached_property

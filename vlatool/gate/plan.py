@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
 
@@ -29,6 +30,7 @@ class Plan:
         seconds: time after which such a process begins no further pair.
         timeout: seconds that any process may take.
         data: recorded observations that the gate file names.
+        names: name in the spec -> name in them, where they differ.
         episodes: number of closed-loop episodes; 0 for none.
         policy: directory of the policy.yaml that names environment and tasks.
         disturb, strength: disturbances under which the episodes are played as well, and how strong they are.
@@ -44,6 +46,7 @@ class Plan:
     seconds: float = 10.0
     timeout: float = 1800.0
     data: Path | None = None
+    names: Mapping[str, str] = field(default_factory=dict)
     episodes: int = 0
     policy: Path | None = None
     disturb: tuple[str, ...] = ()

@@ -10,6 +10,7 @@ from statistics import median
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import NamedRecording
 from vlatool.gate.config import Gate
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.inputs import AGREEMENT, Inputs
@@ -54,7 +55,8 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
         refuse_findings(bundle, gate.accept)
     host, plan = before_run(), gate.plan
     seed = secrets.randbits(32) if seed is None else seed
-    inputs = Inputs(baseline, plan.data, seed)
+    data = None if plan.data is None else NamedRecording(plan.data, plan.names)
+    inputs = Inputs(baseline, data, seed)
     paths = str(baseline.path), str(candidate.path)
     job = PairJob(*paths, plan.engine, plan.threads, plan.warmup, plan.pairs, plan.seconds, seed)
     timed = Timed(job, context, plan.timeout, inputs)

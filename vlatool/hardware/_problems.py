@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from vlatool.errors import suggest
+from vlatool.files.printable import reason_of
 
 UNITS = ("cpu", "gpu", "npu")
 WEIGHTS = ("w8", "w4")
@@ -31,7 +32,7 @@ def describe_problem(error: ErrorDetails, known: Iterable[str]) -> str:
         hint, _, _ = suggest(str(error["loc"][-1]), known).rpartition(" known: ")
         return f"{where}: is not a known key; {hint}".removesuffix("; ")
     if kind == "value_error":
-        return f"{where}: {error['msg'].removeprefix('Value error, ')}"
+        return f"{where}: {reason_of(error['msg'])}"
     words = error["msg"].replace("Input should be", "must be").replace("greater than 0", "above 0")
     return f"{where}: {REASONS.get(kind, words)}{'' if kind == 'missing' else got}"
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from pydantic import Field, ValidationError
 
 from vlatool.errors import ProfileError
+from vlatool.files.printable import reason_of
 from vlatool.files.yaml import read_yaml
 from vlatool.hardware._problems import describe_problem
 from vlatool.hardware.profile import NAME, SUFFIXES, Kind, Strict
@@ -58,7 +59,7 @@ def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
         return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        problem = f"{'.'.join(map(str, first['loc']))}: {reason_of(first['msg'])}"
         if first["type"] == "extra_forbidden":
             problem = describe_problem(first, Platform.model_fields)
         raise ProfileError(

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from vlatool.errors import DataError, OutputError
+from vlatool.files.printable import amount
 from vlatool.latency_model.features import Shares, rows_of
 from vlatool.latency_model.folds import UNITS, Folds, Sample
 from vlatool.latency_model.gaussian_process import Scales
@@ -228,8 +229,8 @@ def fit(
     work = {part: float(len(mine)) ** 3 for part, mine in subsamples.items()}  # of one assessment
     for part, mine in usable.items():
         sample = Sample.from_points(mine)
-        groups = f"{len(set(sample.devices))} devices and {len(set(sample.models))} models"
-        tell(f"{part}: {len(sample.published)} figures of {groups}")
+        groups = f"{amount(len(set(sample.devices)), 'device')} and {amount(len(set(sample.models)), 'model')}"
+        tell(f"{part}: {amount(len(sample.published), 'figure')} of {groups}")
         begin = (Scales(), Shares())
         if before is not None and part in before.parts:
             begin = (before.parts[part].scales, before.shares[part])

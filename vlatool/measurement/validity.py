@@ -7,6 +7,7 @@ from functools import partial
 from statistics import median
 from typing import Any
 
+from vlatool.files.printable import amount
 from vlatool.measurement.answers import MAX_FRESH_RATIO
 from vlatool.measurement.clock_drift import MAX_DRIFT, drift
 from vlatool.measurement.interleaved import MAX_CALLS
@@ -110,7 +111,7 @@ def _threads(measured: Benchmark, job: LatencyJob) -> Iterator[Finding]:
     threads, processors = _threads_and_processors(measured, job)
     if threads > processors:
         yield suspect(
-            f"{threads} threads share {processors} processor{'s' if processors > 1 else ''}: they wait for each other",
+            f"{threads} threads share {amount(processors, 'processor')}: they wait for each other",
             f"--threads {processors}, or fewer",
         )
 

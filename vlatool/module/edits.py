@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, SourceError, require, suggest
 from vlatool.files.json import read_json
+from vlatool.files.printable import amount
 from vlatool.module.edit import REMAKE
 from vlatool.module.edit import Edit as Edit
 from vlatool.module.feeds import first_feeds
@@ -220,7 +221,7 @@ def _keep_blocks(module: Any, edit: Edit) -> None:
         raise SourceError(said, REMAKE)
     blocks = list(module._modules.items())
     if max(edit.keep) >= len(blocks):
-        has = f"'{edit.module}' has {len(blocks)} blocks, numbered from 0"
+        has = f"'{edit.module}' has {amount(len(blocks), 'block')}, numbered from 0"
         raise SourceError(f"{has}; an edit keeps number {max(edit.keep)}.", REMAKE)
     module._modules.clear()
     for number, index in enumerate(edit.keep):

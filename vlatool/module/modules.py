@@ -7,6 +7,7 @@ from typing import Any
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require, suggest
+from vlatool.files.printable import amount
 
 
 def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
@@ -44,7 +45,7 @@ def outputs_of(result: Any, step: ProgramStep) -> list[Any]:
     outputs = list(result) if isinstance(result, tuple | list) else [result]
     if len(outputs) != len(step.gives):
         raise SourceError(
-            f"The module gives {len(outputs)} outputs; the program says {', '.join(step.gives)}.",
+            f"The module gives {amount(len(outputs), 'output')}; the program says {', '.join(step.gives)}.",
             "return as many tensors as the program's 'gives' names, in its order",
         )
     return outputs

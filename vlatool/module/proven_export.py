@@ -12,7 +12,7 @@ import numpy as np
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import GraphError, VlatoolError, require
-from vlatool.files.printable import message_of, one_line
+from vlatool.files.printable import amount, message_of, one_line
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.float32_conversion import ROUNDING, rewrite_as_float32
 from vlatool.graph.random_ops import refuse_random_ops
@@ -78,7 +78,7 @@ class Exported:
         if not self.readers:
             return said
         return (*said, f"{graph}: forward() decides by values at {', '.join(self.readers)}; the graph holds what it "
-                f"did for each of {calls} inputs, and would not do anything else")  # fmt: skip
+                f"did for each of {amount(calls, 'input')}, and would not do anything else")  # fmt: skip
 
 
 class CalledSession(TorchSession):

@@ -15,7 +15,7 @@ from vlatool.bundle.module_bundle import export_command
 from vlatool.bundle.program import ProgramStep
 from vlatool.data import OBSERVATIONS_FILE, observations_for
 from vlatool.errors import BundleError, GraphError, SourceError, VlatoolError, require
-from vlatool.files.printable import message_of
+from vlatool.files.printable import amount, message_of
 from vlatool.module.description import read_location
 from vlatool.module.edits import FOLDER, Edit, apply, concatenate_edits, holds_weights, read_edits, write_module
 from vlatool.module.failures import remedy_for
@@ -166,7 +166,7 @@ def _structure(bundle: Bundle) -> str:
     told = f"{edits or 'no'} structural edit{'s' if edits != 1 else ''}"
     fewer = any(entry.get("stage") == "prune.steps" for entry in bundle.manifest.build)
     turns = [step.repeat for step in bundle.manifest.program if fewer and step.carry]
-    return ", ".join([told, *(f"{count} denoising step{'s' if count != 1 else ''}" for count in turns)])
+    return ", ".join([told, *(f"{amount(count, 'denoising step')}" for count in turns)])
 
 
 def _run_once(bundle: Bundle) -> None:

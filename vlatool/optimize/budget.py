@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from vlatool.errors import RecipeError, suggest
-from vlatool.measures import quantity_of
+from vlatool.measures import quantities, quantity_of
 from vlatool.measures.actions import AGREEMENT_BASELINE, DISAGREEMENT, ERROR_BASELINE, ERROR_BASELINE_OF
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
 if TYPE_CHECKING:
-    from vlatool.bundle.spec import PolicySpec
+    from vlatool.bundle.spec import PolicySpec, TensorSpec
 
 PROXY = 0.05
 """Error against float32 up to which a plan is worth an evaluation, where the closed loop or the expert decides."""
@@ -39,6 +39,16 @@ class Budget:
             alike = (m for m in ERROR_BASELINE_OF.members(row).values() if m.unit == unit)
             return max(alike, key=lambda m: m.value, default=None)
         return row.get(quantity_of(self.name)) or row.get(ERROR_BASELINE_OF.quantity(self.name))
+
+    def check_name(self, action: TensorSpec) -> None:
+        """Refuse a name that nothing has: no measure, and no element or unit of the action; raises RecipeError."""
+        units = sorted({f"unit:{unit}" for unit in action.units() if unit})
+        known = [*quantities(), DISAGREEMENT.name, *action.labels, *units]
+        if self.name not in known:
+            raise RecipeError(
+                f"--max-drop names '{self.name}', which vlatool does not measure; {suggest(self.name, known)}.",
+                "leave the name out to bound the success or the error that is measured",
+            )
 
     def require(self, row: Row) -> Measurement:
         """Return the row's measurement for the budget; raises RecipeError, naming those it has, when it lacks that."""

@@ -144,7 +144,9 @@ def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:
     limits = plan.recipe.limits
     if not limits.metric:
         return
+    budget = budget_of(limits, baseline.manifest.spec)
     if not is_recorded(baseline, plan.closed_loop):
+        budget.check_name(baseline.manifest.spec.action)
         raise DataError(
             f"--max-drop names '{limits.metric}', which needs recorded observations; the policy brings none to be "
             "evaluated on.",
@@ -152,7 +154,7 @@ def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:
         )
     recorded = Recorded(baseline=baseline.path, samples=1)
     row = cached_measure(recorded, baseline, plan.cache, context).rows[-1]
-    budget_of(limits, baseline.manifest.spec).require(row)
+    budget.require(row)
 
 
 def _proposals(plan: Plan, source: Bundle, baseline: Bundle, context: Context) -> Proposals:

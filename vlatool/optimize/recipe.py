@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from vlatool.errors import RecipeError, require
 from vlatool.files.numbers import Numeric
+from vlatool.files.printable import reason_of
 from vlatool.files.yaml import read_mapping
 from vlatool.machine.instruction_sets import saturates
 from vlatool.runtime.engine import DEFAULT_ENGINE, class_for
@@ -145,7 +146,9 @@ def read_recipe(path: Path) -> Recipe:
     try:
         return Recipe.model_validate(data)
     except ValidationError as error:
-        problems = [f"{'.'.join(map(str, item['loc'])) or 'recipe'}: {item['msg']}" for item in error.errors()]
+        problems = [
+            f"{'.'.join(map(str, item['loc'])) or 'recipe'}: {reason_of(item['msg'])}" for item in error.errors()
+        ]
         raise RecipeError(f"The recipe {path}: {'; '.join(problems)}.", "correct it in the file") from error
 
 

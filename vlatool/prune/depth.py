@@ -10,6 +10,7 @@ from pydantic import Field, field_validator
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
+from vlatool.files.printable import amount
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import BLOCKS, Edit, refuse_traced
 from vlatool.module.feeds import unrecorded_note
@@ -85,7 +86,7 @@ class Depth(ModuleStage):
         remaining = explicit or self._remaining_blocks(sizes, modules, source, context)
         ranked = not explicit and self.rank != "even"
         kept_blocks = (
-            f"kept {len(kept)} of {sizes[graph, name]} blocks of {name or 'the module itself'}: "
+            f"kept {len(kept)} of {amount(sizes[graph, name], 'block')} of {name or 'the module itself'}: "
             f"{', '.join(map(str, kept))}"
             for (graph, name), kept in remaining.items()
         )
@@ -129,7 +130,7 @@ class Depth(ModuleStage):
         scores: dict[BlockId, float] = {}
         for done in range(total):
             blocks = [(*stack, block) for stack, count in pending.items() if count for block in remaining[stack]]
-            context.progress(f"ranking {len(blocks)} blocks", done / total)
+            context.progress(f"ranking {amount(len(blocks), 'block')}", done / total)
             if not scores or self.rank == "error":
                 scores = rank(blocks, removed)
             graph, name, block = least = min(blocks, key=scores.__getitem__)

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import DataError, RecipeError
+from vlatool.files.printable import amount
 from vlatool.files.scratch import scratch_directory
 from vlatool.hardware.profile import Profile, load_profile, profile_file, profile_names
 from vlatool.latency_model.board import Candidate
@@ -146,7 +147,7 @@ class LatencyPruning(ModuleStage):
         groups = find_groups(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         if not groups:
             raise no_units(source.manifest.name)
-        context.progress(f"ranking the units of {len(groups)} groups", None)
+        context.progress(f"ranking the units of {amount(len(groups), 'group')}", None)
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
         work = Macs(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)

@@ -13,6 +13,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import RecipeError
+from vlatool.files.printable import amount
 from vlatool.hardware.profile import Profile
 from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.stage.base import Context
@@ -69,7 +70,7 @@ def with_fewer_steps(step: ProgramStep, count: int) -> ProgramStep:
     """
     if count >= step.repeat:
         raise RecipeError(
-            f"The program repeats '{step.graph}' {step.repeat} times; --to is {count}.", "ask for fewer steps"
+            f"The program repeats '{step.graph}' {amount(step.repeat, 'time')}; --to is {count}.", "ask for fewer steps"
         )
     sizes = {name: numbers[0] for name, numbers in step.schedule.items() if _is_even(numbers, 0.0)}
     times = {name: numbers[1] - numbers[0] for name, numbers in step.schedule.items() if name not in sizes}
@@ -102,8 +103,8 @@ def _as_stored(step: ProgramStep, name: str, numbers: list[float]) -> list[float
         return numbers
     if any(abs(number - round(number)) > ROUNDING_TOLERANCE for number in numbers):
         raise RecipeError(
-            f"The schedule of '{name}' has integers; with {len(numbers)} steps instead of {step.repeat} they would "
-            "become fractions.",
+            f"The schedule of '{name}' has integers; with {amount(len(numbers), 'step')} instead of {step.repeat} they "
+            "would become fractions.",
             f"ask for a divisor of {step.repeat}",
         )
     return [round(number) for number in numbers]

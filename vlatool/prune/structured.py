@@ -10,6 +10,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import FallsShort
+from vlatool.files.printable import amount
 from vlatool.module.axes import Walk
 from vlatool.module.feeds import unrecorded_note
 from vlatool.module.stage import ModuleChanges, ModuleStage
@@ -58,7 +59,7 @@ class Structured(ModuleStage):
         context.progress("tracing the policy", None)
         walks = trace_walks(modules, source)
         groups = find_groups(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
-        context.progress(f"ranking the units of {len(groups)} groups", None)
+        context.progress(f"ranking the units of {amount(len(groups), 'group')}", None)
         if groups:
             rank_units(groups, self.rank, modules, source, self.samples)
         changes = self.choose(walks, groups, {step.graph: step.repeat for step in source.manifest.program}, context)

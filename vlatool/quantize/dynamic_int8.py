@@ -9,6 +9,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError
+from vlatool.files.printable import amount
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import Layer, check_weights, copy_inner_gemm_weights, split_gemms
 from vlatool.graph.onnx_graph import OnnxGraph
@@ -77,7 +78,7 @@ class DynamicInt8(Quantization):
             left = [node.name for node in quantized.graph.node if node.op_type in OPS and node.name in names]
             if left:
                 raise GraphError(
-                    f"ONNX Runtime's quantizer leaves {len(left)} of {len(names)} layers in float32: "
+                    f"ONNX Runtime's quantizer leaves {len(left)} of {amount(len(names), 'layer')} in float32: "
                     f"{', '.join(left[:3])}.",
                     "exclude them: " + " ".join(f"--exclude '{name}'" for name in left[:3]),
                 )

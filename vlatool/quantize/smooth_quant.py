@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError
+from vlatool.files.printable import amount
 from vlatool.graph.files import foreign_errors, load, save
 from vlatool.graph.nodes import reads
 from vlatool.graph.onnx_graph import OnnxGraph
@@ -104,7 +105,8 @@ class SmoothQuant(CalibratedQuantization):
         groups = json.loads((smoothed.path / REPORT).read_text(encoding="utf-8"))["groups"]
         count = {how: sum(group["how"] == how for group in groups) for how in ("folded", "inserted", "left")}
         layers = sum(len(group["layers"]) for group in groups if group["how"] != "left")
-        text = f"smoothed the inputs of {layers} layers: {count['folded']} scales folded, {count['inserted']} inserted"
+        text = f"smoothed the inputs of {amount(layers, 'layer')}: {count['folded']} scales folded, "
+        text += f"{count['inserted']} inserted"
         blocked = sum(group["why"] == "only a Mul of its own could divide it" for group in groups)
         more = f" ({blocked} of them need --insert)" if blocked else ""
         return (f"{text}, {count['left']} unchanged{more}",)

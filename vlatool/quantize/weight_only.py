@@ -16,6 +16,7 @@ from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.module_bundle import export_command
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, DataError, require
+from vlatool.files.printable import amount
 from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.graph.files import link
 from vlatool.graph.precision import precision_shares
@@ -145,8 +146,8 @@ class WeightOnly(WeightOptions):
         if not report["layers"]:
             return ("no layer was quantized",)
         return (
-            f"{len(report['layers'])} weights in int{self.bits}, blocks of {self.block}{again}; relative L2 error: "
-            f"mean {report['mean']:.4f}, largest {report['max']:.4f} ({report['worst']})",
+            f"{amount(len(report['layers']), 'weight')} in int{self.bits}, blocks of {self.block}{again}; relative L2 "
+            f"error: mean {report['mean']:.4f}, largest {report['max']:.4f} ({report['worst']})",
             *self._underdetermined_layers(report["layers"]),
         )
 

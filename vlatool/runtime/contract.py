@@ -14,6 +14,7 @@ from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import GraphError, SpecError, suggest
+from vlatool.files.printable import amount
 from vlatool.runtime.observation import all_finite
 
 Array = NDArray[Any]
@@ -92,7 +93,7 @@ def check_chunk(spec: PolicySpec) -> None:
     actions, name = math.prod(sizes), spec.action.name
     raise SpecError(
         f"The spec has chunk {spec.chunk}; the shape {list(spec.action.shape)} of the output '{name}' holds "
-        f"{actions} {'action' if actions == 1 else 'actions'}.",
+        f"{amount(actions, 'action')}.",
         f"write chunk: {actions} (and execute: for how many of them are executed), or another shape",
     )
 

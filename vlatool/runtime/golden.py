@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
@@ -17,6 +19,8 @@ COPY_AGAIN = "copy the bundle again from where it was made, or make it again"
 
 GOLDEN_STEPS = 2
 """Golden observations in a row that a program with kept values needs: the first alone does not show what was kept."""
+CHUNK, ROBOT_CHUNK = "chunk", "robot_chunk"
+"""Prefixes of actions in physical units: before they are converted, and as the robot gets them."""
 Array = NDArray[Any]
 Golden = tuple[dict[str, Any], dict[str, Array], Array]
 """Observation, noise, raw action output."""
@@ -80,9 +84,31 @@ def golden_steps(bundle: Bundle, stored: Mapping[str, Array]) -> list[Golden]:
     ]
 
 
-def golden_chunks(action: TensorSpec, stored: Mapping[str, Array], steps: int) -> list[Array]:
-    """Return the recorded actions in physical units; none for indices, and where they were not recorded."""
-    chunks = stored.get(f"chunk.{action.name}")
+def golden_chunks(action: TensorSpec, stored: Mapping[str, Array], steps: int, kind: str = CHUNK) -> list[Array]:
+    """Return the recorded actions in physical units; none for indices, and where they were not recorded.
+
+    Args:
+        kind: ``CHUNK``, before they are converted, or ``ROBOT_CHUNK``, as the robot gets them.
+    """
+    chunks = stored.get(f"{kind}.{action.name}")
     if chunks is None or action.kind == "discrete" or not chunks.ndim or chunks.dtype.kind not in "fiu":
         return []
     return list(chunks) if len(chunks) == steps else []
+
+
+def conversion_error(got: Array, expected: Array) -> float:
+    """Return how far two conversions of one action are apart: the worst element, relative to its own size.
+
+    An element is taken as 1 % of the largest at least: what is left where large numbers cancel is rounding. Infinite
+    when their sizes differ.
+
+    Args:
+        got: (T, A) in the units of the robot.
+        expected: the same.
+    """
+    one, other = (np.asarray(each, np.float64).reshape(-1, each.shape[-1]) for each in (got, expected))
+    if one.shape != other.shape:
+        return math.inf
+    sizes = np.abs(other).max(axis=0, initial=0.0)
+    least = 0.01 * float(sizes.max(initial=0.0)) or 1.0
+    return float((np.abs(one - other).max(axis=0, initial=0.0) / np.maximum(sizes, least)).max(initial=0.0))

@@ -19,7 +19,7 @@ FORMAT = 1
 """Version of what is hashed: a change of it changes every identity."""
 FILE_FIELDS = ("statistics", "tokenizer")
 """Fields of a tensor that name files: what the files say is hashed, not their names."""
-ROWS = ("offset", "scale", "inverse_scale", "at_offset")
+ROWS = ("offset", "scale", "inverse_scale")
 """Fields of a normaliser that its values follow from."""
 NO_BEHAVIOUR = ("data/", "golden/", f"{ASSETS}/")
 """Prefixes of the files of a source bundle that hold no weights; assets are hashed with the tensors that name them."""

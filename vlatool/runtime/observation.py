@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError
+from vlatool.files.printable import amount
 from vlatool.runtime.assets import Assets, asset_path
 from vlatool.runtime.converter import Converter, newest_moment
 from vlatool.runtime.history import History
@@ -25,7 +26,8 @@ NOT_FINITE = (
     "with finite: false in its spec"
 )
 Array = NDArray[Any]
-Encoder = Callable[[Any], Array]
+Encoder = Callable[..., Array]
+"""Takes the value of an input, and for a prompt the state that it has in it, encoded."""
 
 
 class EncodedObservation(dict[str, Array]):
@@ -49,7 +51,12 @@ class ObservationEncoder:
 
     def __init__(self, spec: PolicySpec, assets: Assets, history: History | None = None) -> None:
         self.names = [tensor.name for tensor in spec.inputs]
-        self._encoders = [(tensor.name, _encoder(tensor, assets, history)) for tensor in spec.inputs]
+        states = [tensor.name_in_prompt for tensor in spec.inputs]
+        encoders = [
+            (tensor.name, _encoder(tensor, assets, history, exact=tensor.name in states), tensor.name_in_prompt)
+            for tensor in spec.inputs
+        ]
+        self._encoders = sorted(encoders, key=lambda each: bool(each[2]))  # what a prompt has stands before it
         self._dtypes = {tensor.name: tensor.dtype for tensor in spec.inputs}
         self._reference = spec.reference
         self._of_reference = Converter(spec.reference, assets) if spec.reference else None
@@ -69,13 +76,13 @@ class ObservationEncoder:
             return self._copied(observation)
         values = EncodedObservation()
         with np.errstate(over="raise"):
-            for name, encode in self._encoders:
+            for name, encode, state in self._encoders:
                 try:
                     value = observation[name]
                 except Exception:  # the seam: a mapping raises KeyError, anything else may raise anything
                     raise self._missing_input(observation, name) from None
                 try:
-                    values[name] = encode(value)
+                    values[name] = encode(value, values[state]) if state else encode(value)
                 except (RuntimeWarning, FloatingPointError):
                     raise self._too_large(name, value) from None
         if self._reference is not None:
@@ -119,7 +126,12 @@ class ObservationEncoder:
         return f"{only}pass {{{written}}}"
 
 
-def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None) -> Encoder:
+def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None, *, exact: bool = False) -> Encoder:
+    """Return the encoder of an input.
+
+    Args:
+        exact: whether a vector is normalised in float32 throughout, as in training: the bins of a prompt show a bit.
+    """
     if tensor.kind == "text":
         return _text_encoder(tensor, assets)
     if tensor.history and history is not None:
@@ -134,6 +146,7 @@ def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None)
     batched, single = tensor.shape, tensor.shape[1:]
     vector = (
         normaliser is not None
+        and not exact
         and len(single) == 1
         and tensor.width in range(1, MAX_SMALL_VALUES)
         and dtype == np.float32
@@ -201,7 +214,8 @@ def _frame_encoder(tensor: TensorSpec, encode_frame: FrameEncoder) -> Encoder:
         frames = frame[0] if len(frame) == 1 and frame.ndim > len(tensor.observation.shape) - 1 else frame
         if len(frames) != tensor.history:
             raise DataError(
-                f"The input '{tensor.name}' is given as {len(frames)} frames; the policy takes {tensor.history}.",
+                f"The input '{tensor.name}' is given as {amount(len(frames), 'frame')}; the policy takes "
+                f"{tensor.history}.",
                 "give the frame of this moment alone, or those of all moments",
             )
         return np.stack([encode_frame(each) for each in frames], axis=1)
@@ -238,11 +252,11 @@ def _text_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
     content = tokenizer_content(assets, tensor.tokenizer, tensor.name)
     tokenizer = Tokenizer(asset_path(assets, tensor.tokenizer), tensor.max_tokens, tensor.name, content, tensor.prompt)
 
-    def encode(value: Any) -> Array:
+    def encode(value: Any, state: Array | None = None) -> Array:
         if isinstance(value, str):
-            return tokenizer(value)
+            return tokenizer(value, state)
         if isinstance(value, np.ndarray) and value.dtype.kind == "U" and value.size == 1:
-            return tokenizer(str(value.reshape(())))
+            return tokenizer(str(value.reshape(())), state)
         raise DataError(f"The input '{tensor.name}' is text; got {type(value).__name__}.", "pass a str")
 
     return encode
@@ -288,7 +302,11 @@ def all_finite(array: Array) -> bool:
 
 def _not_finite(array: Array) -> str:
     nans = int(np.isnan(array).sum())
-    return f"{nans} NaN of {array.size} values" if nans else f"infinity in {int(np.isinf(array).sum())} of {array.size}"
+    return (
+        f"{nans} NaN of {amount(array.size, 'value')}"
+        if nans
+        else f"infinity in {int(np.isinf(array).sum())} of {array.size}"
+    )
 
 
 def not_finite_text(spec: PolicySpec, observation: Mapping[str, Any]) -> str:
@@ -308,4 +326,4 @@ def _texts(spec: PolicySpec, observation: Mapping[str, Any]) -> Iterator[str]:
         counts = {"NaN": np.isnan(array).sum(), "inf": (array == math.inf).sum(), "-inf": (array == -math.inf).sum()}
         parts = [f"{count} {name}" for name, count in counts.items() if count]
         if parts:
-            yield f"{' and '.join(parts)} in the {array.size} values of '{tensor.name}'"
+            yield f"{' and '.join(parts)} in the {amount(array.size, 'value')} of '{tensor.name}'"

@@ -21,18 +21,29 @@ from vlatool.files.printable import printable
 from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.arithmetic import int8_trouble, machine
 from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, written_as_declared
+from vlatool.runtime.converter import newest_moment
 from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
-from vlatool.runtime.golden import GOLDEN_STEPS, golden_arrays, golden_chunks, golden_steps
+from vlatool.runtime.golden import (
+    GOLDEN_STEPS,
+    ROBOT_CHUNK,
+    Golden,
+    conversion_error,
+    golden_arrays,
+    golden_chunks,
+    golden_steps,
+)
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.history import History
 from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.interface import Action, Array
-from vlatool.runtime.observation import EncodedObservation, ObservationEncoder
+from vlatool.runtime.observation import EncodedObservation, ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
 
 FLOAT_ROUNDING = 1e-3
 """Relative difference of a float32 golden action that a different order of summation explains; observed: up to 6e-7."""
+CONVERSION_TOLERANCE = 1e-4
+"""Largest relative difference of a converted golden action: numpy converts the same numbers on each machine."""
 FIRST_RUN_S = 60.0
 """Time limit of one inference in the warm-up: far more than any policy that a robot could use would take."""
 
@@ -66,6 +77,7 @@ class BundlePolicy:
         """Time limit of an inference in seconds, after which it is stopped; no limit when None."""
         self.golden_error: float | None = None
         self.golden_chunk_error: float | None = None
+        self.golden_conversion_error: float | None = None
 
     @classmethod
     def open(
@@ -271,7 +283,8 @@ class BundlePolicy:
             first_run_s: Time limit of each inference in seconds.
 
         Raises:
-            BundleError: when a program that keeps values has only one golden step.
+            BundleError: when a program that keeps values has only one golden step, or the bundle converts its golden
+                action to another one than recorded.
             DataError: when the golden file cannot be read.
             GraphError: when the difference is larger or not a number, or an inference takes longer.
         """
@@ -310,6 +323,19 @@ class BundlePolicy:
             self.limit_s = limit
         self.reset()
         self.golden_error, self.golden_chunk_error = _worst(errors), _worst(of_chunks)
+        converted = golden_chunks(self.spec.action, stored, len(steps), ROBOT_CHUNK)
+        self.golden_conversion_error = _worst(
+            conversion_error(self._converted(step), expected)
+            for step, expected in zip(steps, converted, strict=False)
+            if all_finite(step[2])
+        )
+
+    def _converted(self, golden: Golden) -> Array:
+        """Return what the conversion makes of a recorded raw action; the engine has no part in it."""
+        observation, _, raw = golden
+        reference = self.spec.reference
+        state = None if reference is None else newest_moment(observation[reference.name], reference.robot_width)
+        return self._decode(raw, state)[0]
 
     def check_golden(self, tolerance: float | None = None) -> None:
         """Check the differences that the warm-up stored against the tolerances.
@@ -318,6 +344,7 @@ class BundlePolicy:
             tolerance: Largest relative L2 difference of outputs and of chunks; those in the manifest when None.
 
         Raises:
+            BundleError: when the conversion makes another action of the golden one than recorded.
             GraphError: when a difference is larger or not a number.
         """
         limits = self.golden_tolerances if tolerance is None else (tolerance, tolerance)
@@ -332,6 +359,14 @@ class BundlePolicy:
                     or self._made_for()
                     or "the engine or processor may lack what this precision needs; run: vlatool doctor",
                 )
+        allowed = max(CONVERSION_TOLERANCE, tolerance or 0.0)
+        if (error := self.golden_conversion_error) is not None and not error <= allowed:
+            raise BundleError(
+                f"The conversion of '{self.spec.action.name}' in {self.bundle.path} makes another action of the golden "
+                f"one than recorded: relative error {error:.3g}, allowed {allowed:g}. Its spec ('convert', 'parts', "
+                "statistics) was changed after the bundle was made.",
+                "make the bundle again from the policy, with what is right in its policy.yaml",
+            )
 
     def _made_for(self) -> str:
         """Return a fix that names the bundle's engine, if a different one runs it."""

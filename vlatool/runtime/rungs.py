@@ -199,7 +199,7 @@ def neutral_index(action: TensorSpec, label: str = "") -> int:
     Raises:
         UsageError: when the label is not there, or none or several of the labels mean no motion.
     """
-    found = [place for place, name in enumerate(action.labels)
+    found = [index for index, name in enumerate(action.labels)
              if (name == label if label else name.lower() in NO_MOTION)]  # fmt: skip
     if len(found) != 1:
         known = ", ".join(action.labels[:20])

@@ -20,7 +20,7 @@ from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError
 from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.control import build_layer, check_order, layers, options_of, takes_delay
-from vlatool.runtime.control.checked import CheckedPolicy
+from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.control.fallback import HOLD_S, FallbackLadder

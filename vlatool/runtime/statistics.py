@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import STATISTICS_OF, TensorSpec
 from vlatool.errors import SpecError, suggest
 from vlatool.files.json import read_json
+from vlatool.files.printable import amount
 from vlatool.runtime.assets import Assets, asset_path, read_asset
 
 Array = NDArray[np.float32]
@@ -22,51 +23,56 @@ class Normaliser:
 
     ``mean_std``: offset = mean, scale = std. ``min_max``, ``quantiles`` and ``quantile10`` map [low, high] to [-1, 1]:
     offset = (low + high) / 2, scale = (high - low) / 2. With an epsilon, as LeRobot has it: a std is that much larger
-    on the way in alone, and an element whose low and high are equal has low = offset -> -1 and the scale epsilon / 2.
+    on the way in alone, and ranges are ``(physical - low) / scale - 1``, bit for bit as LeRobot computes them in
+    float32; an element whose low and high are equal has the scale epsilon / 2.
 
     Args:
         offset: float32 (A,), in the unit of the tensor.
         scale: float32 (A,), in the unit of the tensor.
         inverse_scale: float32 (A,): scale on the way back, where it is another one.
-        at_offset: float32 (A,): what the offset becomes, where that is not 0.
+        low: float32 (A,): what becomes -1, where that is computed from there.
     """
 
     offset: Array
     scale: Array
     inverse_scale: Array | None = None
-    at_offset: Array | None = None
+    low: Array | None = None
     _rows: dict[tuple[int, ...], tuple[Array, Array, Array]] = field(default_factory=dict, repr=False, compare=False)
 
     def forward(self, physical: Array) -> Array:
         """Physical to normalised, float32, any shape (..., A)."""
-        offset, scale, _ = self._rows.get(physical.shape) or self._spread(physical.shape)
-        normalised = (physical - offset) / scale
-        return normalised if self.at_offset is None else normalised + self.at_offset
+        origin, scale, _ = self._rows.get(physical.shape) or self._spread(physical.shape)
+        normalised = (physical - origin) / scale
+        return normalised if self.low is None else normalised - np.float32(1)
 
     def forward_row(self, physical: list[float]) -> Array:
         """Physical to normalised for one short vector: A numbers to float32 (1, A), without numpy's arithmetic."""
         pairs = zip(physical, self._numbers, strict=True)
-        row = np.array([[(value - offset) / scale for value, (offset, scale) in pairs]], np.float32)
-        return row if self.at_offset is None else row + self.at_offset
+        row = np.array([[(value - origin) / scale for value, (origin, scale) in pairs]], np.float32)
+        return row if self.low is None else row - np.float32(1)
+
+    @property
+    def _origin(self) -> Array:
+        return self.offset if self.low is None else self.low
 
     @functools.cached_property
     def _numbers(self) -> list[tuple[float, float]]:
-        return list(zip(self.offset.tolist(), self.scale.tolist(), strict=True))
+        return list(zip(self._origin.tolist(), self.scale.tolist(), strict=True))
 
     def inverse(self, normalised: Array) -> Array:
         """Normalised to physical, float32, any shape (..., A)."""
-        offset, _, scale = self._rows.get(normalised.shape) or self._spread(normalised.shape)
-        return (normalised if self.at_offset is None else normalised - self.at_offset) * scale + offset
+        origin, _, scale = self._rows.get(normalised.shape) or self._spread(normalised.shape)
+        return (normalised if self.low is None else normalised + np.float32(1)) * scale + origin
 
     def _spread(self, shape: tuple[int, ...]) -> tuple[Array, Array, Array]:
-        """Return offset, scale and inverse scale of the full shape, kept: it spares numpy the broadcasting.
+        """Return origin, scale and inverse scale of the full shape, kept: it spares numpy the broadcasting.
 
         Right after an inference the processor's caches hold the network, and broadcasting then takes 20 us longer
         (``vlatool benchmark overhead``).
         """
-        offset, scale = np.broadcast_to(self.offset, shape).copy(), np.broadcast_to(self.scale, shape).copy()
+        origin, scale = np.broadcast_to(self._origin, shape).copy(), np.broadcast_to(self.scale, shape).copy()
         other = self.inverse_scale
-        operands = offset, scale, scale if other is None else np.broadcast_to(other, shape).copy()
+        operands = origin, scale, scale if other is None else np.broadcast_to(other, shape).copy()
         self._rows[shape] = operands
         return operands
 
@@ -93,18 +99,12 @@ def load_normaliser(tensor: TensorSpec, assets: Assets) -> Normaliser | None:
         )
     if not np.isfinite([offset, scale]).all():
         raise SpecError(f"The statistics of '{tensor.name}' span more than float32 holds.", "repair the statistics")
-    return _normaliser(offset.astype(np.float32), scale.astype(np.float32), np.float32(tensor.epsilon), first == "mean")
-
-
-def _normaliser(offset: Array, scale: Array, epsilon: np.float32, deviations: bool) -> Normaliser:
-    """Return a normaliser with an epsilon, from standard ``deviations`` or else from halves of ranges."""
+    offset, scale, epsilon = offset.astype(np.float32), scale.astype(np.float32), np.float32(tensor.epsilon)
     if not epsilon:
         return Normaliser(offset, scale)
-    if deviations:
+    if first == "mean":
         return Normaliser(offset, scale + epsilon, inverse_scale=scale)
-    still = scale == 0
-    at_offset = np.where(still, np.float32(-1), np.float32(0)) if still.any() else None
-    return Normaliser(offset, np.where(still, epsilon / 2, scale).astype(np.float32), at_offset=at_offset)
+    return Normaliser(offset, np.where(scale == 0, epsilon / 2, scale).astype(np.float32), low=low)
 
 
 def _row(tensor: TensorSpec, assets: Assets, key: str) -> Array:
@@ -136,8 +136,8 @@ def _checked(values: object, tensor: TensorSpec, where: str) -> Array:
         ) from error
     if row.shape != (tensor.width,):
         raise SpecError(
-            f"{where} has the shape {list(row.shape)}; '{tensor.name}' has {tensor.width} elements.",
-            f"store one number for each of the {tensor.width} elements",
+            f"{where} has the shape {list(row.shape)}; '{tensor.name}' has {amount(tensor.width, 'element')}.",
+            f"store {amount(tensor.width, 'number')}, one for each element",
         )
     if not np.all(np.isfinite(row)):
         raise SpecError(

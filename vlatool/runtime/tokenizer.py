@@ -15,6 +15,7 @@ from vlatool.bundle.prompt import Prompt
 from vlatool.errors import DataError, SpecError, VlatoolError, require
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit
+from vlatool.files.printable import amount
 from vlatool.runtime.assets import Assets, asset_path, read_asset
 from vlatool.runtime.token_growth import growth
 
@@ -25,7 +26,7 @@ Encode = Callable[[str], list[int]]
 
 
 class Tokenizer:
-    """Turns an instruction into ids of fixed width; remembers the last instructions.
+    """Turns an instruction into ids of fixed width; remembers the last prompts.
 
     Args:
         path: ``tokenizer.json`` of the ``tokenizers`` library, or a vocabulary
@@ -64,12 +65,16 @@ class Tokenizer:
                 SAVE,
             )
 
-    def __call__(self, text: str) -> NDArray[np.int64]:
+    def __call__(self, text: str, state: NDArray[Any] | None = None) -> NDArray[np.int64]:
         """Return the ids of ``text``, int64, shape (1, max_tokens).
+
+        Args:
+            state: what the prompt has of another input, where it has something, as the network has it.
 
         Raises:
             DataError: when the library cannot read it, or its prompt is too long: cut, it would ask for nothing.
         """
+        text = text if self.prompt is None else self.prompt.write(text, state)
         known = self._cache.get(text)
         if known is None:
             if len(self._cache) >= self.remembered:
@@ -78,7 +83,6 @@ class Tokenizer:
         return known
 
     def _padded(self, text: str) -> NDArray[np.int64]:
-        text = text if self.prompt is None else self.prompt.write(text)
         check_limit(
             "text_characters",
             len(text) * self._growth,
@@ -90,12 +94,12 @@ class Tokenizer:
             ids = self.prompt.end(ids)
         if len(ids) > self.max_tokens and self.prompt is not None:
             raise DataError(
-                f"The {self.name} makes a prompt of {len(ids)} tokens; the policy takes {self.max_tokens}.",
+                f"The {self.name} makes a prompt of {amount(len(ids), 'token')}; the policy takes {self.max_tokens}.",
                 "say it in fewer words",
             )
         if len(ids) > self.max_tokens:
             warnings.warn(
-                f"the {self.name} has {len(ids)} tokens; the last {len(ids) - self.max_tokens} are cut",
+                f"the {self.name} has {amount(len(ids), 'token')}; the last {len(ids) - self.max_tokens} are cut",
                 stacklevel=4,
             )
         row = np.full((1, self.max_tokens), self.pad, np.int64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +20,23 @@ from vlatool.sources._lerobot_conversions import (
     ABSOLUTE,
     RELATIVE,
     STATE,
+    STATE_IN_PROMPT,
     Steps,
     aloha_steps,
     joint_names,
     relative_parts,
+    state_prompt,
 )
 
-FAMILIES = ("act", "diffusion", "pi0", "smolvla")
+FAMILIES = ("act", "diffusion", "pi0", "pi05", "smolvla")
 """Types of policies that ``_lerobot_child`` traces."""
 HARMLESS = ("to_batch_processor", "device_processor")
 TEXT_STEPS = {
     "smolvla": ("smolvla_new_line_processor", "tokenizer_processor"),
     "pi0": ("pi0_new_line_processor", "tokenizer_processor"),
+    "pi05": (STATE_IN_PROMPT, "tokenizer_processor"),
 }
-"""Family -> steps of its instruction; ``_lerobot_child`` writes the tokenizer that does both."""
+"""Family -> steps of its instruction, which the tokenizer that ``_lerobot_child`` writes and a prompt do."""
 RENAME, NORMALIZER, UNNORMALIZER = "rename_observations_processor", "normalizer_processor", "unnormalizer_processor"
 MODES = {
     "IDENTITY": (), "MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"),
@@ -79,6 +82,7 @@ class Checkpoint:
     Args:
         inputs: key in the policy -> the feature, in the order of config.json.
         execute: actions that are executed of a chunk.
+        prompt: what is written around the instruction, as a spec says it; empty where nothing is.
         ensemble: coefficient of ACT's temporal ensembling, with which it averages chunks; None without.
     """
 
@@ -87,6 +91,7 @@ class Checkpoint:
     inputs: Mapping[str, Feature]
     action: Feature
     execute: int
+    prompt: Mapping[str, Any] = field(default_factory=dict)
     ensemble: float | None = None
 
 
@@ -114,9 +119,10 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             raise SourceError(
                 f"{folder / 'policy_preprocessor.json'} has no step '{name}', as {family} has it.", COMPLETE
             )
-    _check_order(folder, steps, RENAME, NORMALIZER)
+    _check_order(folder, steps, RENAME, NORMALIZER, STATE_IN_PROMPT)
     _check_order(folder, steps, *TEXT_STEPS.get(str(family), ()))
-    _check_text(folder, config, steps.get("tokenizer_processor", {}))
+    for name in TEXT_STEPS.get(str(family), ()):
+        _check_text(folder, config, name, steps[name])
     behind = _steps(folder, "policy_postprocessor.json", (*HARMLESS, UNNORMALIZER, ABSOLUTE))
     mapping = config.get("normalization_mapping")
     trained_with = mapping if isinstance(mapping, dict) else {}
@@ -139,7 +145,9 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     if not isinstance(execute, int) or execute < 1:
         raise SourceError(f"config.json of {folder} has n_action_steps {truncate(repr(execute), 40)}.", COMPLETE)
     ensemble = _ensemble(folder, config, action)
-    return Checkpoint(folder, str(family), inputs, action, execute if ensemble is None else 1, ensemble)
+    prompt = state_prompt(folder, steps, inputs[STATE].key if STATE in inputs else "")
+    executed = execute if ensemble is None else 1
+    return Checkpoint(folder, str(family), inputs, action, executed, prompt, ensemble)
 
 
 def _ensemble(folder: Path, config: Mapping[str, Any], action: Feature) -> float | None:
@@ -174,14 +182,14 @@ def _check_order(folder: Path, steps: Steps, *names: str) -> None:
         )
 
 
-def _check_text(folder: Path, config: Mapping[str, Any], step: Mapping[str, Any]) -> None:
+def _check_text(folder: Path, config: Mapping[str, Any], name: str, step: Mapping[str, Any]) -> None:
     """Refuse what changes the ids of an instruction in ways that the tokenizer's file does not show."""
     for key, known in (
         ("padding_side", "right"), ("task_key", "task"), ("max_length", config.get("tokenizer_max_length")),
     ):  # fmt: skip
         if (value := step.get(key)) not in (None, known):
             raise SourceError(
-                f"{folder / 'policy_preprocessor.json'} has tokenizer_processor with {key} {truncate(repr(value), 40)};"
+                f"{folder / 'policy_preprocessor.json'} has {name} with {key} {truncate(repr(value), 40)};"
                 f" wanted: {known}.",
                 COMPLETE,
             )

@@ -26,6 +26,8 @@ EMPTY = "observation.images.empty_camera_"
 """Cameras that a policy of several fills with a constant."""
 STATE, TEXT = "observation.state", "task"
 """How LeRobot calls joints and instruction."""
+STATE_IN_PROMPT = "pi05_prepare_state_tokenizer_processor_step"
+TASKS = ("pick up the red cup", "  open_the {state} drawer\n", "a\nb {}")
 
 
 def identifier(key):
@@ -216,7 +218,7 @@ class Prefix(nn.Module):
 
 
 class PiPrefix(nn.Module):
-    """Pictures and instruction of pi0 to the keys and values of every layer, and which positions are there."""
+    """Pictures and prompt of pi0 or pi0.5 to the keys and values of every layer, and which positions are there."""
 
     def __init__(self, policy, observation, pad):
         super().__init__()
@@ -262,21 +264,43 @@ class Flow(nn.Module):
         return x, x[:, :, : self.width]
 
 
+def steps_of(policy):
+    """Return the steps of the checkpoint's own preprocessor: registry name -> configuration."""
+    steps = json.loads(Path(policy.config.pretrained_path, "policy_preprocessor.json").read_text())["steps"]
+    return {step["registry_name"]: step["config"] for step in steps}
+
+
 def tokenizer_name(policy):
     """Return the tokenizer that the checkpoint's own processor names."""
-    steps = json.loads(Path(policy.config.pretrained_path, "policy_preprocessor.json").read_text())["steps"]
-    return next(step["config"]["tokenizer_name"] for step in steps if step["registry_name"] == "tokenizer_processor")
+    return steps_of(policy)["tokenizer_processor"]["tokenizer_name"]
 
 
-def write_tokenizer(name, out):
-    """Write the tokenizer of a policy, which ends an instruction with a line break, and return the id that pads."""
+def prompts(policy, generator):
+    """Return what this LeRobot makes of instructions and normalised states: (task, state, prompt) of each."""
+    from lerobot.processor import ProcessorStepRegistry, TransitionKey
+
+    if STATE_IN_PROMPT not in steps_of(policy):
+        return []
+    step = ProcessorStepRegistry.get(STATE_IN_PROMPT)(**steps_of(policy)[STATE_IN_PROMPT])
+    width, found = policy.config.input_features[STATE].shape[0], []
+    for task, scale in zip(TASKS, (0.6, 1.0, 0.3), strict=True):
+        state = (torch.randn(1, width, generator=generator) * scale * 128).round() / 128  # edges of bins
+        said = {TransitionKey.OBSERVATION: {STATE: state}, TransitionKey.COMPLEMENTARY_DATA: {TEXT: [task]}}
+        (prompt,) = step(said)[TransitionKey.COMPLEMENTARY_DATA][TEXT]
+        found.append((task, state[0].tolist(), prompt))
+    return found
+
+
+def write_tokenizer(name, out, line_break=True):
+    """Write the tokenizer of a policy, which may end a text with a line break, and return the id that pads."""
     from tokenizers import Regex, normalizers
     from transformers import AutoTokenizer
 
     tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=True)
     inner, pad = tokenizer.backend_tokenizer, tokenizer.pad_token_id
-    line_break = normalizers.Replace(Regex(r"(?<!\n)\z"), "\n")
-    inner.normalizer = normalizers.Sequence([line_break, *([inner.normalizer] if inner.normalizer else [])])
+    if line_break:
+        ends = normalizers.Replace(Regex(r"(?<!\n)\z"), "\n")
+        inner.normalizer = normalizers.Sequence([ends, *([inner.normalizer] if inner.normalizer else [])])
     inner.no_truncation()
     inner.enable_padding(pad_id=pad, pad_token=tokenizer.pad_token)
     inner.save(str(out / "tokenizer.json"))
@@ -293,15 +317,20 @@ def smolvla(policy, observation, values, out):
 
 
 def pi0(policy, observation, values, out):
-    """Return the graphs of pi0 with an example of their inputs, and the program; its state goes into every step."""
+    """Return the graphs of pi0 or pi0.5 with an example of their inputs, and the program.
+
+    The state goes into every step of pi0, and into the prompt of pi0.5, which has no line break at its end.
+    """
     config, model = policy.config, policy.model.paligemma_with_expert
     if config.n_obs_steps != 1:
         raise SystemExit("more than one observation step is not supported")
     for part in (model.paligemma.model.language_model, model.gemma_expert.model):
         part.config._attn_implementation = "eager"  # as its own inference has it
-    prefix = PiPrefix(policy, observation, write_tokenizer(tokenizer_name(policy), out))
+    in_prompt = config.type == "pi05"
+    prefix = PiPrefix(policy, observation, write_tokenizer(tokenizer_name(policy), out, line_break=not in_prompt))
     named = dict(zip(observation.keys, values, strict=True))
-    return flow(policy, prefix, {key: named[key] for key in observation.cameras}, config.num_inference_steps, named)
+    seen = {key: named[key] for key in observation.cameras}
+    return flow(policy, prefix, seen, config.num_inference_steps, None if in_prompt else named)
 
 
 def flow(policy, prefix, seen, steps, named=None):
@@ -337,7 +366,7 @@ def flow(policy, prefix, seen, steps, named=None):
     return graphs, program, config.chunk_size
 
 
-FAMILIES = {"act": act, "diffusion": diffusion, "pi0": pi0, "smolvla": smolvla}
+FAMILIES = {"act": act, "diffusion": diffusion, "pi0": pi0, "pi05": pi0, "smolvla": smolvla}
 
 
 def play(graphs, program, values, keys, generator):
@@ -367,7 +396,7 @@ def own_inference(policy, observation, values, drawn, graph_pad):
         ids = values[-1][:, values[-1][0] != graph_pad]
         batch |= {"observation.language.tokens": ids, "observation.language.attention_mask": torch.ones_like(ids) > 0}
         return policy.predict_action_chunk(batch, noise=drawn["x"])
-    if policy.config.type == "pi0":
+    if policy.config.type in ("pi0", "pi05"):
         batch |= {"observation.language.tokens": values[-1]}
         batch |= {"observation.language.attention_mask": values[-1] != graph_pad}
         return policy.predict_action_chunk(batch, noise=drawn["x"])
@@ -453,7 +482,7 @@ def main(request):
         "program": program,
         "shapes": {key: list(value.shape) for key, value in zip(keys, first, strict=True)},
         "action": list(action.shape), "chunk": chunk, "error": max(errors),
-        "history": config.n_obs_steps,
+        "history": config.n_obs_steps, "prompts": prompts(policy, generator),
         "tokens": None if pad is None else config.tokenizer_max_length,
         "versions": {name: version(name) for name in ("lerobot", "torch")},
     }  # fmt: skip

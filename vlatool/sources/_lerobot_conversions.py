@@ -1,4 +1,4 @@
-"""What the steps of a LeRobot checkpoint do to states and actions beside statistics, as ``convert`` of a spec."""
+"""What the steps of a LeRobot checkpoint do to states and actions beside statistics, as a spec says it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,11 @@ from vlatool.files.printable import truncate
 
 RELATIVE, ABSOLUTE = "relative_actions_processor", "absolute_actions_processor"
 STATE = "observation.state"
+STATE_IN_PROMPT = "pi05_prepare_state_tokenizer_processor_step"
+STATE_PROMPT = {
+    "template": "Task: {}, State: {state};\nAction: ", "strip": True, "replace": {"_": " ", "\n": " "},
+}  # fmt: skip
+"""The prompt of pi0.5, as ``policies/pi05/processor_pi05.py`` of LeRobot 0.6.1 has it."""
 Steps = Mapping[str, Mapping[str, Any]]
 ALOHA = "adapt_to_pi_aloha"
 FLIPPED_JOINTS, GRIPPERS = [1, 2, 8, 9], [6, 13]
@@ -67,6 +72,25 @@ def relative_parts(folder: Path, steps: tuple[Steps, Steps], widths: tuple[int, 
             f"{folder} has actions of {widths[1]} elements that are relative to {widths[0]} of '{STATE}'.", SAVE_BOTH
         )
     return _runs(_mask(folder, before[RELATIVE], widths[1]))
+
+
+def state_prompt(folder: Path, steps: Steps, state: str) -> dict[str, Any]:
+    """Return the prompt of a policy that reads its state as text; empty for any other policy.
+
+    Args:
+        state: name of the state as a robot has it; empty where there is none.
+
+    Raises:
+        SourceError: where the policy has no state.
+    """
+    if STATE_IN_PROMPT not in steps:
+        return {}
+    if not state:
+        raise SourceError(
+            f"config.json of {folder} has no '{STATE}', which '{STATE_IN_PROMPT}' writes into the prompt.",
+            "train the policy with a state, as LeRobot wants it",
+        )
+    return {**STATE_PROMPT, "state": {"input": state}}
 
 
 def aloha_steps(folder: Path, config: Mapping[str, Any], widths: tuple[int, int]) -> tuple[list[Any], list[Any]]:

@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from vlatool.bundle.prompt import Prompt
 from vlatool.bundle.spec import UNKNOWN
 from vlatool.errors import SourceError
 from vlatool.files.blob_store import mark_cache
@@ -98,6 +99,7 @@ def write_policy(checkpoint: Checkpoint, python: str, out: Path) -> None:
         SourceError: when LeRobot cannot load or trace the policy.
     """
     facts = _traced(checkpoint, python, out)
+    _check_prompts(checkpoint, facts)
     statistics = {feature.key: _rows(feature) for feature in (*checkpoint.inputs.values(), checkpoint.action)}
     (out / "statistics.json").write_text(
         json.dumps({key: rows for key, rows in statistics.items() if rows}, indent=1) + "\n", encoding="utf-8"
@@ -144,6 +146,22 @@ def _traced(checkpoint: Checkpoint, python: str, out: Path) -> dict[str, Any]:
     return said
 
 
+def _check_prompts(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> None:
+    """Compare the prompts of this LeRobot with those of the spec: releases of it differ.
+
+    Raises:
+        SourceError: when one differs.
+    """
+    prompt = Prompt.from_dict(checkpoint.prompt)
+    for task, state, lerobot in facts["prompts"]:
+        if (own := prompt.write(task, np.array(state, np.float32))) != lerobot:
+            raise SourceError(
+                f"LeRobot {facts['versions']['lerobot']} makes another prompt of {task!r} than is known of 0.6: "
+                f"{truncate(repr(lerobot), 200)}, not {truncate(repr(own), 200)}.",
+                "name the Python that has LeRobot 0.6 with --python, if the policy was trained with it",
+            )
+
+
 def _offset_and_scale(feature: Feature) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return what LeRobot subtracts from a feature, and what it divides by then."""
     first, second = feature.statistics.values()
@@ -177,7 +195,9 @@ def _description(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> dict[str, 
         for key, feature in checkpoint.inputs.items()
     ]
     if facts["tokens"]:
-        inputs.append({"name": "task", "kind": "text", "tokenizer": "tokenizer.json", "max_tokens": facts["tokens"]})
+        prompt = {"prompt": dict(checkpoint.prompt)} if checkpoint.prompt else {}
+        text = {"name": "task", "kind": "text", "tokenizer": "tokenizer.json", "max_tokens": facts["tokens"]}
+        inputs.append({**text, **prompt})
     action = {"name": "action", "shape": facts["action"], **_tensor(checkpoint.action)}
     keys = {key: feature.key for key, feature in checkpoint.inputs.items()}
     program = [

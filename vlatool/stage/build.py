@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from vlatool import registry
 from vlatool.errors import RecipeError, fix_for, suggest
+from vlatool.files.printable import reason_of
 from vlatool.stage.base import Stage
 
 AnyStage = TypeVar("AnyStage", bound=Stage)
@@ -50,7 +51,8 @@ def _problem(item: Mapping[str, Any], kind: type[Stage]) -> str:
     field_name = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
         return f"unknown option '{field_name}'; {suggest(field_name, list(kind.model_fields))}"
-    problem = f"{field_name} = {item['input']!r}: {str(item['msg'])[:1].lower()}{str(item['msg'])[1:]}"
+    reason = reason_of(str(item["msg"]))
+    problem = f"{field_name} = {item['input']!r}: {reason[:1].lower()}{reason[1:]}"
     ends = _ends(kind, field_name) if set(item.get("ctx", {})) & set(ENDS) else []
     return f"{problem}; allowed: {', '.join(ends)}" if len(ends) > 1 else problem
 

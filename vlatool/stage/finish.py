@@ -21,6 +21,7 @@ from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machin
 from vlatool.runtime.contract import OF_NOT_FINITE, OF_THE_GRAPHS, OF_THE_POLICY, off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, identities
 from vlatool.runtime.engines import reference
+from vlatool.runtime.golden import CHUNK, ROBOT_CHUNK
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.interface import Action
 from vlatool.runtime.observation import not_finite_text
@@ -310,7 +311,8 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
 
     Each has a sample axis. The outputs are what the graphs say: the engine that the bundle is made for may compute
     something else. The samples follow each other without a reset between, so that what a program keeps shows in the
-    second. The chunk is the action in physical units, before it is converted: it shows other statistics, too.
+    second. The chunk is the action in physical units, before it is converted: it shows other statistics, too. What the
+    conversion makes of it is ``robot_chunk.NAME``.
 
     Args:
         draft: the bundle as written so far; its graphs are what runs.
@@ -329,7 +331,8 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
             ("in", observation),
             ("noise", noise),
             ("out", action.outputs),
-            ("chunk", {name: policy.golden_chunk(action)}),
+            (CHUNK, {name: policy.golden_chunk(action)}),
+            (ROBOT_CHUNK, {name: action.chunk}),
         )
         for prefix, values in parts:
             for key, value in values.items():

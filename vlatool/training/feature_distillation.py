@@ -11,6 +11,7 @@ import numpy as np
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, SourceError, require
+from vlatool.files.printable import amount
 from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.module.feeds import recorded_inputs
 from vlatool.training.device import device_in_use
@@ -157,7 +158,7 @@ def _mismatch(ours: Form, theirs: Form, kind: Any) -> str:
     if not ours.calls or not theirs.calls:
         return "its blocks are not called as modules"
     if ours.calls != theirs.calls:
-        return f"the student runs its blocks {ours.calls} times in an inference, the teacher {theirs.calls} times"
+        return f"the student runs its blocks {amount(ours.calls, 'time')} in an inference, the teacher {theirs.calls}"
     if ours.shape is None or theirs.shape is None:
         return "its blocks do not give a tensor of floats, always of the same shape"
     if ours.features[:-1] != theirs.features[:-1]:

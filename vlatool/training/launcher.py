@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import RecipeError, SourceError, VlatoolError
+from vlatool.files.printable import amount
 from vlatool.training.group import LOST_PROCESS, RUN_AGAIN, Group, join_group
 from vlatool.training.torchrun import PRELOAD, RENDEZVOUS, Follower, Launch, current_launch, open_store, write_token
 from vlatool.user_code.children import Child
@@ -117,7 +118,7 @@ def check_launch(launch: Launch | None, size: int) -> None:
     """Refuse, with RecipeError, a number of processes that is not torchrun's, and other processes than the first."""
     if launch is not None and (launch.size != size or launch.rank):
         raise RecipeError(
-            f"torchrun started {launch.size} processes, of which this is number {launch.rank + 1}; the training was "
-            f"asked for {size}, by the first one.",
+            f"torchrun started {amount(launch.size, 'process')}, of which this is number {launch.rank + 1}; the "
+            f"training was asked for {size}, by the first one.",
             "leave --processes out: torchrun says how many there are",
         )

@@ -12,6 +12,7 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError, require
+from vlatool.files.printable import amount
 from vlatool.module.torch_policy import load_modules
 from vlatool.stage.build import build_stage
 from vlatool.training.batches import Batches, draw_of
@@ -95,8 +96,8 @@ def train(job: Mapping[str, Any], _tell: OnProgress) -> None:
     state.expert.read()
     if len(state.frames) != job["rows"]:
         raise DataError(
-            f"The first process trains on {job['rows']} rows, process {state.group.rank + 1} sees {len(state.frames)} "
-            f"of them in {state.folder}.",
+            f"The first process trains on {amount(job['rows'], 'row')}, process {state.group.rank + 1} sees "
+            f"{len(state.frames)} of them in {state.folder}.",
             "let all processes see the same folder (VLATOOL_CACHE)",
         )
     state.training.look(partial(state.objective.look, state.frames, state.expert.frames))

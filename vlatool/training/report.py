@@ -8,6 +8,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 from vlatool.bundle.bundle import REPORTS, Bundle
+from vlatool.files.printable import amount
 from vlatool.machine.host import fingerprint
 from vlatool.measures import series, tables
 from vlatool.measures.training import TRAINING_TIME
@@ -55,7 +56,7 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
 def course(training: Mapping[str, Any]) -> str:
     """Say how the loss fell."""
     first, last = _loss_ends(training["losses"])
-    return f"{training['loss']} {first:.4g} -> {last:.4g} in {len(training['losses'])} steps"
+    return f"{training['loss']} {first:.4g} -> {last:.4g} in {amount(len(training['losses']), 'step')}"
 
 
 def _loss_ends(losses: Sequence[float]) -> tuple[float, float]:
@@ -69,7 +70,7 @@ def along_lines(training: Mapping[str, Any]) -> tuple[str, ...]:
     about = training.get("along")
     if about is None:
         return ()
-    of = f"{about['observations']} observations of {about['episodes']} whole episodes"
+    of = f"{amount(about['observations'], 'observation')} of {about['episodes']} whole episodes"
     losses = f"{training['loss']} {about['before']:.4g} -> {about['after']:.4g}"
     return (f"{losses} over {of}, with what is kept carried along", *_warning(training))
 

@@ -13,6 +13,7 @@ from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.frames import file_of
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, require
+from vlatool.files.printable import amount
 from vlatool.module.batched_program import PATH, BatchedProgram, draw_noise
 from vlatool.module.origin import origin_of
 from vlatool.runtime.interface import Array
@@ -108,7 +109,7 @@ def write_labels(frames: Path, names: Sequence[str], outputs: Sequence[str], tea
                 if value.is_floating_point() and not bool(torch.isfinite(value).all()):
                     raise DataError("The teacher gives an action that is not finite.", "look at the recordings")
                 kept[name][rows[own]] = value.cpu().numpy()[own]
-            context.progress(f"the teacher labels {count} observations", (int(rows[0]) + 1) / count)
+            context.progress(f"the teacher labels {amount(count, 'observation')}", (int(rows[0]) + 1) / count)
     return [name.removeprefix(LABEL) for name in kept if name.startswith(LABEL)]
 
 

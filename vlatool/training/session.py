@@ -18,6 +18,7 @@ from vlatool.data import BEGINS, Recording, kept_rows, recorded_observations
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import jobs_for
 from vlatool.errors import require
+from vlatool.files.printable import amount
 from vlatool.files.user_files import atomic_file
 from vlatool.module.edits import read_edits
 from vlatool.module.stage import ModuleChanges, write_modules
@@ -301,7 +302,7 @@ class Session:
         who = "student" if number else "teacher"
         about: dict[str, Any] = {"step": self._trainer.step, "actor": who}
         if self._scene is not None and episodes:
-            self._context.progress(f"the {who} plays {episodes} episodes", None)
+            self._context.progress(f"the {who} plays {amount(episodes, 'episode')}", None)
             scene, tasks = self._scene
             jobs = [
                 replace(job, noise=self._plan.noise, record=str(folder / f"{index:05d}"))

@@ -14,7 +14,7 @@ from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.bundle.module_bundle import factory_of
 from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import OutputError, RecipeError, require
-from vlatool.files.printable import file_of
+from vlatool.files.printable import amount, file_of
 from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.module.edits import is_changed
 from vlatool.module.source import claimed_source
@@ -172,8 +172,8 @@ class TrainingStage(ModuleStage):
             )
         if kept and self.batch < self.window * self.accumulate:
             raise RecipeError(
-                f"A batch of {self.batch} observations holds {self.batch // self.window} windows of {self.window}; "
-                f"wanted {self.accumulate}, one for each part, at least.",
+                f"A batch of {self.batch} observations holds {amount(self.batch // self.window, 'window')} of "
+                f"{self.window}; wanted {self.accumulate}, one for each part, at least.",
                 f"take --batch {self.window * self.accumulate} or more, or a shorter --window",
             )
 
@@ -224,7 +224,7 @@ class TrainingStage(ModuleStage):
         )  # fmt: skip
         return (
             *along_lines(training),
-            f"{course(training)} on {seen} observations",
+            f"{course(training)} on {amount(seen, 'observation')}",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
             *gap_lines(training["rounds"]),
             *_hint_lines(training.get("hints", {})),

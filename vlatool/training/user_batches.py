@@ -14,7 +14,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError
-from vlatool.files.printable import message_of
+from vlatool.files.printable import amount, message_of
 from vlatool.module.factory import iterate_function
 from vlatool.module.origin import origin_of
 from vlatool.runtime.observation import ObservationEncoder
@@ -120,13 +120,15 @@ class _Rows:
                 self._row = f"Row {row} of batch {number} of '{self.function}'"
                 yield {name: column[row] for name, column in columns.items()}
                 done += 1
-            self.tell(f"{done} of {self.count} rows of {self.function}", done / self.count)
+            self.tell(f"{done} of {amount(self.count, 'row')} of {self.function}", done / self.count)
             if done == self.count:
                 return
         if not done:
-            raise DataError(f"'{self.function}' yields nothing; wanted {self.count} rows.", f"let it yield; {GUIDE}")
+            raise DataError(
+                f"'{self.function}' yields nothing; wanted {amount(self.count, 'row')}.", f"let it yield; {GUIDE}"
+            )
         raise DataError(
-            f"'{self.function}' ends after {done} rows; wanted {self.count}.",
+            f"'{self.function}' ends after {amount(done, 'row')}; wanted {self.count}.",
             f"let it go on, or take fewer: --from-batches {done}",
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import Recording
-from vlatool.files.rows import in_memory
+from vlatool.files.rows import Rows, in_memory
 from vlatool.verify._images import is_image
 from vlatool.verify._series import Array, Indices, Motion, Series, blocks
 from vlatool.verify._views import PLACES
@@ -92,8 +92,8 @@ class Reader:
         """Return the signals of a recording, with more noise, and of moved cameras; and a reader that knows images."""
         chosen, episodes, groups = rows_of(recording, self.spec)
         values = {name: _matrix(recording.inputs[name], chosen) for name in self.names.vectors}
-        if self.names.commands:
-            values[self.names.commands] = self._commands(recording, chosen)
+        if self.names.commands and recording.actions is not None:
+            values[self.names.commands] = self._commands(recording.actions, chosen)
         grey = {}
         for tensor in (each.observation for each in self.spec.inputs if each.name in self.names.images):
             source, change = (changes or {}).get(tensor.name, (tensor.name, None))
@@ -112,9 +112,8 @@ class Reader:
             values[name + PLACES] = self.motions[name].places(images)
         return replace(series, values=values)
 
-    def _commands(self, recording: Recording, chosen: Indices) -> Array:
-        assert recording.actions is not None
-        actions = in_memory(recording.actions)[chosen][:, 0]
+    def _commands(self, recorded: Array | Rows, chosen: Indices) -> Array:
+        actions = in_memory(recorded)[chosen][:, 0]
         if self.spec.action.kind == "discrete":
             return np.eye(len(self.spec.action.labels) or int(actions.max()) + 1)[actions]
         return actions.astype(np.float64).reshape(len(chosen), -1)

@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
+from vlatool.files.printable import amount
 from vlatool.verify._explanation import Explanation
 
 TEXT = "text"
@@ -18,7 +19,7 @@ def explain_empty(name: str, log: Sequence[str], reference: Sequence[str]) -> It
     """Yield whether texts are empty that never are in the reference."""
     empty = sum(not text.strip() for text in log)
     if empty and all(text.strip() for text in reference):
-        where = f"it is empty in {empty} of {len(log)} rows"
+        where = f"it is empty in {empty} of {amount(len(log), 'row')}"
         yield Explanation(name, TEXT, where, 1.0, 0.0, len(log), remedy=REMEDY)
 
 
@@ -41,7 +42,7 @@ def unknown_texts(
     for text, count in Counter(log).most_common():
         if text in counts or not text.strip():
             continue
-        sentence = f"'{name}' is {text!r} in {count} rows, which was never recorded"
+        sentence = f"'{name}' is {text!r} in {amount(count, 'row')}, which was never recorded"
         if same := plain.get(_plain(text)):
             yield f"{sentence}: it was written {same!r}"
         elif unknown := [word for word in _plain(text).split() if word not in words]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.files.printable import amount
 from vlatool.runtime.statistics import Normaliser
 from vlatool.verify._explanation import Explanation
 from vlatool.verify._pairing import Pairs
@@ -118,7 +119,7 @@ def explain_vector(
         return
     if match.delay:
         late = "late" if match.delay > 0 else "early"
-        steps = f"{abs(match.delay)} control step{'s' if abs(match.delay) > 1 else ''} {late}"
+        steps = f"{amount(abs(match.delay), 'control step')} {late}"
         yield Explanation(name, "delayed", steps, match.own, match.cost, len(pairs))
     moved = [index for index, other in enumerate(match.order) if index != other]
     if moved:

@@ -14,6 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import Recording, read_recording, recordings_of
 from vlatool.errors import DataError
+from vlatool.files.printable import amount
 from vlatool.machine.host import fingerprint
 from vlatool.measures.actions import RELATIVE_ERROR_MAX
 from vlatool.report import Report, Row
@@ -262,7 +263,7 @@ def _report(bundle: Bundle, options: LogOptions, log: Recording, outcome: Outcom
     if outcome.suspicious and not found:
         result = "nothing is proven wrong, but something differs"
     first = f"In {options.log.name}, {result}" if found or outcome.suspicious else f"{options.log.name} fits {name}"
-    sentences = (f"{first}: compared {how}, on {len(log)} rows.", *(each.sentence() for each in found),
+    sentences = (f"{first}: compared {how}, on {amount(len(log), 'row')}.", *(each.sentence() for each in found),
                  *(f"Suspicious: {each}." for each in outcome.suspicious))  # fmt: skip
     worst = max((min(each.before, 1e9) for each in found if each.evidence is None), default=0.0)
     measured = [RELATIVE_ERROR_MAX.measurement(worst, samples=len(log), note="of signals that are wrong")]

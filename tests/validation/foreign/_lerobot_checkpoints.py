@@ -1,6 +1,6 @@
 """Make a LeRobot checkpoint with random weights, and record what its policy does; run in the Python that has LeRobot.
 
-    python _lerobot_checkpoints.py act|diffusion-ddim|diffusion-ddpm|smolvla|pi0[-relative] FOLDER [--small] [--steps N]
+    python _lerobot_checkpoints.py KIND[-relative] FOLDER [--small] [--steps N]
 
 Writes ``FOLDER/checkpoint`` and ``FOLDER/episode.npz``: the observations of an episode (N, ...), the actions (N, A) of
 ``select_action`` with LeRobot's own processors around it, and the noise that each inference drew. The actions of a kind
@@ -19,7 +19,7 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 
-JOINTS, TEXT_KINDS = 14, ("smolvla", "pi0")
+JOINTS, TEXT_KINDS = 14, ("smolvla", "pi0", "pi05")
 TEXTS = ("red cup", "green bowl", "cup into the bowl\n")
 
 
@@ -67,26 +67,33 @@ def smolvla(folder):
     return SmolVLAPolicy(config())
 
 
-def pi0(folder, small):
-    """Return a pi0, with a tokenizer beside the checkpoint in the place of PaliGemma's."""
+def pi0(folder, kind, small):
+    """Return a pi0 or pi0.5, with a tokenizer beside the checkpoint in the place of PaliGemma's."""
     from lerobot.policies.pi0 import processor_pi0
     from lerobot.policies.pi0.configuration_pi0 import PI0Config
     from lerobot.policies.pi0.modeling_pi0 import PI0Policy
-    from tokenizers import Tokenizer, models, pre_tokenizers, processors
+    from lerobot.policies.pi05 import processor_pi05
+    from lerobot.policies.pi05.configuration_pi05 import PI05Config
+    from lerobot.policies.pi05.modeling_pi05 import PI05Policy
+    from tokenizers import Regex, Tokenizer, models, pre_tokenizers, processors
     from transformers import PreTrainedTokenizerFast
 
     os.chdir(folder)
     names = ["<pad>", "<bos>", "<unk>", "\n", *["pick", "up", "the", "red", "green", "cup", "bowl", "into"]]
+    names += ["Task", "State", "Action", *":,;-0123456789"]
     words = Tokenizer(models.WordLevel({word: index for index, word in enumerate(names)}, unk_token="<unk>"))
-    words.pre_tokenizer = pre_tokenizers.Split(" ", "removed")
+    pieces = pre_tokenizers.Split(Regex(r"[0-9]|[A-Za-z]+|[^0-9A-Za-z]"), "isolated")
+    words.pre_tokenizer = pre_tokenizers.Sequence([pre_tokenizers.Split(" ", "removed"), pieces])
     words.post_processor = processors.TemplateProcessing(single="<bos> $A", special_tokens=[("<bos>", 1)])
     tokenizer = PreTrainedTokenizerFast(tokenizer_object=words, pad_token="<pad>", unk_token="<unk>")
     tokenizer.save_pretrained("tokenizer")
     step = processor_pi0.TokenizerProcessorStep
-    processor_pi0.TokenizerProcessorStep = lambda **more: step(**{**more, "tokenizer_name": "tokenizer"})
+    for module in (processor_pi0, processor_pi05):
+        module.TokenizerProcessorStep = lambda **more: step(**{**more, "tokenizer_name": "tokenizer"})
     sizes = {"chunk_size": 10, "n_action_steps": 5, "num_inference_steps": 5, "image_resolution": (56, 56)}
-    config = PI0Config(**features(48, 64, ["front", "wrist"]), **(sizes if small else {"n_action_steps": 10}))
-    policy = PI0Policy(config)
+    policy_type, config_type = {"pi0": (PI0Policy, PI0Config), "pi05": (PI05Policy, PI05Config)}[kind]
+    config = config_type(**features(48, 64, ["front", "wrist"]), **(sizes if small else {"n_action_steps": 10}))
+    policy = policy_type(config)
     with torch.no_grad():
         for name, parameter in policy.named_parameters():
             if "norm" in name and parameter.ndim == 1:
@@ -106,12 +113,16 @@ def statistics(config):
         shape = {**config.input_features, **config.output_features}[key].shape
         mean, std = torch.randn(shape, generator=generator), torch.rand(shape, generator=generator) + 0.1
         std[3] = 0
-        found[key] = {"mean": mean, "std": std, "min": mean - 2 * std, "max": mean + 2 * std}
+        low, high = mean - 2 * std, mean + 2 * std
+        found[key] = {"mean": mean, "std": std, "min": low, "max": high, "q01": low, "q99": high}
     return found
 
 
-def observation(config, generator, still):
-    """Return one raw observation: pictures (H, W, 3) uint8 and joints in physical units, one of which never moves."""
+def observation(config, generator, low, high):
+    """Return one raw observation: pictures (H, W, 3) uint8 and joints in physical units.
+
+    One joint never moves, and three are at the lower end, the middle and the upper end of what training had.
+    """
     raw = {}
     for key, feature in config.input_features.items():
         if key in config.image_features:
@@ -119,7 +130,7 @@ def observation(config, generator, still):
             raw[key] = torch.randint(0, 256, (height, width, 3), generator=generator, dtype=torch.uint8)
         else:
             raw[key] = torch.randn(feature.shape, generator=generator)
-            raw[key][3] = still
+            raw[key][[3, 6]], raw[key][8], raw[key][13] = low[[3, 6]], (low[8] + high[8]) / 2, high[13]
     return raw
 
 
@@ -142,7 +153,8 @@ def main(kind, folder, small, steps):
     relative, kind = kind.endswith("-relative"), kind.removesuffix("-relative")
     torch.manual_seed(0)
     folder.mkdir(parents=True, exist_ok=True)
-    make = {"act": lambda: act(small), "smolvla": lambda: smolvla(folder), "pi0": lambda: pi0(folder, small)}
+    make = {"act": lambda: act(small), "smolvla": lambda: smolvla(folder)}
+    make |= {pi: lambda: pi0(folder, kind, small) for pi in ("pi0", "pi05")}
     policy = make.get(kind, lambda: diffusion(kind.rpartition("-")[2].upper(), small))().eval()
     config, stats = policy.config, statistics(policy.config)
     before, after = processors(config, stats, relative)
@@ -167,7 +179,7 @@ def main(kind, folder, small, steps):
     policy.reset()
     with torch.no_grad():
         for _ in range(steps):
-            raw = observation(config, generator, stats["observation.state"]["mean"][3])
+            raw = observation(config, generator, *(stats["observation.state"][side] for side in ("min", "max")))
             fed = {
                 key: value.permute(2, 0, 1).float() / 255 if key in config.image_features else value
                 for key, value in raw.items()

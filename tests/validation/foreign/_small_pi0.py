@@ -1,4 +1,4 @@
-"""Make pi0 of LeRobot small: its own configuration knows two sizes alone, of which the smaller has 1.3 billion weights.
+"""Make pi0 and pi0.5 of LeRobot small: they know two sizes alone, of which the smaller has 1.3 billion weights.
 
     python _small_pi0.py SCRIPT ARGUMENTS...
 
@@ -14,10 +14,8 @@ import sys
 VOCABULARY = 64
 
 
-def make_small():
-    """Replace the sizes in the module of pi0."""
-    from lerobot.policies.pi0 import modeling_pi0 as pi0
-
+def make_small(pi0):
+    """Replace the sizes in the module of pi0 or pi0.5."""
     sizes = {"gemma_2b": (64, 3, 128), "gemma_300m": (32, 3, 64)}
     whole, expert = pi0.PaliGemmaForConditionalGenerationWithPiGemma, pi0.PiGemmaForCausalLM
 
@@ -41,6 +39,10 @@ def make_small():
 
 
 if __name__ == "__main__":
-    make_small()
+    from lerobot.policies.pi0 import modeling_pi0
+    from lerobot.policies.pi05 import modeling_pi05
+
+    for module in (modeling_pi0, modeling_pi05):
+        make_small(module)
     sys.argv = [word for word in sys.argv[1:] if word != "-I"]
     runpy.run_path(sys.argv[0], run_name="__main__")

@@ -21,7 +21,7 @@ import numpy as np
 
 import vlatool
 
-KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla", "pi0", "act-relative", "diffusion-ddim-relative")
+KINDS = ("act", "diffusion-ddim", "diffusion-ddpm", "smolvla", "pi0", "pi05", "act-relative", "diffusion-ddim-relative")
 LIMIT = 1e-4
 MAKE = Path(__file__).with_name("_lerobot_checkpoints.py")
 SMALL = Path(__file__).with_name("_small_pi0.py")
@@ -51,7 +51,7 @@ def errors(bundle: Path, recorded: Path) -> list[float]:
 
 
 def small_pi0(python: str, place: Path) -> str:
-    """Return a program that runs a script as a Python does, with pi0 in a small size."""
+    """Return a program that runs a script as a Python does, with pi0 and pi0.5 in a small size."""
     program = place / "small-pi0"
     program.write_text(f'#!/bin/sh\nexec "{python}" "{SMALL}" "$@"\n')
     program.chmod(0o755)
@@ -76,7 +76,7 @@ def main(arguments: list[str]) -> int:
         for kind in asked.kinds:
             folder = Path(place) / kind
             sizes = ["--steps", str(asked.steps), *(["--small"] if asked.small else [])]
-            python = small_pi0(asked.python, Path(place)) if (kind, asked.small) == ("pi0", True) else asked.python
+            python = small_pi0(asked.python, Path(place)) if asked.small and kind.startswith("pi0") else asked.python
             subprocess.run([python, MAKE, kind, folder, *sizes], check=True, capture_output=True)
             command = ["export", "onnx", folder / "checkpoint", "-o", folder / "bundle", "--python", python]
             subprocess.run([sys.executable, "-m", "vlatool", *command], check=True, capture_output=True)

@@ -14,7 +14,7 @@ from vlatool.accuracy.credibility import DECIDE, Credibility, credibility
 from vlatool.accuracy.losses import drop, losses
 from vlatool.accuracy.success_comparison import few_starts, repeated_starts
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import read_recording
+from vlatool.data import NamedRecording, read_recording
 from vlatool.errors import DataError
 from vlatool.evaluate.recorded import run_recorded, single_policy_measurements
 from vlatool.gate.claim import Claim
@@ -33,6 +33,7 @@ EXAMPLE = """
 accuracy:
   max_drop: 0.01       # one point, on the same samples (and episodes) as the baseline
   # data: data/evaluation.npz   # recorded observations and actions; the baseline's own when not given
+  # map: {state: observation.state}   # names in the spec -> names in that data, where they differ
   # episodes: 200               # also closed-loop episodes, on paired seeds
   # policy: policy              # directory of the policy.yaml that names environment and tasks
 """
@@ -48,16 +49,23 @@ class Accuracy(Claim):
 
     max_drop: float = Field(0.01, ge=0, le=1, description="largest drop, a share (0.01 = 1 point)")
     data: Path | None = Field(None, description="recorded observations and actions; the baseline's own when not given")
+    map: dict[str, str] = Field({}, description="name in the spec -> name in `data`, where they differ")
     episodes: int = Field(0, ge=0, description="closed-loop episodes over all tasks; 0 for recorded observations alone")
     policy: Path | None = Field(None, description="directory of the policy.yaml that names environment and tasks")
 
     def extend_plan(self, plan: Plan) -> Plan:
         """Name the recordings, and the episodes that other claims look at, too."""
-        plan = replace(super().extend_plan(plan), data=self.data, episodes=self.episodes, policy=self.policy)
+        plan = replace(super().extend_plan(plan), data=self.data, names=self.map)
+        plan = replace(plan, episodes=self.episodes, policy=self.policy)
         return replace(plan, needs=plan.needs | {Need.EPISODES}) if self.episodes else plan
 
     def check(self, baseline: Bundle, plan: Plan) -> None:
         """Refuse a claim that there is nothing to examine on."""
+        if self.map and self.data is None:
+            raise DataError(
+                "The gate maps names of recorded data, and names no data.",
+                "name it, too (accuracy: data), or leave the map out",
+            )
         if recorded_data(baseline, plan) is None and not plan.episodes:
             raise DataError(
                 f"Accuracy is claimed, but the baseline {baseline.path} carries no evaluation data (those of the "
@@ -71,8 +79,8 @@ class Accuracy(Claim):
         Each bundle is run with its own statistics and vocabulary, and judged by its physical actions.
         """
         parts: list[_Part] = []
-        if evidence.recording_path is not None:
-            parts.append(self._on_recordings(evidence, evidence.recording_path))
+        if evidence.recording_path is not None and evidence.recording is not None:
+            parts.append(self._on_recordings(evidence, evidence.recording))
         if self.episodes:
             parts.append(self._in_episodes(*evidence.episodes))
         baselines = tuple(number for part in parts for number in part.baseline if number.name in DECIDE)
@@ -98,7 +106,7 @@ class Accuracy(Claim):
         own = tuple(number for number in candidate.measurements if number.name == SUCCESS.name)
         return _Part(judged, baseline.measurements, own, repeated_starts(baseline))
 
-    def _on_recordings(self, evidence: Evidence, data: Path) -> _Part:
+    def _on_recordings(self, evidence: Evidence, data: NamedRecording) -> _Part:
         action = evidence.baseline.manifest.spec.action
         recording = read_recording(data, evidence.baseline.manifest.spec).with_whole_chunks()
         indices = recording.spread(MAX_SAMPLES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
+from vlatool.files.printable import amount
 from vlatool.gate.claim import Claim
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Need
@@ -71,7 +72,7 @@ class Deadline(Claim):
             words = (
                 f"{found.name} {_ms(found.value)}, at most {_ms(found.bound)} with {found.confidence:.0%} confidence"
             )
-            words += f", {calls} calls beside the baseline's"
+            words += f", {amount(calls, 'call')} beside the baseline's"
         return f"{words}; allowed: {_ms(self.ms)}"
 
 

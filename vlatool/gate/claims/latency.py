@@ -8,6 +8,7 @@ from typing import Annotated
 
 from pydantic import AliasChoices, Field, model_validator
 
+from vlatool.files.printable import amount
 from vlatool.gate.claim import Claim
 from vlatool.gate.evidence import Evidence
 from vlatool.gate.plan import Need, Plan
@@ -140,7 +141,7 @@ def decision_words(decision: Decision) -> str:
 def _advice(decision: Decision) -> str:
     """Return how many processes would decide; why none would where that is not a sensible number."""
     if decision.processes_needed <= MAX_PROCESSES:
-        return f"about {decision.processes_needed} processes would decide"
+        return f"about {amount(decision.processes_needed, 'process')} would decide"
     if (
         replace(decision, ratio=1.0).processes_needed > MAX_PROCESSES
     ):  # not even two equal bundles could be shown to be so

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from vlatool.files.printable import amount
 from vlatool.render._format import fixed_decimals, significant, tick
 from vlatool.render._view import Latency
 from vlatool.render.charts.samples import Sampled, ecdf, histogram
@@ -93,7 +94,9 @@ def _strip(canvas: Canvas, variant: Sampled, axis: Axis, top: float) -> None:
         for index, count in enumerate(counts)
         if count
     )
-    canvas.add("path", f"fill {variant.css}", f"{variant.name}: {len(variant.samples)} samples", d=bars or "M0 0")
+    canvas.add(
+        "path", f"fill {variant.css}", f"{variant.name}: {amount(len(variant.samples), 'sample')}", d=bars or "M0 0"
+    )
     canvas.line(axis.start, base, axis.end, base, "axis")
     for share in variant.marks.values():
         if axis.holds(variant.at(share)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from vlatool.files.printable import amount
 from vlatool.measures.series import READING, READING_TIMES, THROTTLE_TIMES
 from vlatool.measures.tables import TELEMETRY
 from vlatool.render._format import fixed_decimals, plain, significant, tick
@@ -68,7 +69,7 @@ def over_time(report: Report, variants: Sequence[Sampled], aim: Latency, width: 
     end = max([*(variant.times[-1] for variant in variants), *(gauge.times[-1] for gauge in readings), *moments])
     bottom = PANEL * len(variants) + GAUGE_PANEL * len(readings) + (20 if moments else 0)
     worst = ", ".join(f"{variant.name} {significant(variant.ordered[-1])} ms" for variant in variants)
-    throttling = f" Throttled at {len(moments)} moments." if moments else ""
+    throttling = f" Throttled at {amount(len(moments), 'moment')}." if moments else ""
     canvas = Canvas(f"time-{width}", width, bottom + 42, "Latency over time", f"Largest latency: {worst}.{throttling}")
     across = Axis(0.0, end, LEFT_MARGIN, width - RIGHT_MARGIN)
     for value in across.ticks(8 if width > 500 else 4):
@@ -77,7 +78,7 @@ def over_time(report: Report, variants: Sequence[Sampled], aim: Latency, width: 
     if moments:
         spots = sorted({round(across(moment) / 2) * 2 for moment in moments})
         canvas.add("path", "throttle", d="".join(f"M{spot} 22V{bottom}" for spot in spots))
-        words = f"throttled: {len(moments)} moment{'s' if len(moments) > 1 else ''}"
+        words = f"throttled: {amount(len(moments), 'moment')}"
         canvas.text(0, PANEL * len(variants) + 14, words, "limit-text halo")
     for index, variant in enumerate(variants):
         panel(canvas, variant, aim, PANEL * index, across, variant.times)

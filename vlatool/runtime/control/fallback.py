@@ -81,54 +81,54 @@ class FallbackLadder:
             Exception: what the policy raised, when no rung has an action: nothing is known yet that could be held.
         """
         self.error = None
-        for place, rung in enumerate(self.rungs):
-            if not self._asks(place):
+        for index, rung in enumerate(self.rungs):
+            if not self._asks(index):
                 rung.watch(observation)
                 continue
             try:
                 action = rung.act(observation, self._last)
             except Exception as error:  # the seam: a policy of another package raises anything, and the robot moves
                 self.error = self.error or error
-                self._note(place, answered=False)
+                self._note(index, answered=False)
                 continue
-            if self._note(place, answered=True):
-                return self._use(place, action, observation)
+            if self._note(index, answered=True):
+                return self._use(index, action, observation)
             rung.pause()
         self.rung, self.fresh, self.origin = len(self.rungs) - 1, False, Origin(STOP)
         raise self.error or DeadlineMissed("The ladder is stopped.", "reset it")
 
-    def _asks(self, place: int) -> bool:
+    def _asks(self, index: int) -> bool:
         """Return whether a rung is asked: those above to see whether they recover, a bridge where it has to."""
-        if place < self.level and self._latch and self.level == len(self.rungs) - 1:
+        if index < self.level and self._latch and self.level == len(self.rungs) - 1:
             return False
-        return not self.rungs[place].bridges or self.level == place - 1
+        return not self.rungs[index].bridges or self.level == index - 1
 
-    def _note(self, place: int, *, answered: bool) -> bool:
+    def _note(self, index: int, *, answered: bool) -> bool:
         """Count an answer, or that there was none, and step up or down; returns whether the answer is to be used."""
-        if place < self.level:
-            self._streaks[place] = self._streaks[place] + 1 if answered else 0
-            if self._streaks[place] < self._recover:
+        if index < self.level:
+            self._streaks[index] = self._streaks[index] + 1 if answered else 0
+            if self._streaks[index] < self._recover:
                 return False
-            self._stand_on(place)
-        elif place == self.level:
+            self._stand_on(index)
+        elif index == self.level:
             self._asked.append(not answered)
             if sum(self._asked) >= self._misses:
-                below = [index for index in range(place + 1, len(self.rungs)) if not self.rungs[index].bridges]
-                self._stand_on(below[0] if below else place)
+                below = [lower for lower in range(index + 1, len(self.rungs)) if not self.rungs[lower].bridges]
+                self._stand_on(below[0] if below else index)
         return answered
 
-    def _stand_on(self, place: int) -> None:
-        self.level = place
+    def _stand_on(self, index: int) -> None:
+        self.level = index
         self._asked.clear()
         self._streaks = [0] * len(self.rungs)
 
-    def _use(self, place: int, action: Array, observation: Mapping[str, Any]) -> Array:
-        rung, now = self.rungs[place], self._clock()
-        for other in self.rungs[place + 1 : self.rung + 1]:
+    def _use(self, index: int, action: Array, observation: Mapping[str, Any]) -> Array:
+        rung, now = self.rungs[index], self._clock()
+        for other in self.rungs[index + 1 : self.rung + 1]:
             other.pause()
-        for other in self.rungs[place + 1 :]:
+        for other in self.rungs[index + 1 :]:
             other.watch(observation)
-        self.rung, self._last, self.origin = place, action, rung.origin
+        self.rung, self._last, self.origin = index, action, rung.origin
         self.fresh = isinstance(rung, PolicyRung) and rung.controller.fresh
         if isinstance(rung, Hold):
             age = None if self._age is None else self._age[0] + (now - self._age[1]) * 1e3

@@ -10,7 +10,7 @@ from _numbered import MOVES, NumberedPolicy, spec_of
 
 from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import GraphError
-from vlatool.runtime.control.checked import CheckedPolicy
+from vlatool.runtime.control.action_check import CheckedPolicy
 
 GOOD = np.zeros((3, 2), np.float32)
 BUTTONS = TensorSpec("a", (1, 2, 3), kind="discrete", labels=("l", "r", "stop"))
