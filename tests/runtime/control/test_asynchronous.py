@@ -161,3 +161,26 @@ def test_moments_of_a_history_are_given_whole_with_the_first_before_them():
         moments.add({"x": np.zeros(3), "t": 6})
     moments.clear()
     np.testing.assert_array_equal(moments.add({"x": np.array([6.0, 7.0]), "t": 7})["x"], [[6, 7]] * 3)
+
+
+def test_each_action_says_where_it_came_from_and_how_old_its_observation_is():
+    ticks = iter(range(1000))
+    controller = AsynchronousController(NumberedPolicy(spec_of(4)), delay=5)
+    controller._clock = lambda: float(next(ticks))
+    sources, ages = [], []
+    for t in range(7):
+        controller.act({"t": t})
+        sources.append(controller.origin.source)
+        ages.append(controller.origin.age_ms)
+    assert sources == ["policy"] * 4 + ["hold"] * 2 + ["policy"]
+    assert all(age is not None and age > 0 for age in ages)
+
+
+def test_the_rest_of_a_chunk_answers_a_step_and_counts_as_executed():
+    controller = AsynchronousController(NumberedPolicy(spec_of(4)), delay=2)
+    controller.act({"t": 0})
+    controller.act({"t": 1})
+    action = controller.rest()
+    assert action is not None
+    assert (float(action[0]), controller.origin.source, controller.fresh) == (2, "chunk", False)
+    assert float(controller.act({"t": 3})[0]) == 102, "two were executed since the observation of step 1"
