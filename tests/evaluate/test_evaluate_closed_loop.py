@@ -261,6 +261,8 @@ def test_without_environment_or_tasks_the_remedy_is_named(int8_bundle):
         ({"controller": "lat"}, "Unknown controller 'lat'; did you mean 'late'"),
         ({"controller": "chunked, late"}, "Both chunked and late play the chunks"),
         ({"controller": "chunked", "latency_in_the_loop": True}, "The controller chunked waits for each inference"),
+        ({"controller": "rtc:delay=-1"}, "delay is -1; allowed: a whole number from 0"),
+        ({"controller": "start_pose"}, "0 inputs have the"),
         ({"controller": "late", "control": "random"}, "--controller is of inferences, and random actions need none"),
         ({"latency_in_the_loop": True, "control": "random"}, "--latency-in-the-loop is of inferences, and random"),
     ],

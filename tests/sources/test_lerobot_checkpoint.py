@@ -18,6 +18,8 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError
 from vlatool.machine.host import LEROBOT_PYTHON
 from vlatool.registry import Claim
+from vlatool.runtime.control import layers
+from vlatool.runtime.control.temporal_ensemble import TemporalEnsemble
 from vlatool.runtime.converter import action_converter
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
@@ -349,6 +351,31 @@ def test_relative_actions_are_a_step_of_the_spec(
     TensorSpec.from_dict({"name": "action", "shape": [1, 4, 2], **directory._tensor(action)})
 
 
+def ensembled(edit: Callable[[dict[str, Any]], None]) -> Callable[[dict[str, Any]], None]:
+    """Return an edit after which the policy averages its chunks, too."""
+
+    def both(files: dict[str, Any]) -> None:
+        edit(files)
+        files["config.json"] |= {"temporal_ensemble_coeff": 0.01, "n_action_steps": 1}
+
+    return both
+
+
+def test_a_policy_that_averages_its_chunks_says_which_controller_does(tmp_path: Path) -> None:
+    files = parts()
+    ensembled(lambda _: None)(files)
+    checkpoint = read_checkpoint(write(tmp_path / "c", files))
+    assert (checkpoint.ensemble, checkpoint.execute) == (0.01, 1)
+    facts = {"shapes": {key: [1, 3] for key in checkpoint.inputs}, "history": 1, "tokens": 0, "chunk": 4,
+             "action": [1, 4, 2], "program": [], "versions": {"lerobot": "0.6.1"}}  # fmt: skip
+    said = directory._description(checkpoint, facts)
+    assert said["description"].endswith("--controller temporal_ensemble:coefficient=0.01.")
+    assert said["spec"]["execute"] == 1
+    (wrapper,) = layers(["temporal_ensemble:coefficient=0.01"])
+    assert wrapper is TemporalEnsemble
+    assert read_checkpoint(write(tmp_path / "d", parts())).ensemble is None
+
+
 INPUTS = ("config.json", "input_features")
 STEPS = ("policy_preprocessor.json", "steps")
 STATES = "policy_preprocessor_step_3_normalizer_processor.safetensors"
@@ -368,7 +395,9 @@ def text_step(turned: bool = False, **config: Any) -> Callable[[dict[str, Any]],
 
 BROKEN = {
     "unknown family": (edited("config.json", "type", to="tdmpc"), "of the type 'tdmpc'"),
-    "ensembling": (edited("config.json", "temporal_ensemble_coeff", to=0.01), "averages overlapping chunks"),
+    "ensembling of text": (edited("config.json", "temporal_ensemble_coeff", to="0.01"), "coeff '0.01'; allowed: null"),
+    "ensembling of another": (instruct("smolvla", temporal_ensemble_coeff=0.01), "allowed: null, or a number for act"),
+    "ensembling of differences": (ensembled(relative()), "relative to the states of different inferences"),
     "no features": (edited("config.json", "input_features", to={}), "has no input_features"),
     "features of text": (edited("config.json", "input_features", to={"a": "b"}), "has no input_features"),
     "negative shape": (edited(*INPUTS, "observation.state", "shape", to=[-3]), r"the shape \[-3\]"),

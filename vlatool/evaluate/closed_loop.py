@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -17,6 +17,7 @@ from vlatool.accuracy.disturbance_drops import with_disturbed, without_effect
 from vlatool.accuracy.episode_choice import with_episode
 from vlatool.accuracy.success_comparison import Outcome, compare_success, repeated_starts, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.bundle.spec import PolicySpec
 from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
@@ -37,7 +38,8 @@ from vlatool.measures.success import SUCCESS
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.module.source import describe
 from vlatool.report import Report, Row
-from vlatool.runtime.control import layers
+from vlatool.runtime.control import build_controller, layers
+from vlatool.runtime.interface import Action
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.identity import with_identity
 from vlatool.stats.starts import distinct_starts
@@ -99,8 +101,9 @@ class ClosedLoop(Measure):
     )
     controller: tuple[str, ...] = Field(
         (),
-        description="controller that plays the chunks, and wrappers: chunked, late, or those of other packages, such "
-        "as smooth,late; when not given, late with --latency-in-the-loop, and chunked without",
+        description="controller that plays the chunks, and wrappers, with options: chunked, late, rtc:delay=8, "
+        "temporal-ensemble, or those of other packages, such as smooth,late; when not given, late with "
+        "--latency-in-the-loop, and chunked without",
     )
     board: str = Field(
         "", description="profile whose predicted latency that is; --profile sets it; measured here when empty"
@@ -160,6 +163,8 @@ class ClosedLoop(Measure):
             message = f"{option} is of inferences, and {self.control} actions need none."
             raise UsageError(message, f"leave {option} or --control out")
         layers(self.controller, delayed=self.latency_in_the_loop)
+        if source is not None and not self.control:
+            build_controller(_Unopened(source.manifest.spec), self.controller, int(self.latency_in_the_loop))
         if "strength" in self.options() and not self.disturb:
             raise UsageError("--strength is of disturbances, and none is named.", "add --disturb all")
         jobs = self._jobs(source)
@@ -369,3 +374,19 @@ class ClosedLoop(Measure):
         job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control,
                           controller=self.controller, timeout_s=timeout)  # fmt: skip
         return jobs_for(job, tasks, self.episodes, self.first_seed)
+
+
+class _Unopened:
+    """A policy of which the spec alone is known, with which controllers check their options."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self.spec = spec
+
+    def infer(self, observation: Mapping[str, Any], *, noise: Any = None) -> Action:
+        raise NotImplementedError
+
+    def observe(self, observation: Mapping[str, Any]) -> None:
+        pass
+
+    def reset(self, seed: int | None = None) -> None:
+        pass

@@ -65,6 +65,23 @@ def turn(vectors: Array, quaternions: Array) -> Array:
     return np.asarray(vectors + 2 * np.cross(xyz, np.cross(xyz, vectors) + w * vectors))
 
 
+def slerp(before: Array, after: Array, share: float | Array) -> Array:
+    """Return the rotation at a share of the shortest way between unit quaternions (Shoemake 1985).
+
+    Args:
+        before: (..., 4).
+        after: (..., 4); that of the two signs which is closer is used.
+        share: 0 is ``before``, 1 is ``after``; beyond them, the turn goes on.
+
+    Returns:
+        (..., 4), float64, of length 1.
+    """
+    difference = product(after, inverse(before))
+    difference = np.where(difference[..., 3:] < 0, -difference, difference)
+    turned: Array = product(_from_axis_angle(_to_axis_angle(difference) * share), before)
+    return turned
+
+
 def _reader(form: str) -> Callable[[Array], Array]:
     kind, _, rest = form.partition("_")
     if kind == "euler":

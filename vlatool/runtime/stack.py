@@ -19,7 +19,7 @@ import numpy as np
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError
 from vlatool.runtime.arguments import check_positive
-from vlatool.runtime.control import build_layer, check_order, layers, takes_delay
+from vlatool.runtime.control import build_layer, check_order, layers, options_of, takes_delay
 from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline
@@ -229,7 +229,7 @@ def build_stack(
         SpecError: when the rate of the spec is unknown, and something needs it.
     """
     options = fallback if isinstance(fallback, Fallback) else Fallback(fallback)
-    entries = layers(controllers)
+    entries, chosen = layers(controllers), options_of(controllers)
     check_deadline(policy.spec, deadline_ms, waits=not any(takes_delay(entry) for entry in entries))
     own_ms = policy_ms(deadline_ms, options) if options.policy is not None else 0.0
     falls_back = deadline_ms is not None or fallback is not None
@@ -238,12 +238,13 @@ def build_stack(
     check_order([*wrappers, *[Deadline] * (deadline_ms is not None), player, *[FallbackLadder] * falls_back, *outer])
     inner: Any = policy
     for entry in wrappers:
-        inner = build_layer(entry, inner)
-    inner = build_layer(player, _limited(inner, None if deadline_ms is None else deadline_ms - own_ms, clock))
+        inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry))
+    limited = _limited(inner, None if deadline_ms is None else deadline_ms - own_ms, clock)
+    inner = build_layer(player, limited, spec=policy.spec, options=chosen.get(player))
     ladder = _ladder(inner, policy.spec, options, deadline_ms, clock) if falls_back else None
     inner = ladder or inner
     for entry in outer:
-        inner = build_layer(entry, inner)
+        inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry))
     if envelope is not None:
         inner = (robot_envelope(policy.spec, envelope) if isinstance(envelope, str) else envelope)(inner)
         if ladder is not None and hasattr(inner, "stop"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -82,6 +83,7 @@ class Checkpoint:
         inputs: key in the policy -> the feature, in the order of config.json.
         execute: actions that are executed of a chunk.
         prompt: what is written around the instruction, as a spec says it; empty where nothing is.
+        ensemble: coefficient of ACT's temporal ensembling, with which it averages chunks; None without.
     """
 
     folder: Path
@@ -90,6 +92,7 @@ class Checkpoint:
     action: Feature
     execute: int
     prompt: Mapping[str, Any] = field(default_factory=dict)
+    ensemble: float | None = None
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
@@ -105,12 +108,6 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise SourceError(
             f"{folder} is a LeRobot policy of the type {truncate(repr(family), 60)}; {suggest(str(family), FAMILIES)}.",
             "write a policy.yaml and a few lines of Python: docs/guides/lerobot-policy.md",
-        )
-    if config.get("temporal_ensemble_coeff") is not None:
-        raise SourceError(
-            f"{folder} averages overlapping chunks (temporal_ensemble_coeff), which no controller of vlatool does yet.",
-            "set it to null and n_action_steps to the actions that are executed of each chunk, if the policy can do "
-            "without",
         )
     steps = _steps(
         folder,
@@ -147,8 +144,31 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     execute = config.get("n_action_steps", 1)
     if not isinstance(execute, int) or execute < 1:
         raise SourceError(f"config.json of {folder} has n_action_steps {truncate(repr(execute), 40)}.", COMPLETE)
+    ensemble = _ensemble(folder, config, action)
     prompt = state_prompt(folder, steps, inputs[STATE].key if STATE in inputs else "")
-    return Checkpoint(folder, str(family), inputs, action, execute, prompt)
+    executed = execute if ensemble is None else 1
+    return Checkpoint(folder, str(family), inputs, action, executed, prompt, ensemble)
+
+
+def _ensemble(folder: Path, config: Mapping[str, Any], action: Feature) -> float | None:
+    """Return the coefficient of ACT's temporal ensembling, None without; raises SourceError where ours differs."""
+    if (value := config.get("temporal_ensemble_coeff")) is None:
+        return None
+    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if config.get("type") != "act" or not number:
+        raise SourceError(
+            f"config.json of {folder} has temporal_ensemble_coeff {truncate(repr(value), 40)}; allowed: null, or a "
+            "number for act.",
+            COMPLETE,
+        )
+    if any(step["op"] == "relative" for step in action.convert):
+        raise SourceError(
+            f"{folder} averages actions that are relative to the states of different inferences "
+            "(temporal_ensemble_coeff); temporal_ensemble of vlatool averages what the robot gets.",
+            "set it to null and n_action_steps to the actions that are executed of each chunk, if the policy can do "
+            "without",
+        )
+    return float(value)
 
 
 def _check_order(folder: Path, steps: Steps, *names: str) -> None:

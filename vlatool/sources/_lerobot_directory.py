@@ -209,7 +209,7 @@ def _description(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> dict[str, 
         "schema": 1,
         "name": checkpoint.family if name in ("pretrained_model", "") else name,
         "description": f"LeRobot {checkpoint.family}, traced by LeRobot {facts['versions']['lerobot']}. The checkpoint "
-        "says neither units nor modes nor the control rate.",
+        f"says neither units nor modes nor the control rate.{_how_to_play(checkpoint)}",
         "source": "policy.py:make",
         "spec": {
             "inputs": inputs,
@@ -220,6 +220,13 @@ def _description(checkpoint: Checkpoint, facts: Mapping[str, Any]) -> dict[str, 
         },
         "program": program,
     }
+
+
+def _how_to_play(checkpoint: Checkpoint) -> str:
+    """Return which controller does what LeRobot does with the chunks, where that is not the usual one."""
+    if checkpoint.ensemble is None:
+        return ""
+    return f" It averages its chunks: --controller temporal_ensemble:coefficient={checkpoint.ensemble:g}."
 
 
 def _tensor(feature: Feature) -> dict[str, Any]:

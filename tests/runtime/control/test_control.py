@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import inspect
+import re
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from _numbered import NumberedPolicy, spec_of
+from _numbered import MOVES, NumberedPolicy, spec_of
 
 from vlatool import registry
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import PluginError, UsageError
 from vlatool.runtime.control import build_controller, layers
 from vlatool.runtime.control.chunked import ChunkQueue
@@ -64,6 +66,17 @@ class EveryStep(Negated):
         return self.policy.infer(observation).chunk[0]
 
 
+class Tuned(Doubled):
+    """A wrapper with options."""
+
+    def __init__(
+        self, policy: Policy, *, spec: PolicySpec, gain: float = 1.0, steps: int | None = None, on: bool = False,
+        word: str = "", table: dict[str, int] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(policy)
+        self.given = (spec, gain, steps, on, word, table)
+
+
 class Nothing:
     """Neither a policy nor a controller."""
 
@@ -71,7 +84,8 @@ class Nothing:
         self.policy = policy
 
 
-ADDED = {"doubled": Doubled, "shifted": Shifted, "negated": Negated, "every-step": EveryStep, "nothing": Nothing}
+ADDED = {"doubled": Doubled, "shifted": Shifted, "negated": Negated, "every-step": EveryStep, "nothing": Nothing,
+         "tuned": Tuned}  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -129,9 +143,42 @@ def test_an_entry_that_is_neither_is_said():
 
 
 def test_all_of_vlatools_controllers_are_made_of_a_policy_alone():
+    place = TensorSpec("place", (1, 2), labels=MOVES.labels)
+    spec = PolicySpec((*spec_of().inputs, place), (MOVES,), 20, 2)
     for name in {*registry.names("control")} - {"envelope"}:  # which needs the envelope of a robot
-        made = build_controller(NumberedPolicy(spec_of(2)), (name,))
+        made = build_controller(NumberedPolicy(spec), (name,))
         assert isinstance(made, Controller)
-        np.testing.assert_array_equal(made.act({"t": 0}), [0, 0.5])
+        np.testing.assert_array_equal(made.act({"t": 0, "place": np.zeros(2)}), [0, 0.5])
         assert isinstance(inspect.getmodule(type(made)), ModuleType)
         assert Path(inspect.getfile(type(made))).parent.name == "control"
+
+
+def given(name: str) -> tuple[Any, ...]:
+    controller: Any = build_controller(NumberedPolicy(spec_of(4, 2)), (name,))
+    tuned: Tuned = controller.policy
+    assert tuned.given[0] == spec_of(4, 2)
+    return tuned.given[1:]
+
+
+def test_options_follow_the_name():
+    assert given("tuned") == (1.0, None, False, "", None)
+    assert given("tuned:gain=2:steps=3:on=true:word=a=b") == (2.0, 3, True, "a=b", None)
+    assert given("tuned:gain=1e-3") == (1e-3, None, False, "", None)
+    assert first(("late:delay=1",)) == first(("late",), delay=1)
+    assert first(("doubled", "late:delay=1", "negated")) == first(("negated", "doubled"), delay=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "delayed", "message"),
+    [("tuned:gian=1", False, "has no option 'gian'; did you mean 'gain'"), ("tuned:gain", False, "gives gain no value"),
+     ("tuned:policy=1", False, "has no option 'policy'"), ("tuned:spec=1", False, "has no option 'spec'"),
+     ("tuned:table=1", False, "has no option 'table'"), ("tuned:", False, "has no option ''"),
+     ("tuned:gain=1:gain=2", False, "gives gain twice"), ("tuned:gain=nan", False, "gain is 'nan'; allowed: a number"),
+     ("tuned:gain=", False, "gain is ''; allowed"), ("tuned:steps=1.5", False, "steps is '1.5'; allowed: a whole"),
+     ("tuned:on=1", False, "on is '1'; allowed: true or false"), ("chunked:delay=1", False, "has no option 'delay'"),
+     ("late:delay=1", True, "The delay of late is given, and it is that of the latency"),
+     ("chunked:execute=2", True, "The controller chunked waits for each inference")],
+)  # fmt: skip
+def test_options_that_are_none_are_refused(name: str, delayed: bool, message: str):
+    with pytest.raises(UsageError, match=re.escape(message)):
+        layers((name,), delayed=delayed)

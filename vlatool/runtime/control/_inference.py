@@ -1,0 +1,176 @@
+"""Inferences that run while a controller acts: played, with a fixed delay, or in a thread of their own."""
+
+from __future__ import annotations
+
+import copy
+import queue
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from vlatool.bundle.spec import PolicySpec
+from vlatool.errors import DataError
+from vlatool.runtime.interface import Array, Policy, observer_of
+
+
+class Inference(Protocol):
+    """One inference at a time, beside the control steps."""
+
+    running: bool
+
+    def start(self, observation: Mapping[str, Any]) -> None:
+        """Start an inference with the observation of this control step."""
+
+    def observe(self, observation: Mapping[str, Any]) -> None:
+        """Keep the observation of a control step at which none starts."""
+
+    def poll(self, steps: int) -> Array | None:
+        """Return the chunk of an inference that has ended, once.
+
+        Args:
+            steps: Number of control steps since the one at which it started.
+
+        Raises:
+            VlatoolError: as the policy's ``infer`` does; the inference has then ended, too.
+        """
+
+    def wait(self) -> Array:
+        """Return the chunk of the inference that runs when it has ended."""
+
+    def cancel(self) -> None:
+        """Discard the inference that runs, and all observations; return when it has ended."""
+
+
+class PlayedInference:
+    """Infers at once and withholds the chunk for a number of control steps, so that it depends on nothing else."""
+
+    def __init__(self, policy: Policy, delay: int) -> None:
+        self.running = False
+        self._policy, self._delay, self._observer = policy, delay, observer_of(policy)
+
+    def start(self, observation: Mapping[str, Any]) -> None:
+        """Infer."""
+        self._chunk = self._policy.infer(observation).chunk
+        self.running = True
+
+    def observe(self, observation: Mapping[str, Any]) -> None:
+        """Give the policy the observation, if it has inputs of several moments."""
+        if self._observer is not None:
+            self._observer.observe(observation)
+
+    def poll(self, steps: int) -> Array | None:
+        """Return the chunk ``delay`` control steps after its start."""
+        return self.wait() if self.running and steps >= self._delay else None
+
+    def wait(self) -> Array:
+        """Return the chunk."""
+        self.running = False
+        return self._chunk
+
+    def cancel(self) -> None:
+        """Discard the chunk."""
+        self.running = False
+
+
+class BackgroundInference:
+    """Infers in a thread of its own, which ends when this object is collected.
+
+    An observation is copied before the thread gets it. Inputs that hold several moments are given whole, since the
+    policy itself might see the moments in another order than they came.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self.running = False
+        self._moments = Moments(policy.spec)
+        self._work: queue.SimpleQueue[Mapping[str, Any] | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Array | BaseException] = queue.SimpleQueue()
+        arguments = policy.infer, self._work, self._answers
+        threading.Thread(target=_infer_all, args=arguments, name="vlatool-inference", daemon=True).start()
+        weakref.finalize(self, self._work.put, None)
+
+    def start(self, observation: Mapping[str, Any]) -> None:
+        """Hand the observation to the thread."""
+        self._work.put(self._moments.add(observation))
+        self.running = True
+
+    def observe(self, observation: Mapping[str, Any]) -> None:
+        """Keep a moment of the inputs that hold several."""
+        if self._moments.lengths:
+            self._moments.add(observation)
+
+    def poll(self, steps: int) -> Array | None:
+        """Return the chunk if the thread has it."""
+        if not self.running or self._answers.empty():
+            return None
+        return self.wait()
+
+    def wait(self) -> Array:
+        """Return the chunk when the thread has it."""
+        answer = self._answers.get()
+        self.running = False
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    def cancel(self) -> None:
+        """Wait for the thread and discard what it answers."""
+        if self.running:
+            self._answers.get()
+            self.running = False
+        self._moments.clear()
+
+
+def _infer_all(
+    infer: Callable[..., Any],
+    work: queue.SimpleQueue[Mapping[str, Any] | None],
+    answers: queue.SimpleQueue[Array | BaseException],
+) -> None:
+    while (observation := work.get()) is not None:
+        try:
+            answers.put(infer(observation).chunk)
+        except BaseException as error:  # the control loop raises it
+            answers.put(error)
+
+
+class Moments:
+    """The last observations of an episode, for inputs that hold several moments.
+
+    Args:
+        spec: of the policy; ``lengths`` has its inputs with a ``history`` and how many moments they hold.
+    """
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self._names = [tensor.name for tensor in spec.inputs]
+        self.lengths = {tensor.name: tensor.history for tensor in spec.inputs if tensor.history}
+        self._axes = {tensor.name: len(tensor.observation.moment.shape) for tensor in spec.inputs if tensor.history}
+        self._before: deque[Mapping[str, Any]] = deque(maxlen=max(self.lengths.values(), default=1))
+
+    def add(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a copy of an observation in which such inputs hold all their moments, oldest first.
+
+        The first observation stands for those before it. Names that the policy does not take are left out.
+        """
+        moment = {name: _copied(observation[name]) for name in self._names if name in observation}
+        self._before.append({name: moment[name] for name in self.lengths if name in moment})
+        return {**moment, **{name: self._window(name) for name in self.lengths if name in moment}}
+
+    def _window(self, name: str) -> Array:
+        axes = self._axes[name]
+        moments = [np.asarray(each[name]) for each in self._before if name in each][-self.lengths[name] :]
+        moments = [each[0] if each.ndim == axes else each for each in moments]
+        if len(shapes := {each.shape for each in moments}) > 1:
+            raise DataError(f"The moments of '{name}' have different shapes: {sorted(map(list, shapes))}.",
+                            "give moments of one shape in an episode")  # fmt: skip
+        return np.stack([moments[0]] * (self.lengths[name] - len(moments)) + moments)
+
+    def clear(self) -> None:
+        """Start a new episode."""
+        self._before.clear()
+
+
+def _copied(value: Any) -> Any:
+    return value if isinstance(value, str) else copy.deepcopy(value)
