@@ -171,10 +171,10 @@ class Hold(Rung):
         return slower
 
     def _without_motion(self) -> Array:
-        """Return the zeros that mean no motion, where there was no action before."""
+        """Return the action that means no motion, where there was none before."""
         if self._action.mode not in ("delta", "velocity") or self._action.robot_width < 1:
             raise DeadlineMissed("There is no action yet that could be held.", "give the pose to hold: start=[...]")
-        return np.zeros(self._action.robot_width, np.float32)
+        return hold(self._action, np.zeros(self._action.robot_width, np.float32))
 
     def leave_to_envelope(self) -> None:
         """Have no action from now on: the envelope around the ladder stops the robot as it has proven that it can."""

@@ -9,7 +9,9 @@ import pytest
 
 from vlatool.bundle.spec import TensorSpec
 from vlatool.runtime.control._elements import ActionElements, rotations_of
+from vlatool.runtime.control.late import hold
 from vlatool.runtime.rotation import convert_rotation, product, slerp
+from vlatool.runtime.rungs import Hold
 
 LABELS = ["x", "y", "z", *"abcd", "gripper"]
 RANDOM = np.random.default_rng(3)
@@ -66,6 +68,14 @@ def test_no_motion_of_a_rotation_is_none_and_not_zeros():
     np.testing.assert_array_equal(still[:-1], [0, 0, 0, 0, 0, 0, 1])
     last = values()
     np.testing.assert_array_equal(ActionElements(action("absolute")).hold(last), last)
+
+
+def test_whoever_holds_a_delta_does_not_turn_it_into_no_rotation_at_all():
+    delta, last = action("delta"), values().astype(np.float32)
+    still = ActionElements(delta).hold(last)
+    np.testing.assert_array_equal(hold(delta, last), still)
+    np.testing.assert_array_equal(Hold(delta).act({}, last), still)
+    np.testing.assert_array_equal(Hold(delta).act({}, None), [0, 0, 0, 0, 0, 0, 1, 0])
 
 
 def test_rotations_are_those_of_the_robot_up_to_a_step_that_moves_the_places():

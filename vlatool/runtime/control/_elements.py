@@ -6,11 +6,12 @@ import numpy as np
 
 from vlatool.bundle.conversion import ROTATIONS, Span
 from vlatool.bundle.spec import TensorSpec
-from vlatool.runtime.control.late import STOPPABLE_MODES
 from vlatool.runtime.interface import Array
 from vlatool.runtime.rotation import convert_rotation, inverse, product, slerp, to_quaternions
 
 QUATERNION = "quaternion_xyzw"
+STOPPABLE_MODES = ("delta", "velocity")
+"""Action modes that can express no motion: zeros, and for a rotation the identity."""
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 

@@ -10,11 +10,9 @@ import numpy as np
 
 from vlatool.bundle.spec import TensorSpec
 from vlatool.runtime.arguments import check_whole
+from vlatool.runtime.control._elements import ActionElements
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import CHUNK, HOLD, Action, Array, Policy
-
-STOPPABLE_MODES = ("delta", "velocity")
-"""Action modes in which 0 means no motion."""
 
 
 class LateController(ChunkQueue):
@@ -77,14 +75,11 @@ class LateController(ChunkQueue):
 def hold(action: TensorSpec, last: Array | None) -> Array:
     """Return the action of a robot without a new one: no motion if the mode can express that, else the last action.
 
+    No motion is 0, of a rotation the identity; the gripper keeps its command.
+
     Raises:
         ValueError: when there is no last action.
     """
     if last is None:
         raise ValueError("there is no action to hold")
-    if action.kind == "discrete" or action.mode not in STOPPABLE_MODES:
-        return last.copy()
-    still = np.zeros_like(last)
-    if (gripper := action.gripper) is not None:
-        still[gripper] = last[gripper]
-    return still
+    return ActionElements(action).hold(last)

@@ -11,8 +11,8 @@ import numpy as np
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SpecError
 from vlatool.runtime.arguments import check_whole
+from vlatool.runtime.control._elements import STOPPABLE_MODES
 from vlatool.runtime.control.asynchronous import AsynchronousController
-from vlatool.runtime.control.late import STOPPABLE_MODES
 from vlatool.runtime.interface import Array, Policy
 
 LEFT_OVER, DELAY, HORIZON = "prev_chunk_left_over", "inference_delay", "execution_horizon"
