@@ -269,7 +269,7 @@ MAPS = (
 REFUSED: dict[str, tuple[Callable[[Path], Bundle], str, str]] = {
     "no blocks": (tiny, "features", "have no stack of blocks in common .* so --features would compare nothing"),
     "loops": (unlike, "features", "--features can compare no stack of blocks: acting: the student runs its blocks 1 "
-              "times in an inference, the teacher 4 times"),
+              "time in an inference, the teacher 4"),
     "blocks that are not called": (lambda at: deep(at, (LOOP, INSIDE)), "attention",
                                    "blocks: its blocks are not called as modules"),
     "a single token": (lambda at: deep(at, (LOOP, POOLED)), "attention", r"they give a single token, \[1, 1, 16\]"),

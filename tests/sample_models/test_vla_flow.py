@@ -51,7 +51,8 @@ def imported(monkeypatch: pytest.MonkeyPatch) -> Iterator[Imported]:
         for file in folder.glob("*.py"):  # another policy's, left behind by whatever ran before
             monkeypatch.delitem(sys.modules, file.stem, raising=False)
     before = set(sys.modules)
-    monkeypatch.setattr(sys, "path", [str(FLOW), *sys.path])
+    elsewhere = [entry for entry in sys.path if Path(entry).parent != FLOW.parent]
+    monkeypatch.setattr(sys, "path", [str(FLOW), *elsewhere])
     import flow_learning
     from batches import Batches, Budget
     from demonstrations import Frames

@@ -34,6 +34,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "sim": ("gymnasium", "minigrid"),
     "metaworld": ("metaworld", "mujoco"),
     "text": ("tokenizers",),
+    "sign": ("cryptography",),
     "search": ("optuna",),
     "tensorboard": ("tensorboard",),
     "video": ("pillow",),

@@ -57,7 +57,8 @@ class StartPose:
         if array.shape != (self._tensor.robot_width,) or not np.isfinite(array).all():
             raise UsageError(
                 f"The pose has the shape {list(array.shape)}; wanted: {self._tensor.robot_width} finite numbers, as "
-                f"'{self._tensor.name}' has."
+                f"'{self._tensor.name}' has.",
+                "give one position for each, in its units",
             )
         return array
 
@@ -145,7 +146,8 @@ def _state_of(spec: PolicySpec, name: str) -> TensorSpec:
     action = spec.action
     if action.kind == "discrete" or action.mode not in MODES:
         what = action.kind if action.kind == "discrete" else f"of the mode '{action.mode}'"
-        raise UsageError(f"'{action.name}' is {what}; wanted: one of the modes {', '.join(MODES)}.")
+        raise UsageError(f"'{action.name}' is {what}; wanted: one of the modes {', '.join(MODES)}.",
+                         "leave start_pose out")  # fmt: skip
     vectors = [
         tensor for tensor in spec.inputs
         if tensor.kind == "tensor" and tensor.robot_width == action.robot_width and len(tensor.moment.shape) == 2
