@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from _numbered import MOVES, NumberedPolicy, spec_of
 from _written import written
 
 from vlatool import registry
+from vlatool.bundle.conversion import Conversion
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DeadlineMissed, GraphError, ProfileError, UsageError
 from vlatool.runtime import Policy, load
@@ -382,3 +384,11 @@ def test_a_caller_or_a_sink_that_changes_an_action_changes_no_other(more: dict[s
         action *= 1000
     assert played[0] == [100, 100.5]
     assert {place for place, _ in played} <= {100, 101}, "the rest of the chunk, then a hold"
+
+
+def test_a_second_policy_with_another_form_of_rotations_is_refused():
+    first = spec_of(action=TensorSpec("a", (1, 1, 4), labels=("x", "y", "z", "w"), mode="absolute"))
+    turning = Conversion("rotation", parts=((0, 4),), robot="quaternion_xyzw", network="quaternion_wxyz")
+    other = spec_of(action=replace(first.action, convert=(turning,)))
+    with pytest.raises(UsageError, match="other rotations"):
+        build_stack(NumberedPolicy(first), fallback=NumberedPolicy(other))

@@ -21,6 +21,7 @@ from vlatool.errors import UsageError
 from vlatool.files.validate import short_repr
 from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.control import build_layer, check_order, layers, options_of, takes_delay
+from vlatool.runtime.control._elements import rotations_of
 from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline
@@ -364,6 +365,11 @@ def check_same_actions(first: PolicySpec, second: PolicySpec) -> None:
                 f"The second policy's action has the {what} {others!r}, that of the first {ours!r}.",
                 "fall back to a policy with the same action",
             )
+    if rotations_of(first.action) != rotations_of(second.action):
+        raise UsageError(
+            "The second policy's action has other rotations, or in other places or forms, than that of the first.",
+            "fall back to a policy with the same action",
+        )
     if first.action.units() != second.action.units() or first.control_hz != second.control_hz:
         raise UsageError(
             f"The second policy acts in {second.action.units()} at {second.control_hz} Hz, the first in "
