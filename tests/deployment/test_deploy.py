@@ -169,6 +169,15 @@ def test_a_trial_that_nobody_began_makes_way(store, tmp_path, key):
     }
 
 
+def test_a_trial_that_nobody_began_stays_where_the_bundle_before_it_is_damaged(store, tmp_path, key):
+    install(store, bundle_of(tmp_path / "other", 3, "1.2.1"), TRIAL)
+    shutil.rmtree(store.folder("a"))
+    with pytest.raises(DataError, match="no array 'x'"):
+        np.savez(tmp_path / "recording.npz", y=np.zeros(1))
+        deploy(store, candidate(tmp_path, key), Conditions(recording=str(tmp_path / "recording.npz")), tell)
+    assert (store.read().active, list(store.read().slots)) == ("b", ["b"])
+
+
 def test_a_bundle_in_the_slot_that_is_emptied_for_it_is_refused(store, tmp_path):
     install(store, bundle_of(tmp_path / "other", 3, "1.2.1"), None)
     with store.lock() as pointer:

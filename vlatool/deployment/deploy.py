@@ -178,13 +178,18 @@ def _problem(store: Store, name: str, slot: Slot) -> str:
 
 
 def _after_idle_trial(store: Store, pointer: Pointer) -> Pointer:
-    """Return the pointer, of a trial that no controller has begun the one before it; refuse where one has begun."""
+    """Return the pointer, of a trial that no controller has begun the one before it; refuse where one has begun.
+
+    Where the files of the one before are damaged, nothing could be gone back to: the one on trial stays active.
+    """
     if pointer.trial is None:
         return pointer
     if pointer.trial.starts:
         raise DeploymentError(
             f"The store {store.path} has a bundle on trial.", "wait until it is committed, or: vlatool rollback"
         )
+    if _problem(store, pointer.inactive, pointer.slots[pointer.inactive]):
+        return pointer.without_inactive()
     return pointer.exchange("another bundle was deployed before its trial began")
 
 

@@ -229,6 +229,6 @@ def _write_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         why = "its disk is full" if error.errno in NO_SPACE else str(error.strerror)
         raise OutputError(
-            f"The store {path} cannot be changed: {why}. The active bundle is what it was.",
-            "free some space, or name another directory with --store",
+            f"The store {path} cannot be changed: {why}.",
+            "free some space, or name another directory with --store; vlatool status shows what is active",
         ) from error
