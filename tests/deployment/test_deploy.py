@@ -172,9 +172,10 @@ def test_a_trial_that_nobody_began_makes_way(store, tmp_path, key):
 def test_a_trial_that_nobody_began_stays_where_the_bundle_before_it_is_damaged(store, tmp_path, key):
     install(store, bundle_of(tmp_path / "other", 3, "1.2.1"), TRIAL)
     shutil.rmtree(store.folder("a"))
+    np.savez(tmp_path / "recording.npz", y=np.zeros(1))
+    path, conditions = candidate(tmp_path, key), Conditions(recording=str(tmp_path / "recording.npz"))
     with pytest.raises(DataError, match="no array 'x'"):
-        np.savez(tmp_path / "recording.npz", y=np.zeros(1))
-        deploy(store, candidate(tmp_path, key), Conditions(recording=str(tmp_path / "recording.npz")), tell)
+        deploy(store, path, conditions, tell)
     assert (store.read().active, list(store.read().slots)) == ("b", ["b"])
 
 

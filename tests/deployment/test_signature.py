@@ -56,7 +56,7 @@ def test_a_private_key_is_for_its_owner_alone_and_never_replaced(keys, tmp_path)
 
 @pytest.mark.parametrize("name", ["", ".", "/"])
 def test_a_path_without_a_name_is_no_place_for_a_key(name):
-    with pytest.raises(OutputError, match="no name of a file"):
+    with pytest.raises(OutputError, match="not the name of a file"):
         new_key(Path(name))
 
 

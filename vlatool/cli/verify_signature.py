@@ -18,7 +18,7 @@ def verify_signature(
     key: Annotated[list[Path], typer.Option(help="public key (PEM) that is trusted; may be given several times")],
     as_json: AsJson = False,
 ) -> None:
-    """Verify every file in the manifest of a bundle, and that one of the keys signed it; reports are not part of that."""
+    """Verify every file in the manifest of a bundle, and that one of the keys signed it; reports are not part of it."""
     from vlatool.deployment.signature import SIGNATURE, public_key, verify
 
     found = verify(Bundle.open(bundle), [public_key(path) for path in key])

@@ -144,7 +144,7 @@ def roll_back(store: Store, reason: str = "an operator asked for it") -> dict[st
         DeploymentError: when there is no other bundle, or it is damaged.
     """
     with store.lock() as pointer:
-        changed = store.left(pointer, reason)
+        changed = store.pointer_after_rollback(pointer, reason)
         if problem := _problem(store, pointer.inactive, pointer.slots[pointer.inactive]):
             raise DeploymentError(
                 f"The bundle to go back to is damaged: {problem}", "deploy a whole one: vlatool deploy BUNDLE"

@@ -78,7 +78,7 @@ def new_key(path: Path) -> Path:
         MissingExtra: without ``cryptography``.
     """
     if not path.name:
-        raise OutputError(f"'{path}' is no name of a file.", "name the file of the key: vlatool sign --new-key KEY")
+        raise OutputError(f"'{path}' is not the name of a file.", "name one: vlatool sign --new-key KEY")
     private = _ed25519().Ed25519PrivateKey.generate()
     text = _serialization()
     public = path.with_name(path.name + PUBLIC_SUFFIX)

@@ -132,7 +132,7 @@ class Store:
         Raises:
             DeploymentError: when there is nothing to go back to, or as ``lock`` does.
         """
-        return self._change(lambda pointer: self.left(pointer, reason), bundle, wait_s)
+        return self._change(lambda pointer: self.pointer_after_rollback(pointer, reason), bundle, wait_s)
 
     def commit(self, bundle: str, wait_s: float = 0.0) -> Pointer:
         """End the trial of a bundle that has passed it, and return the pointer."""
@@ -149,7 +149,7 @@ class Store:
             changed = change(pointer)
             return pointer if changed == pointer else self.write(changed)
 
-    def left(self, pointer: Pointer, reason: str) -> Pointer:
+    def pointer_after_rollback(self, pointer: Pointer, reason: str) -> Pointer:
         """Return the pointer after a rollback; raises DeploymentError when there is nothing to go back to."""
         if pointer.inactive not in pointer.slots:
             raise DeploymentError(

@@ -45,7 +45,7 @@ class Deadline:
         self._observer = observer_of(policy)
         self.deadline_ms = 1000 / policy.spec.rate if deadline_ms is None else float(deadline_ms)
         self.started: float | None = None
-        """Time of the clock at which the control step was to begin; the call of ``infer`` when None or still to come."""
+        """Time of the clock at which the control step was to begin; the call of ``infer`` when None or after it."""
         self._clock = clock
         self._worker = Worker("vlatool-inference", clock) if worker is None else worker
         self._engine = next((layer for layer in layers_of(policy) if _stops(layer)), None)

@@ -126,7 +126,7 @@ class EnvelopeController:
         return self._newest(observation[self._position])
 
     def _newest(self, measured: Any) -> Any:
-        """Return the position (A,) float64, the newest where there are several; what is no position as it is."""
+        """Return the position (A,) float64, the newest where there are several; anything else as it is."""
         width = len(self.envelope.limits.joints)
         try:
             values = np.asarray(measured, np.float64)
