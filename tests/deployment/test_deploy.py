@@ -15,7 +15,16 @@ from vlatool.deployment.judge import check_contract, inference_period_ms
 from vlatool.deployment.shadow import MIN_RUNS, ShadowJob
 from vlatool.deployment.signature import SIGNATURE, new_key, public_key, sign
 from vlatool.deployment.store import Store
-from vlatool.errors import BundleError, DataError, DeploymentError, GraphError, OutputError, SignatureError, SpecError
+from vlatool.errors import (
+    BundleError,
+    DataError,
+    DeploymentError,
+    GraphError,
+    OutputError,
+    SignatureError,
+    SpecError,
+    UsageError,
+)
 
 
 def tell(_what, _share):
@@ -149,10 +158,45 @@ def test_a_full_disk_is_found_out_before_the_other_slot_is_emptied(store, tmp_pa
 def test_a_trial_that_nobody_began_makes_way(store, tmp_path, key):
     install(store, bundle_of(tmp_path / "other", 3, "1.2.1"), TRIAL)
     path = candidate(tmp_path, key, control_hz=20.0)
-    with pytest.raises(SpecError):
-        deploy(store, path, Conditions(), tell)
-    assert store.read().active == "a"
-    assert store.read().rollback.startswith("another bundle was deployed")
+    refused(store, path, SpecError, "another contract")
+    assert store.read().active == "b", "a bundle that is refused moves nothing"
+    path = candidate(tmp_path / "next", key)
+    before = bundle_of(tmp_path / "whole", 1, "1.2.0").hash
+    deploy(store, path, Conditions(runs=32), tell)
+    assert {name: slot.bundle for name, slot in store.read().slots.items()} == {
+        "a": before,
+        "b": Bundle.open(path).hash,
+    }
+
+
+def test_a_trial_that_nobody_began_stays_where_the_bundle_before_it_is_damaged(store, tmp_path, key):
+    install(store, bundle_of(tmp_path / "other", 3, "1.2.1"), TRIAL)
+    shutil.rmtree(store.folder("a"))
+    np.savez(tmp_path / "recording.npz", y=np.zeros(1))
+    path, conditions = candidate(tmp_path, key), Conditions(recording=str(tmp_path / "recording.npz"))
+    with pytest.raises(DataError, match="no array 'x'"):
+        deploy(store, path, conditions, tell)
+    assert (store.read().active, list(store.read().slots)) == ("b", ["b"])
+
+
+def test_a_bundle_in_the_slot_that_is_emptied_for_it_is_refused(store, tmp_path):
+    install(store, bundle_of(tmp_path / "other", 3, "1.2.1"), None)
+    with store.lock() as pointer:
+        store.write(replace(pointer, keys=()))
+    (tmp_path / "link").symlink_to(store.folder("a"))
+    for path in (store.folder("a"), tmp_path / "link"):
+        refused(store, path, DeploymentError, "slot that it would be copied into", downgrade_to=Bundle.open(path).hash)
+        assert Bundle.open(path)
+
+
+@pytest.mark.parametrize("wrong", [
+    {"latency_ms": float("inf")}, {"latency_ms": float("nan")}, {"latency_ms": -1.0}, {"seconds": float("inf")},
+    {"seconds": 1e300}, {"memory_mb": float("inf")}, {"first_run_s": float("inf")}, {"first_run_s": 0.0},
+    {"ticks": 10**20}, {"ticks": -1}, {"runs": 0}, {"threads": 0},
+], ids=str)  # fmt: skip
+def test_a_condition_that_cannot_be_kept_is_refused_before_anything_is_done(wrong):
+    with pytest.raises(UsageError, match="allowed"):
+        Conditions(**wrong)
 
 
 @pytest.mark.parametrize(("new", "old", "older"), [

@@ -54,6 +54,12 @@ def test_a_private_key_is_for_its_owner_alone_and_never_replaced(keys, tmp_path)
     assert not (tmp_path / "k").exists()
 
 
+@pytest.mark.parametrize("name", ["", ".", "/"])
+def test_a_path_without_a_name_is_no_place_for_a_key(name):
+    with pytest.raises(OutputError, match="not the name of a file"):
+        new_key(Path(name))
+
+
 def test_a_key_that_others_can_read_is_refused(bundle, keys, tmp_path):
     loose = Path(shutil.copy(keys[0], tmp_path / "loose"))
     loose.chmod(0o640)

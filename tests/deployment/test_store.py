@@ -13,6 +13,7 @@ import pytest
 from _slots import TRIAL, bundle_of, install
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.deployment import pointer as pointer_module
 from vlatool.deployment import store as store_module
 from vlatool.deployment.deploy import roll_back, status
 from vlatool.deployment.pointer import FILES, Pointer, decode, encode, read_pointer
@@ -79,6 +80,36 @@ def test_a_rollback_of_another_bundle_than_the_active_one_does_nothing(store, bu
     install(store, bundles[0])
     install(store, bundles[1])
     assert store.roll_back("late news", bundles[0].hash).current.bundle == bundles[1].hash
+
+
+@pytest.mark.parametrize("name", ["pointer.json", "pointer.copy.json"])
+@pytest.mark.parametrize("earlier", [0, 1])
+def test_a_pointer_of_which_one_file_cannot_be_written_is_the_old_one(store, bundles, monkeypatch, name, earlier):
+    for bundle in bundles[:earlier]:
+        install(store, bundle)
+    store.make()
+    before = store.read()
+    replace_file = pointer_module.replace_file
+
+    def full(path, content):
+        if path.name == name and b'"active"' in content and bundles[1].hash.encode() in content:
+            raise OSError(28, "No space left on device", str(path))
+        replace_file(path, content)
+
+    monkeypatch.setattr(pointer_module, "replace_file", full)
+    with pytest.raises(OutputError, match="its disk is full"):
+        install(store, bundles[1])
+    assert store.read() == before
+    (store.path / "pointer.json").unlink(missing_ok=True)
+    assert store.read() in (before, Pointer()), "the copy does not say what has not happened"
+
+
+def test_a_rollback_beside_another_change_is_refused_and_never_does_nothing(store, bundles):
+    install(store, bundles[0])
+    install(store, bundles[1], trial=None)
+    with store.lock(), pytest.raises(DeploymentError, match="Another process"):
+        roll_back(store)
+    assert roll_back(store)["active"] == "a"
 
 
 def test_a_copy_that_fails_leaves_the_active_slot(store, bundles, monkeypatch):

@@ -147,6 +147,19 @@ def test_all_values_are_of_the_newest_time_that_all_have():
     assert reading.ages_s == pytest.approx({"fast": 0.35, "slow": 0.3})
 
 
+@pytest.mark.parametrize("method", ["linear", "nearest"])
+def test_a_sample_that_is_still_to_come_changes_no_reading(method: str):
+    clock = Clock()
+    sensors = Sensors({"a": SensorLimits(0.1, method=method)}, clock=clock)
+    clock.now = 1.0
+    sensors.add("a", 1.0, arrival=0.98)
+    sensors.add("a", 1000.0, arrival=1.01)
+    reading = sensors.read()
+    assert (reading.observation["a"], reading.problems) == (1.0, ())
+    clock.now = 0.9
+    assert sensors.read().problems, "nothing has come yet"
+
+
 def test_what_is_missing_or_too_far_apart_is_said():
     clock = Clock()
     sensors = Sensors({"a": SensorLimits(5.0), "b": SensorLimits(5.0), "c": SensorLimits(5.0)}, 0.1, clock)

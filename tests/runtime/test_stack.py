@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from _numbered import MOVES, NumberedPolicy, spec_of
 from _written import written
 
 from vlatool import registry
+from vlatool.bundle.conversion import Conversion
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DeadlineMissed, GraphError, ProfileError, UsageError
 from vlatool.runtime import Policy, load
@@ -99,7 +101,7 @@ def test_an_action_goes_through_all_layers_and_says_so():
         clock.now = step * 0.05 + 0.001
         action = stack.act({"t": step}, scheduled=step * 0.05)
         assert action[0] == [0, 100, 101, 101][step]
-        assert records[-1].action is action
+        np.testing.assert_array_equal(records[-1].action, action)
     assert [record.origin.source for record in records] == [POLICY, POLICY, CHUNK, HOLD]
     assert [record.missed for record in records] == [False, False, True, True]
     assert [record.answer_ms for record in records] == pytest.approx([5, 3, 10, 10]), "from when it was to begin"
@@ -332,3 +334,61 @@ def test_moves_are_zero_without_an_action():
     policy = SlowPolicy(spec_of(1, action=MOVES), clock, [99.0])
     stack = fake(build_stack(policy, deadline_ms=10, clock=clock), clock)
     assert stack.act({"t": 0}).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"max_age_ms": float("nan")}, {"max_age_ms": -1}, {"hold_s": float("nan")}, {"hold_s": float("inf")},
+     {"ramp_s": -1.0}, {"ramp_s": "1"}, {"policy_ms": 5.0}, {"latch": "no"}, {"policy": "hold"}, {"neutral": "gripper"},
+     {"start": [1.0]}, {"start": [float("nan"), 1.0]}, {"start": "abc"}, {"policy": 5}],
+    ids=str,
+)  # fmt: skip
+def test_an_option_of_a_fallback_that_cannot_be_kept_is_refused(wrong: dict[str, Any]):
+    with pytest.raises(UsageError) as caught:
+        built(fallback=Fallback(**wrong))
+    assert caught.value.fix
+
+
+def test_a_part_of_no_deadline_is_refused():
+    second = NumberedPolicy(spec_of(2, 1, POSITIONS))
+    with pytest.raises(UsageError, match="part of the deadline, and there is none"):
+        built(fallback=Fallback(second, policy_ms=5.0))
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [({"deadline_ms": float("inf"), "controllers": ["asynchronous"]}, "deadline_ms is inf"),
+     ({"envelope": 5}, "The envelope is 5"), ({"envelope": lambda _: None}, "returns a controller"),
+     ({"envelope": lambda _: ChunkQueue(NumberedPolicy(spec_of()))}, "around the one that it is given"),
+     ({"telemetry": []}, "telemetry is a list"), ({"fallback": True}, "The fallback is True"),
+     ({"controllers": ["rtc:blend=2", "rtc:blend=4"]}, "named twice"), ({"controllers": "rtc"}, "the text 'rtc'"),
+     ({"controllers": [5]}, "A controller is 5")],
+)  # fmt: skip
+def test_an_argument_that_would_have_no_effect_is_refused(asked: dict[str, Any], message: str):
+    with pytest.raises(UsageError, match=message):
+        built(**asked)
+
+
+@pytest.mark.parametrize("more", [{}, {"controllers": ["asynchronous"]}, {"controllers": ["late:delay=1"]}], ids=str)
+def test_a_caller_or_a_sink_that_changes_an_action_changes_no_other(more: dict[str, Any]):
+    def convert(record: TickRecord) -> None:
+        if record.action is not None:
+            record.action *= 57
+
+    _, stack, clock = built([0.0, *[99.0] * 9], deadline_ms=10, telemetry=convert, **more)
+    played = []
+    for step in range(6):
+        clock.now = step * 0.05
+        action = stack.act({"t": 1})
+        played.append(action.tolist())
+        action *= 1000
+    assert played[0] == [100, 100.5]
+    assert {place for place, _ in played} <= {100, 101}, "the rest of the chunk, then a hold"
+
+
+def test_a_second_policy_with_another_form_of_rotations_is_refused():
+    first = spec_of(action=TensorSpec("a", (1, 1, 4), labels=("x", "y", "z", "w"), mode="absolute"))
+    turning = Conversion("rotation", parts=((0, 4),), robot="quaternion_xyzw", network="quaternion_wxyz")
+    other = spec_of(action=replace(first.action, convert=(turning,)))
+    with pytest.raises(UsageError, match="other rotations"):
+        build_stack(NumberedPolicy(first), fallback=NumberedPolicy(other))

@@ -11,11 +11,12 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.deployment.judge import check_contract, inference_period_ms
-from vlatool.deployment.pointer import Pointer, Slot, Trial
-from vlatool.deployment.shadow import shadow_run
+from vlatool.deployment.pointer import MAX_COUNT, Pointer, Slot, Trial
+from vlatool.deployment.shadow import MAX_RUNS, shadow_run
 from vlatool.deployment.signature import verify
 from vlatool.deployment.store import Store
-from vlatool.errors import DeploymentError, GraphError, OutputError, SignatureError, VlatoolError
+from vlatool.errors import DeploymentError, GraphError, OutputError, SignatureError, UsageError, VlatoolError
+from vlatool.runtime.arguments import MOST_THREADS, check_positive, check_whole
 from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.policy import FIRST_RUN_S, refuse_findings
 from vlatool.runtime.probe import probe
@@ -25,6 +26,8 @@ DOTTED_NUMBERS = re.compile(r"v?(\d{1,9}(?:\.\d{1,9}){0,5})(?![\d.])")
 HASH_CHARACTERS = 19
 """Characters of a hash by which a downgrade is asked for: ``sha256:`` and twelve digits."""
 SLACK_BYTES = 8 << 20
+MAX_SECONDS, MAX_MS, MAX_MB = 1e6, 1e7, 1e6
+"""Largest limits: 11 days, three hours for one inference, and 1 TB. More is a typing error."""
 MAX_NAME = 200
 """Characters of a name or version that the pointer holds."""
 
@@ -47,6 +50,9 @@ class Conditions:
         seconds: seconds of the trial.
         engine: engine that the robot uses; the one of the bundle when empty.
         threads: threads of the engine; the cores that this process may use when None.
+
+    Raises:
+        UsageError: when a number is out of its range.
     """
 
     key: str = ""
@@ -62,12 +68,27 @@ class Conditions:
     engine: str = ""
     threads: int | None = None
 
+    def __post_init__(self) -> None:
+        check_whole("runs", self.runs, 1, MAX_RUNS)
+        check_whole("ticks", self.ticks, 0, MAX_COUNT - 1)
+        check_whole("threads", self.threads, 1, MOST_THREADS, optional=True)
+        for name, most, unit in (
+            ("latency_ms", MAX_MS, "milliseconds"), ("first_run_s", MAX_SECONDS, "seconds"),
+            ("seconds", MAX_SECONDS, "seconds"), ("memory_mb", MAX_MB, "10^6 bytes"),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            words = f"a number of {unit} up to {most:g},"
+            check_positive(name, value, words, optional=name == "latency_ms", zero=name != "first_run_s")
+            if value is not None and value > most:
+                raise UsageError(f"{name} is {value!r}; allowed: {words[:-1]}.", "pass a smaller one")
+
 
 def deploy(store: Store, path: Path, conditions: Conditions, tell: OnProgress) -> dict[str, Any]:
     """Deploy a bundle, and return the status of the store with what the shadow run measured.
 
     Whatever fails, and at whatever instant this process ends, the active slot stays as it was. From the moment that the
-    copy begins, the bundle before the active one is gone.
+    copy begins, the bundle before the active one is gone; or one on trial that no controller has opened, and the one
+    before it is active.
 
     Raises:
         BundleError, SpecError, DataError: when the bundle is damaged, has another contract, or nothing to run on.
@@ -82,16 +103,19 @@ def deploy(store: Store, path: Path, conditions: Conditions, tell: OnProgress) -
     refuse_findings(bundle)
     store.make()
     with store.lock() as pointer:
-        pointer = _after_idle_trial(store, pointer)
+        on_disk, pointer = pointer, _after_idle_trial(store, pointer)
         if pointer.current is not None and pointer.current.bundle == bundle.hash:
-            raise DeploymentError(f"{path} is the active bundle already.", "vlatool status shows what is deployed")
+            which = "the active bundle already" if pointer == on_disk else "the bundle before the one on trial"
+            raise DeploymentError(f"{path} is {which}.", "vlatool status shows what is deployed; or: vlatool rollback")
         keys = _required_keys(pointer, conditions.key)
         signature = verify(bundle, keys) if keys else None
         release = signature.release if signature else 0
         _refuse_older(pointer, bundle, release, conditions.downgrade_to)
         _check_against_active(store, pointer, bundle, conditions)
+        _refuse_own_slot(store, pointer, path)
         _check_room(store, pointer, bundle)
         tell(f"copying it into slot {pointer.inactive}", None)
+        pointer = pointer if pointer == on_disk else store.write(pointer)
         pointer, copy = store.fill(pointer, bundle)
         measured = _try_out(copy, conditions, tell)
         names = (bundle.manifest.name[:MAX_NAME], bundle.manifest.version[:MAX_NAME])
@@ -120,13 +144,13 @@ def roll_back(store: Store, reason: str = "an operator asked for it") -> dict[st
         DeploymentError: when there is no other bundle, or it is damaged.
     """
     with store.lock() as pointer:
-        slot = pointer.slots.get(pointer.inactive)
-        if slot is not None and (problem := _problem(store, pointer.inactive, slot)):
+        changed = store.pointer_after_rollback(pointer, reason)
+        if problem := _problem(store, pointer.inactive, pointer.slots[pointer.inactive]):
             raise DeploymentError(
                 f"The bundle to go back to is damaged: {problem}", "deploy a whole one: vlatool deploy BUNDLE"
             )
-    leave = "" if pointer.current is None else pointer.current.bundle
-    return status(store, store.roll_back(reason, leave))
+        changed = store.write(changed)
+    return status(store, changed)
 
 
 def open_slot(store: Store, name: str, slot: Slot) -> Bundle:
@@ -154,14 +178,19 @@ def _problem(store: Store, name: str, slot: Slot) -> str:
 
 
 def _after_idle_trial(store: Store, pointer: Pointer) -> Pointer:
-    """Return the pointer, of a trial that no controller has begun the one before it; refuse where one has begun."""
+    """Return the pointer, of a trial that no controller has begun the one before it; refuse where one has begun.
+
+    Where the files of the one before are damaged, nothing could be gone back to: the one on trial stays active.
+    """
     if pointer.trial is None:
         return pointer
     if pointer.trial.starts:
         raise DeploymentError(
             f"The store {store.path} has a bundle on trial.", "wait until it is committed, or: vlatool rollback"
         )
-    return store.write(pointer.exchange("another bundle was deployed before its trial began"))
+    if _problem(store, pointer.inactive, pointer.slots[pointer.inactive]):
+        return pointer.without_inactive()
+    return pointer.exchange("another bundle was deployed before its trial began")
 
 
 def _required_keys(pointer: Pointer, key: str) -> tuple[str, ...]:
@@ -235,6 +264,16 @@ def _check_against_active(store: Store, pointer: Pointer, bundle: Bundle, condit
     except VlatoolError:
         return
     check_contract(bundle.manifest.spec, active.manifest.spec)
+
+
+def _refuse_own_slot(store: Store, pointer: Pointer, path: Path) -> None:
+    """Refuse to copy from the slot that is emptied for the copy; raises DeploymentError."""
+    slot, source = store.folder(pointer.inactive).resolve(), path.resolve()
+    if slot == source or slot in source.parents or source in slot.parents:
+        raise DeploymentError(
+            f"{path} is in the slot that it would be copied into.",
+            "copy it to another directory first; or, to go back to it: vlatool rollback",
+        )
 
 
 def _check_room(store: Store, pointer: Pointer, bundle: Bundle) -> None:

@@ -6,6 +6,7 @@ valid for a pointer, and it holds its own SHA-256: any other content is refused.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import re
@@ -189,14 +190,20 @@ def read_pointer(store: Path) -> Pointer:
 
 
 def write_pointer(store: Path, pointer: Pointer) -> Pointer:
-    """Replace the pointer and then its copy, each at once, and return it with the next number.
+    """Replace the copy of the pointer and then the pointer, each at once, and return it with the next number.
 
     Raises:
-        OSError: when it cannot be written; the old pointer then holds.
+        OSError: when one of both cannot be written; the old pointer then holds.
     """
     numbered = replace(pointer, change=pointer.change + 1)
-    for name in FILES:
-        replace_file(store / name, encode(numbered))
+    pointer_file, copy = (store / name for name in FILES)
+    replace_file(copy, encode(numbered))
+    try:
+        replace_file(pointer_file, encode(numbered))
+    except OSError:
+        with contextlib.suppress(OSError):  # it says what has not happened
+            copy.unlink()
+        raise
     return numbered
 
 

@@ -77,6 +77,8 @@ def new_key(path: Path) -> Path:
         OutputError: when one of the files exists or cannot be written.
         MissingExtra: without ``cryptography``.
     """
+    if not path.name:
+        raise OutputError(f"'{path}' is not the name of a file.", "name one: vlatool sign --new-key KEY")
     private = _ed25519().Ed25519PrivateKey.generate()
     text = _serialization()
     public = path.with_name(path.name + PUBLIC_SUFFIX)

@@ -132,7 +132,7 @@ class Store:
         Raises:
             DeploymentError: when there is nothing to go back to, or as ``lock`` does.
         """
-        return self._change(lambda pointer: self._left(pointer, reason), bundle, wait_s)
+        return self._change(lambda pointer: self.pointer_after_rollback(pointer, reason), bundle, wait_s)
 
     def commit(self, bundle: str, wait_s: float = 0.0) -> Pointer:
         """End the trial of a bundle that has passed it, and return the pointer."""
@@ -149,7 +149,8 @@ class Store:
             changed = change(pointer)
             return pointer if changed == pointer else self.write(changed)
 
-    def _left(self, pointer: Pointer, reason: str) -> Pointer:
+    def pointer_after_rollback(self, pointer: Pointer, reason: str) -> Pointer:
+        """Return the pointer after a rollback; raises DeploymentError when there is nothing to go back to."""
         if pointer.inactive not in pointer.slots:
             raise DeploymentError(
                 f"The store {self.path} holds no other bundle to go back to.", "deploy one: vlatool deploy BUNDLE"
@@ -228,6 +229,6 @@ def _write_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         why = "its disk is full" if error.errno in NO_SPACE else str(error.strerror)
         raise OutputError(
-            f"The store {path} cannot be changed: {why}. The active bundle is what it was.",
-            "free some space, or name another directory with --store",
+            f"The store {path} cannot be changed: {why}.",
+            "free some space, or name another directory with --store; vlatool status shows what is active",
         ) from error

@@ -36,7 +36,7 @@ def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, op
 
 
 def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, zero: bool = False) -> None:
-    """Refuse anything but a number above 0 (from 0 where ``zero``); None too, unless it is optional.
+    """Refuse anything but a finite number above 0 (from 0 where ``zero``); None too, unless it is optional.
 
     Raises:
         UsageError: naming the argument, what it is and what is allowed.
@@ -44,7 +44,7 @@ def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, 
     if optional and value is None:
         return
     number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not number or not (value > 0 or (zero and value == 0)):
+    if not number or not (0 < value < math.inf or (zero and value == 0)):
         raise _refused(name, value, f"{unit} {'from' if zero else 'above'} 0", optional)
 
 

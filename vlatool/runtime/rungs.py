@@ -124,6 +124,9 @@ class Hold(Rung):
         steps: Number of control steps in a row that it answers; any number when None.
         ramp: Number of control steps in which a velocity falls to 0.
         neutral: Label of a discrete action without motion; one of ``NO_MOTION`` when empty.
+
+    Raises:
+        UsageError: when a number is out of its range, or a label is given and no label is the one without motion.
     """
 
     def __init__(
@@ -142,7 +145,7 @@ class Hold(Rung):
         self._action, self._limit, self._ramp = action, steps, ramp
         self._first: Array | None = None
         self._left_to_envelope = False
-        self._index = neutral_index(action, neutral) if action.kind == "discrete" else None
+        self._index = neutral_index(action, neutral) if action.kind == "discrete" or neutral else None
         self.pause()
 
     def act(self, observation: Mapping[str, Any], last: Array | None) -> Array:
@@ -197,8 +200,11 @@ def neutral_index(action: TensorSpec, label: str = "") -> int:
     """Return the index of the discrete action without motion: that of a label, or of the only one in ``NO_MOTION``.
 
     Raises:
-        UsageError: when the label is not there, or none or several of the labels mean no motion.
+        UsageError: when the action is not discrete, the label is not there, or none or several of the labels mean no
+            motion.
     """
+    if action.kind != "discrete":
+        raise UsageError(f"'{action.name}' is not discrete: no label of it means no motion.", "leave neutral out")
     found = [index for index, name in enumerate(action.labels)
              if (name == label if label else name.lower() in NO_MOTION)]  # fmt: skip
     if len(found) != 1:

@@ -146,8 +146,9 @@ class SensorBuffer:
         if not self._times:
             return None
         after = bisect_left(self._times, moment)
-        if after == len(self._times) or after == 0 or self._times[after] == moment:
-            return self._sample(min(after, len(self._times) - 1))
+        last = max(0, bisect_right(self._times, self._clock()) - 1)  # what is still to come stands for nothing now
+        if after > last or after == 0 or self._times[after] == moment:
+            return self._sample(min(after, last))
         before, share = after - 1, (moment - self._times[after - 1]) / (self._times[after] - self._times[after - 1])
         if self.limits.method == NEAREST:
             return self._sample(after if share >= 0.5 else before)

@@ -18,8 +18,10 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError
+from vlatool.files.validate import short_repr
 from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.control import build_layer, check_order, layers, options_of, takes_delay
+from vlatool.runtime.control._elements import rotations_of
 from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline
@@ -50,6 +52,9 @@ class Fallback:
         latch: Whether a stopped robot waits for ``reset``.
         start: Pose that is held before the first action, (A,), where an action is a position.
         neutral: Label of the discrete action without motion.
+
+    Raises:
+        UsageError: when a number is out of its range, or the policy is none.
     """
 
     policy: Policy | None = None
@@ -63,6 +68,21 @@ class Fallback:
     latch: bool = False
     start: Any = None
     neutral: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("policy_ms", "max_age_ms"):
+            check_positive(name, getattr(self, name), "a number of milliseconds", optional=True)
+        for name in ("hold_s", "ramp_s"):
+            check_positive(name, getattr(self, name), "a number of seconds", zero=True)
+        if not isinstance(self.latch, bool):
+            raise UsageError(f"latch is {self.latch!r}; allowed: True or False.", "pass latch=True or latch=False")
+        if self.policy is not None and not isinstance(self.policy, Policy):
+            raise UsageError(
+                f"The fallback is {self.policy!r}; allowed: a policy, or a Fallback.",
+                "pass the directory of a bundle to load(), another policy, or Fallback(...)",
+            )
+        if self.policy is None and self.policy_ms is not None:
+            raise UsageError("policy_ms is for a second policy, and there is none.", "pass Fallback(policy=...), too")
 
 
 class TickRecord(NamedTuple):
@@ -78,7 +98,7 @@ class TickRecord(NamedTuple):
         level: Index of the rung that the ladder stands on afterwards.
         origin: Where the action comes from.
         error: Why the policy had no action; empty where it had one.
-        action: The action.
+        action: A copy of the action.
     """
 
     step: int
@@ -103,6 +123,9 @@ class Stack:
         controller: The outermost layer.
         telemetry: Called with the record of each control step. What it raises is counted, not passed on.
         clock: Returns seconds.
+
+    Raises:
+        UsageError: when the sink cannot be called.
     """
 
     def __init__(
@@ -112,6 +135,11 @@ class Stack:
         telemetry: Sink | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        if telemetry is not None and not callable(telemetry):
+            raise UsageError(
+                f"telemetry is a {type(telemetry).__name__}; allowed: a function of a record, or None.",
+                "pass a function, such as records.append",
+            )
         self.controller = controller
         self.layers = layers_of(controller)
         self.policy = self.layers[-1]
@@ -195,7 +223,8 @@ class Stack:
         now = self._clock()
         waited_ms, answer_ms = (called - started) * 1e3, (now - started) * 1e3
         origin = self.origin if action is not None else Origin("")
-        record = TickRecord(self._step, started, waited_ms, answer_ms, bool(cause), rung, level, origin, cause, action)
+        copied = None if action is None else np.array(action)  # what a sink does to it must not reach the robot
+        record = TickRecord(self._step, started, waited_ms, answer_ms, bool(cause), rung, level, origin, cause, copied)
         self._step += 1
         try:
             self._sink(record)  # type: ignore[misc]
@@ -246,12 +275,25 @@ def build_stack(
     for entry in outer:
         inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry))
     if envelope is not None:
-        inner = (robot_envelope(policy.spec, envelope) if isinstance(envelope, str) else envelope)(inner)
+        inner = _enveloped(inner, policy.spec, envelope)
         if ladder is not None and hasattr(inner, "stop"):
             for rung in ladder.rungs:
                 if isinstance(rung, Hold):
                     rung.leave_to_envelope()
     return Stack(inner, telemetry=telemetry, clock=clock)
+
+
+def _enveloped(controller: Controller, spec: PolicySpec, envelope: str | Wrapper) -> Any:
+    """Return a controller with the envelope of a robot, or a wrapper, around it."""
+    wrapper = robot_envelope(spec, envelope) if isinstance(envelope, str) else envelope
+    wrapped = wrapper(controller) if callable(wrapper) else None
+    if not isinstance(wrapped, Controller) or controller not in layers_of(wrapped):
+        raise UsageError(
+            f"The envelope is {short_repr(envelope)}; allowed: the name of a robot, or a function that returns a "
+            "controller around the one that it is given, as its 'controller'.",
+            "pass envelope=lambda controller: EnvelopeController(controller, ...)",
+        )
+    return wrapped
 
 
 def _limited(policy: Policy, deadline_ms: float | None, clock: Callable[[], float]) -> Policy:
@@ -295,9 +337,10 @@ def policy_ms(deadline_ms: float | None, options: Fallback) -> float:
     """Return the part of a deadline that is kept for the second policy, in milliseconds; 0 without a deadline.
 
     Raises:
-        UsageError: when nothing is left for the first one.
+        UsageError: when nothing is left for the first one, or there is no deadline to take a part of.
     """
-    check_positive("policy_ms", options.policy_ms, "a number of milliseconds", optional=True)
+    if deadline_ms is None and options.policy_ms is not None:
+        raise UsageError("policy_ms is a part of the deadline, and there is none.", "pass deadline_ms, too")
     if deadline_ms is None:
         return 0.0
     own = deadline_ms / 2 if options.policy_ms is None else options.policy_ms
@@ -322,6 +365,11 @@ def check_same_actions(first: PolicySpec, second: PolicySpec) -> None:
                 f"The second policy's action has the {what} {others!r}, that of the first {ours!r}.",
                 "fall back to a policy with the same action",
             )
+    if rotations_of(first.action) != rotations_of(second.action):
+        raise UsageError(
+            "The second policy's action has other rotations, or in other places or forms, than that of the first.",
+            "fall back to a policy with the same action",
+        )
     if first.action.units() != second.action.units() or first.control_hz != second.control_hz:
         raise UsageError(
             f"The second policy acts in {second.action.units()} at {second.control_hz} Hz, the first in "

@@ -80,6 +80,14 @@ def test_the_deadline_counts_from_when_the_step_was_to_begin():
     assert deadline.infer({"t": 0}).latency_ms == 6.0
 
 
+def test_a_time_that_is_still_to_come_does_not_put_the_deadline_off():
+    _, deadline, clock = limited(99.0)
+    clock.now, deadline.started = 1.0, 1.7e9  # seconds since 1970, say
+    with pytest.raises(DeadlineMissed):
+        deadline.infer({"t": 0})
+    assert clock.now == 1.01
+
+
 def test_a_policy_that_cannot_be_stopped_is_busy_until_it_ends():
     _, deadline, clock = limited(35.0, stops=False, kind=SlowPolicy)
     misses = []

@@ -169,3 +169,53 @@ def test_an_envelope_of_absurd_arguments_is_refused(options: dict[str, Any]):
 def test_bands_out_of_order_are_refused(bands: dict[str, Any]):
     with pytest.raises(UsageError, match=r"The monitor r has the bands"):
         Monitor("r", **bands)
+
+
+@pytest.mark.parametrize("switch", [False, np.False_, None, 0, "off", np.array(False), float("nan"), 1 / 3], ids=repr)
+def test_a_dead_mans_switch_that_does_not_say_true_stops_the_robot(switch: Any):
+    controller = EnvelopeController(
+        EchoController("action"), Envelope(PAIR, T, clock=Clock()), position="state", enabled=lambda: switch
+    )
+    assert controller.act(see(0.5001, 0.5)).tolist() == [0.5, 0.5]
+    envelope = Envelope(PAIR, T)
+    envelope.start([0.5, 0.5])
+    checks = envelope.step([0.5001, 0.5], elapsed_s=T, enabled=switch).checks
+    assert checks == (() if switch is None else ("dead-man",)), "None: there is no switch"
+
+
+@pytest.mark.parametrize("switch", [True, np.True_, np.float64(2) > 1], ids=repr)
+def test_a_dead_mans_switch_that_is_held_may_be_numpys(switch: Any):
+    envelope = Envelope(PAIR, T, dead_man=True)
+    envelope.start([0.5, 0.5])
+    assert envelope.step([0.5001, 0.5], elapsed_s=T, enabled=switch).checks == ()
+
+
+def test_a_switch_or_readings_that_raise_stop_the_robot():
+    def broken(*_: Any) -> Any:
+        raise OSError("no bus")
+
+    monitor = Monitor("distance", warning=1.0, critical=0.4)
+    for options, check in (({"enabled": broken}, "dead-man"), ({"readings": broken}, "distance")):
+        envelope = Envelope(PAIR, T, clock=Clock(), monitors=[monitor] * ("readings" in options))
+        controller = EnvelopeController(EchoController("action"), envelope, position="state", **options)
+        assert controller.act(see(0.5001, 0.5)).tolist() == [0.5, 0.5]
+        assert controller.result is not None
+        assert controller.result.checks == (check,)
+        assert controller.stop().tolist() == [0.5, 0.5]
+
+
+def test_the_robot_starts_at_the_newest_of_several_moments():
+    for state in ([[0.1, 0.2], [0.5, 0.6]], [[[0.1, 0.2], [0.5, 0.6]]]):
+        controller = bounded()
+        controller.act({"action": np.array([0.5, 0.6]), "state": np.array(state)})
+        assert controller.envelope.position == (0.5, 0.6)
+    for state in ([0.5, 0.6, 0.0, 0.0], ["a", "b"], "here", []):
+        with pytest.raises(DataError, match="The start position is"):
+            bounded().act({"action": np.array([0.5, 0.6]), "state": state})
+
+
+@pytest.mark.parametrize("dtype", [object, np.longdouble, np.complex128], ids=str)
+def test_an_array_that_is_refused_is_never_given_back(dtype: Any):
+    controller = bounded()
+    action = controller.act({"action": np.array([0.5, 0.5], dtype), "state": np.array([0.5, 0.5])})
+    assert action.dtype == np.float64

@@ -102,3 +102,12 @@ def test_an_observation_without_the_position_is_refused():
     controller, _ = acting("delta")
     with pytest.raises(DataError, match="has no 'place'"):
         controller.act({"t": 0})
+
+
+@pytest.mark.parametrize("mode", ["delta", "velocity", "absolute"])
+def test_a_position_that_is_not_finite_is_no_place_to_start_from(mode: str):
+    for pose, broken in ((None, np.nan), ([1.0, -2.0], np.inf)):
+        controller, policy = acting(mode, pose=pose)
+        with pytest.raises(DataError, match="'place' is not finite"):
+            controller.act({"t": 0, "place": np.array([0.0, broken])})
+        assert not policy.asked

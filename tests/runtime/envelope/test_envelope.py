@@ -354,7 +354,7 @@ MUTATIONS: tuple[tuple[str, str, str, str], ...] = (
     ("moving_start", "envelope", "if not self.at_rest():", "if False:"),
     ("late", "envelope", "if interval > self.max_interval_s:", "if False:"),
     ("missed", "envelope", "if command is None:", "if command is None and self._axes and self._axes[0].arm(0.0):"),
-    ("dead_man", "envelope", "if enabled is False or", "if False and"),
+    ("dead_man", "envelope", "if not held and", "if False and"),
     ("internal", "envelope", "except Exception as error:", "except KeyboardInterrupt as error:"),
     ("internal", "envelope", "        if self._emergency:\n", "        if False:\n"),
     ("keep_out", "envelope", "if self._boxes and self._enters_box(samples):", "if False:"),

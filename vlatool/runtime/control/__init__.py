@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 from vlatool import registry
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import PluginError, UsageError
+from vlatool.files.validate import short_repr
 from vlatool.runtime.interface import Controller, Policy
 
 KIND, DEFAULT_PLAYER, PLAYER_WITH_DELAY = "control", "chunked", "late"
@@ -123,7 +124,11 @@ def takes_delay(entry: type) -> bool:
 
 
 def _layers(names: Sequence[str], delayed: bool) -> list[_Layer]:
-    found = {name.partition(":")[0]: _parsed(name) for name in names}
+    if isinstance(names, str):
+        raise UsageError(f"The controllers are the text '{names}'; allowed: names.", f"pass controllers=['{names}']")
+    found = dict(_named(name) for name in names)
+    if len(found) < len(names):
+        raise UsageError(f"A controller is named twice in {list(names)}.", "name each once, with all its options")
     players = [name for name, layer in found.items() if _layer(layer.entry) == 1]
     if len(players) > 1:
         raise UsageError(f"Both {players[0]} and {players[1]} play the chunks of the policy.", "name one of them")
@@ -135,6 +140,12 @@ def _layers(names: Sequence[str], delayed: bool) -> list[_Layer]:
     if delayed and "delay" in found[player].options:
         raise UsageError(f"The delay of {player} is given, and it is that of the latency.", "leave one of them out")
     return sorted(found.values(), key=lambda layer: _layer(layer.entry))
+
+
+def _named(named: str) -> tuple[str, _Layer]:
+    if not isinstance(named, str):
+        raise UsageError(f"A controller is {short_repr(named)}; allowed: a name.", "pass controllers=['NAME']")
+    return named.partition(":")[0], _parsed(named)
 
 
 def _parsed(named: str) -> _Layer:

@@ -123,7 +123,7 @@ class AsynchronousController(ChunkQueue):
             self._steps += 1
             self._last = self._next()
             self.origin = self.origin._replace(source=CHUNK)
-            return self._last
+            return self._last.copy()
 
     def _next(self) -> Array:
         self.origin = Origin(POLICY if self._pending else HOLD, (self._clock() - self._observed) * 1e3)

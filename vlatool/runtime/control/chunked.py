@@ -62,7 +62,7 @@ class ChunkQueue:
         with self._turn:
             try:
                 self._owner = threading.get_ident()
-                return np.asarray(self._step(observation))
+                return np.array(self._step(observation))  # a copy: the caller may change its own
             finally:
                 self._owner = 0
 
@@ -97,7 +97,7 @@ class ChunkQueue:
                 return None
             self.fresh = False
             self._note(CHUNK)
-            return np.asarray(action)
+            return np.array(action)
 
     def drop(self) -> None:
         """Discard the pending actions, so that the next step infers; the policy keeps its values."""

@@ -45,7 +45,7 @@ class Deadline:
         self._observer = observer_of(policy)
         self.deadline_ms = 1000 / policy.spec.rate if deadline_ms is None else float(deadline_ms)
         self.started: float | None = None
-        """Time of the clock at which the control step was to begin; the call of ``infer`` when None."""
+        """Time of the clock at which the control step was to begin; the call of ``infer`` when None or after it."""
         self._clock = clock
         self._worker = Worker("vlatool-inference", clock) if worker is None else worker
         self._engine = next((layer for layer in layers_of(policy) if _stops(layer)), None)
@@ -63,7 +63,8 @@ class Deadline:
             DeadlineMissed: when the inference does not end in time, or an earlier one that was stopped still runs.
             DataError, GraphError, UsageError: as the policy's ``infer`` does.
         """
-        started = self._clock() if self.started is None else self.started
+        now = self._clock()
+        started = now if self.started is None else min(self.started, now)
         inference = _Inference(self.policy, self._engine, observation, noise, self._reset)
         try:
             action: Action = self._worker.call(inference, started + self.deadline_ms / 1e3)

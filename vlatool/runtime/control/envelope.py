@@ -9,6 +9,7 @@ import numpy as np
 
 from vlatool.errors import DataError, UsageError
 from vlatool.runtime.envelope import Envelope, Level, StepResult
+from vlatool.runtime.envelope.envelope import FLOATS
 from vlatool.runtime.interface import STOP, Array, Controller, Origin, origin_of
 
 Measurement = str | Callable[[Mapping[str, Any]], Any]
@@ -27,8 +28,9 @@ class EnvelopeController:
         position: where the robot is measured to be, in the units of the limits: an entry of the observation, or a
             function of it. None is enough if no joint has position limits, or the envelope was started.
         readings: values for the monitors of the envelope: a function of the observation; None takes the entries of the
-            observation that have their names.
-        enabled: returns whether the dead man's switch is held; None if there is none.
+            observation that have their names. Where it raises, there are none, which is critical.
+        enabled: returns whether the dead man's switch is held; None if there is none. What it raises, or anything but
+            True, stops the robot.
 
     Raises:
         UsageError: without an envelope.
@@ -96,11 +98,20 @@ class EnvelopeController:
         self.controller.reset(seed)
 
     def _step(self, action: Any, readings: Mapping[str, Any], age_s: float | None = None) -> Array:
-        enabled = None if self._enabled is None else self._enabled()
-        self.result = result = self.envelope.step(action, readings=readings, enabled=enabled, age_s=age_s)
-        if isinstance(action, np.ndarray) and action.ndim == 1 and action.tolist() == list(result.command):
+        self.result = result = self.envelope.step(action, readings=readings, enabled=self._held(), age_s=age_s)
+        if isinstance(action, np.ndarray) and action.dtype in FLOATS and action.tolist() == list(result.command):
             return action
         return np.array(result.command)
+
+    def _held(self) -> bool | None:
+        """Return whether the dead man's switch is held; None if there is none."""
+        if self._enabled is None:
+            return None
+        try:
+            held = self._enabled()
+        except Exception:  # the seam: a switch that cannot be read is not held
+            return False
+        return isinstance(held, bool | np.bool_) and bool(held)
 
     def _measure(self, observation: Mapping[str, Any]) -> Any:
         if self._position is None:
@@ -112,11 +123,23 @@ class EnvelopeController:
                 f"The observation has no '{self._position}', where the robot's position is to be.",
                 "give the measured position at the first step, or call envelope.start(position)",
             )
-        return np.ravel(observation[self._position]).astype(np.float64)
+        return self._newest(observation[self._position])
+
+    def _newest(self, measured: Any) -> Any:
+        """Return the position (A,) float64, the newest where there are several; anything else as it is."""
+        width = len(self.envelope.limits.joints)
+        try:
+            values = np.asarray(measured, np.float64)
+        except (TypeError, ValueError):
+            return measured
+        return values.reshape(-1, width)[-1] if values.shape[-1:] == (width,) and values.size else np.ravel(values)
 
     def _values(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
         if self._readings is not None:
-            return self._readings(observation)
+            try:
+                return self._readings(observation)
+            except Exception:  # the seam: a reading that is missing is critical
+                return {}
         names = [monitor.name for monitor in self.envelope.monitors]
         return {name: _scalar(observation[name]) for name in names if name in observation}
 

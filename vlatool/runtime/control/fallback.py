@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.errors import DeadlineMissed
+from vlatool.bundle.spec import PolicySpec
+from vlatool.errors import DeadlineMissed, UsageError
+from vlatool.files.validate import short_repr
 from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.interface import STOP, Array, Controller, Origin, layers_of
 from vlatool.runtime.rungs import ChunkRung, Hold, PolicyRung, Rung, Stop
@@ -36,7 +38,8 @@ class FallbackLadder:
         clock: Returns seconds; the age of a held action is measured with it.
 
     Raises:
-        UsageError: when a number is not a whole one from 1, or no label of a discrete action means no motion.
+        UsageError: when a number is not a whole one from 1, the start is not a finite number for each element of the
+            action, or no label of a discrete action means no motion.
     """
 
     def __init__(
@@ -57,7 +60,7 @@ class FallbackLadder:
         lower = default_rungs(controller) if rungs is None else rungs
         self.rungs = [PolicyRung(controller), *lower]
         self._misses, self._recover, self._latch, self._clock = misses, recover, latch, clock
-        self._start = None if start is None else np.asarray(start, np.float32)
+        self._start = None if start is None else _pose(controller, start)
         self._asked: deque[bool] = deque(maxlen=max(window, misses))
         self._forget()
 
@@ -128,7 +131,11 @@ class FallbackLadder:
             other.pause()
         for other in self.rungs[index + 1 :]:
             other.watch(observation)
-        self.rung, self._last, self.origin = index, action, rung.origin
+        self.rung, self._last, self.origin = (
+            index,
+            np.array(action),
+            rung.origin,
+        )  # a copy: the caller may change its own
         self.fresh = isinstance(rung, PolicyRung) and rung.controller.fresh
         if isinstance(rung, Hold):
             age = None if self._age is None else self._age[0] + (now - self._age[1]) * 1e3
@@ -150,9 +157,27 @@ class FallbackLadder:
 
 def default_rungs(controller: Controller) -> list[Rung]:
     """Return the rest of the chunk, where a controller has that, a hold and a stop."""
-    layers = layers_of(controller)
-    spec = next(layer.spec for layer in layers if hasattr(layer, "spec"))
-    player = next((layer for layer in layers if hasattr(layer, "rest")), None)
+    spec = _spec_of(controller)
+    player = next((layer for layer in layers_of(controller) if hasattr(layer, "rest")), None)
     bridge: list[Rung] = [] if player is None else [ChunkRung(player)]
     steps = max(1, round(HOLD_S * (spec.control_hz or 1.0)))
     return [*bridge, Hold(spec.action, steps), Stop(spec.action)]
+
+
+def _spec_of(controller: Controller) -> PolicySpec:
+    return next(layer.spec for layer in layers_of(controller) if hasattr(layer, "spec"))  # type: ignore[no-any-return]
+
+
+def _pose(controller: Controller, start: Any) -> Array:
+    """Return a start as an action, (A,) float32; raises UsageError when it is none."""
+    width = _spec_of(controller).action.robot_width
+    try:
+        pose = np.array(start, np.float32)
+    except (TypeError, ValueError):
+        pose = np.empty(0, np.float32)
+    if pose.shape != (width,) or not np.isfinite(pose).all():
+        raise UsageError(
+            f"start is {short_repr(start)}; allowed: {width} finite numbers, one for each element of the action.",
+            "pass the pose of the robot, in the units of the action",
+        )
+    return pose

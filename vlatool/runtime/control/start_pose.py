@@ -77,7 +77,7 @@ class StartPose:
         """Return the action of this control step: on the way to the pose, or that of the controller.
 
         Raises:
-            DataError: when the observation has no position, or the robot does not arrive.
+            DataError: when the observation has no finite position, or the robot does not arrive.
             VlatoolError: as the controller does.
         """
         action = self._way(observation) if self.moving else None
@@ -106,7 +106,10 @@ class StartPose:
         name = self._tensor.name
         if name not in observation:
             raise DataError(f"The observation has no '{name}', which says where the robot stands.", f"give it '{name}'")
-        return newest_moment(observation[name], self._tensor.robot_width)
+        here = newest_moment(observation[name], self._tensor.robot_width)
+        if not np.isfinite(here).all():
+            raise DataError(f"The position '{name}' is not finite.", "see what measures it; the robot does not move")
+        return here
 
     def _arrived(self, here: Array, pose: Array) -> bool:
         distance = float(np.abs(here - pose).max())

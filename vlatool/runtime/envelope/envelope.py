@@ -161,7 +161,8 @@ class Envelope:
             age_s: age of the command, from its observation on.
             sequence: number of the command, which must grow from step to step.
             readings: values for the monitors, by name.
-            enabled: whether the dead man's switch is held; False stops the robot in any case.
+            enabled: whether the dead man's switch is held, a truth value of Python or NumPy; None if nobody says. Any
+                other value than True stops the robot in any case.
 
         Raises:
             UsageError: before ``start``.
@@ -214,7 +215,8 @@ class Envelope:
     ) -> StepResult:
         values, checks = self._admissible(command, age, sequence)
         level, reports = self._judge(readings)
-        if enabled is False or (self.dead_man and enabled is not True):
+        held = isinstance(enabled, bool | np.bool_) and bool(enabled)
+        if not held and (self.dead_man or enabled is not None):
             checks.append("dead-man")
         if interval > self.max_interval_s:
             checks.append("late")
