@@ -35,8 +35,13 @@ def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, op
         raise _refused(name, value, f"a whole number from {least}{upto}", optional)
 
 
-def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, zero: bool = False) -> None:
+def check_positive(
+    name: str, value: Any, unit: str, *, optional: bool = False, zero: bool = False, finite: bool = False
+) -> None:
     """Refuse anything but a number above 0 (from 0 where ``zero``); None too, unless it is optional.
+
+    Args:
+        finite: Whether infinity is refused, too.
 
     Raises:
         UsageError: naming the argument, what it is and what is allowed.
@@ -44,7 +49,7 @@ def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, 
     if optional and value is None:
         return
     number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not number or not (value > 0 or (zero and value == 0)):
+    if not number or not (value > 0 or (zero and value == 0)) or (finite and value == math.inf):
         raise _refused(name, value, f"{unit} {'from' if zero else 'above'} 0", optional)
 
 

@@ -142,7 +142,7 @@ class Hold(Rung):
         self._action, self._limit, self._ramp = action, steps, ramp
         self._first: Array | None = None
         self._left_to_envelope = False
-        self._index = neutral_index(action, neutral) if action.kind == "discrete" else None
+        self._index = neutral_index(action, neutral) if neutral or action.kind == "discrete" else None
         self.pause()
 
     def act(self, observation: Mapping[str, Any], last: Array | None) -> Array:
@@ -193,18 +193,43 @@ class Stop(Hold):
         super().__init__(action, ramp=ramp, neutral=neutral, source=STOP)
 
 
+def start_pose(pose: Any, action: TensorSpec) -> Array:
+    """Return the pose that is held before the first action: (A,) float32.
+
+    Raises:
+        UsageError: when it is not one finite number for each element of the action.
+    """
+    try:
+        array = np.asarray(pose, np.float32)
+    except (TypeError, ValueError):
+        array = np.asarray(np.nan)
+    if array.shape != (action.robot_width,) or not np.isfinite(array).all():
+        raise UsageError(
+            f"The start is {pose!r:.80}; allowed: {action.robot_width} finite numbers, one for each element of "
+            f"'{action.name}'.",
+            "pass start=[...] with the pose of the robot",
+        )
+    return array
+
+
 def neutral_index(action: TensorSpec, label: str = "") -> int:
     """Return the index of the discrete action without motion: that of a label, or of the only one in ``NO_MOTION``.
 
     Raises:
-        UsageError: when the label is not there, or none or several of the labels mean no motion.
+        UsageError: when the action is not discrete, the label is not there, or none or several of the labels mean no
+            motion.
     """
+    if action.kind != "discrete":
+        raise UsageError(
+            f"neutral is {label!r}, and the action '{action.name}' is not discrete: it has no label without motion.",
+            "leave neutral out",
+        )
     found = [index for index, name in enumerate(action.labels)
              if (name == label if label else name.lower() in NO_MOTION)]  # fmt: skip
     if len(found) != 1:
         known = ", ".join(action.labels[:20])
         raise UsageError(
             f"{len(found)} of the labels of '{action.name}' are {label or 'known to mean no motion'}; labels: {known}.",
-            "name the one without motion: Fallback(neutral=LABEL)",
+            "name the one without motion: Fallback(neutral=LABEL), or --neutral LABEL",
         )
     return found[0]
