@@ -57,6 +57,12 @@ def test_a_directory_of_something_else_is_refused_and_not_changed(tmp_path, name
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
+def test_a_file_is_no_store(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(DeploymentError, match="is not a store: it is a file"):
+        Store(tmp_path / "file").make()
+
+
 @pytest.mark.parametrize("names", [[], ["a"], ["lost+found"], [".pointer.json.part"], [FILES[0], "note.txt"]])
 def test_an_empty_an_interrupted_and_a_used_store_are_used(tmp_path, names):
     for name in names:

@@ -101,6 +101,8 @@ class Store:
 
     def _refuse_other_files(self) -> None:
         """Refuse a directory with other files than an interrupted first deployment or a file system leaves there."""
+        if self.path.exists() and not self.path.is_dir():
+            raise DeploymentError(f"{self.path} is not a store: it is a file.", "name a directory: --store DIR")
         names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
         others = {name for name in names - {*NAMES, *MOUNTED} if not name.startswith(".")}
         if others and names.isdisjoint(FILES):
