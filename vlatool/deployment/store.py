@@ -27,7 +27,7 @@ LOCK_S = 10.0
 """Seconds for which a controller waits for another process that changes the pointer."""
 BLOCK = 1 << 20
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-MOUNTED = ("lost+found",)
+MOUNT_NAMES = ("lost+found",)
 """What a file system has in its root: a store may be a partition of its own."""
 VARIABLE = "VLATOOL_STORE"
 
@@ -104,7 +104,7 @@ class Store:
         if self.path.exists() and not self.path.is_dir():
             raise DeploymentError(f"{self.path} is not a store: it is a file.", "name a directory: --store DIR")
         names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
-        others = {name for name in names - {*NAMES, *MOUNTED} if not name.startswith(".")}
+        others = {name for name in names - {*NAMES, *MOUNT_NAMES} if not name.startswith(".")}
         if others and names.isdisjoint(FILES):
             found = ", ".join(sorted(others)[:6])
             raise DeploymentError(f"{self.path} is not a store: it holds other files (found: {found}).",
