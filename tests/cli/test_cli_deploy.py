@@ -60,8 +60,9 @@ def test_signing_twice_needs_force(run, tmp_path):
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [
-    (["sign"], 2, "Nothing, or too much, to sign"), (["sign", "BUNDLE"], 2, "Nothing, or too much"),
-    (["sign", "BUNDLE", "--key", "k", "--new-key", "n"], 2, "Nothing, or too much"),
+    (["sign"], 2, "Got no arguments; allowed: BUNDLE and --key"), (["sign", "BUNDLE"], 2, "Got BUNDLE; allowed"),
+    (["sign", "BUNDLE", "--key", "k", "--new-key", "n"], 2, "Got BUNDLE and --key and --new-key; allowed"),
+    (["sign", "--key", "k"], 2, "Got --key; allowed"),
     (["sign", "BUNDLE", "--key", "none"], 3, "cannot be read"), (["sign", "none", "--key", "none"], 3, "No bundle at"),
     (["verify-signature", "BUNDLE", "--key", "none"], 3, "cannot be read"),
     (["deploy", "none", "--store", "STORE"], 3, "No bundle at"), (["status", "--store", "STORE"], 3, "holds no bundle"),

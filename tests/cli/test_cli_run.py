@@ -57,6 +57,19 @@ def test_a_robot_and_a_second_bundle_add_theirs(vlatool, speeds: Bundle) -> None
     assert (found["period_ms"], found["deadline_ms"], found["answer"]["samples"]) == (10, 8, 20)
 
 
+def test_a_faster_control_loop_is_played_at_its_own_rate(vlatool, speeds: Bundle) -> None:
+    code, out, err = vlatool("run", speeds.path, "--dry-run", "--steps", 20, "--threads", 1, "--json",
+                             "--controller", "interpolation:factor=4")  # fmt: skip
+    assert (code, err) == (0, "")
+    assert (json.loads(out)["period_ms"], json.loads(out)["deadline_ms"]) == (2.5, 2.5)
+
+
+def test_a_label_without_motion_is_refused_for_a_velocity(vlatool, speeds: Bundle) -> None:
+    code, _, err = vlatool("run", speeds.path, "--dry-run", "--neutral", "stop")
+    assert code == 2
+    assert "neutral is 'stop', and the action 'y' is not discrete" in err
+
+
 def test_a_policy_that_is_too_slow_for_its_deadline_ends_with_1(vlatool, speeds: Bundle) -> None:
     code, _, err = vlatool("run", speeds.path, "--dry-run", "--steps", 20, "--deadline-ms", 0.0001)
     assert code == 1

@@ -97,6 +97,12 @@ def test_a_downgrade_must_be_named_by_the_hash_of_its_bundle(store, tmp_path, ke
     refused(store, path, DeploymentError, "older than release 5", downgrade_to=named)
 
 
+@pytest.mark.parametrize("named", ["sha256:xx", "sha256:" + "0" * 64])
+def test_another_bundle_than_the_one_that_is_named_is_refused(store, tmp_path, key, named):
+    path = candidate(tmp_path, key)
+    refused(store, path, DeploymentError, "which --downgrade-to names", downgrade_to=named)
+
+
 def test_a_truncated_signature(store, tmp_path, key):
     path = candidate(tmp_path, key)
     (path / SIGNATURE).write_bytes((path / SIGNATURE).read_bytes()[:-20])

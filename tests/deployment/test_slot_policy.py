@@ -170,6 +170,25 @@ def test_what_is_outside_may_let_the_trial_fail(store, bundles):
     assert store.read().rollback == "the envelope rejected 3 actions"
 
 
+@pytest.mark.parametrize(("reason", "written"), [("a collision", "a collision"), ("", "the controller gave no reason")])
+@pytest.mark.parametrize("error", [None, ValueError])
+def test_a_trial_that_failed_is_rolled_back_at_the_end(store, bundles, reason, written, error):
+    robot = Robot(store, bundles)
+    assert robot.value() == 2.0
+    robot.policy.fail(reason)
+    robot.policy.__exit__(error, None, None)
+    assert active(store, bundles) == (1, False)
+    assert store.read().rollback == written
+
+
+@pytest.mark.parametrize("period", [0, -1, float("nan"), float("inf"), "1"])
+def test_a_period_in_which_nothing_could_be_watched_is_refused(store, bundles, period):
+    robot = Robot(store, bundles)
+    with pytest.raises(UsageError, match="period_s is"):
+        robot.policy.watch(period)
+    robot.policy.close()
+
+
 def test_a_loop_of_crashes_is_rolled_back(store, bundles):
     for _ in range(MAX_STARTS):
         assert Robot(store, bundles).opened == [2.0, 1.0]  # it crashes

@@ -50,6 +50,27 @@ def test_the_first_bundle_has_no_trial_since_nothing_could_be_gone_back_to(store
     assert store.read().trial == TRIAL
 
 
+@pytest.mark.parametrize("name", ["manifest.json", "policy.py", "photo.jpg"])
+def test_a_directory_of_something_else_is_refused_and_not_changed(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(DeploymentError, match=f"is not a store: it holds other files .found: {name}"):
+        Store(tmp_path).make()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_file_is_no_store(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(DeploymentError, match="is not a store: it is a file"):
+        Store(tmp_path / "file").make()
+
+
+@pytest.mark.parametrize("names", [[], ["a"], ["lost+found"], [".pointer.json.part"], [FILES[0], "note.txt"]])
+def test_an_empty_an_interrupted_and_a_used_store_are_used(tmp_path, names):
+    for name in names:
+        (tmp_path / name).write_bytes(b"")
+    Store(tmp_path).make()
+
+
 def test_rollback_and_back_again(store, bundles):
     install(store, bundles[0])
     install(store, bundles[1], trial=None)

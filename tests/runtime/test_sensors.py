@@ -53,6 +53,41 @@ def test_between_two_samples_numbers_are_in_proportion_and_rotations_turn():
     np.testing.assert_allclose(turned, [0, 0, np.sin(0.15), np.cos(0.15)], atol=1e-12)
 
 
+def test_between_unsigned_integers_differences_do_not_wrap_around():
+    buffer = filled("linear", {0.0: np.array([10, 5], np.uint8), 1.0: np.array([5, 10], np.uint8)})
+    assert at(buffer, 0.5).value.tolist() == [7.5, 7.5]
+
+
+@pytest.mark.parametrize(
+    ("method", "values"),
+    [("linear", [np.zeros(2), np.zeros(3)]), ("linear", [np.zeros(1), np.zeros(2)]), ("linear", ["a", "b"]),
+     ("linear", [None, None]), ("linear", [np.array([True]), np.array([False])]),
+     ("quaternion_xyzw", [np.ones(2), np.ones(2)]), ("matrix", [np.eye(3), np.eye(3)])],
+)  # fmt: skip
+def test_samples_between_which_nothing_lies_are_an_error_of_the_sensor(method: str, values: list[Any]):
+    buffer = filled(method, dict(enumerate(values)))
+    with pytest.raises(DataError):
+        buffer.at(0.5)
+
+
+def test_samples_that_are_dropped_while_a_clock_settles_are_counted_in_what_is_said():
+    sensors = Sensors({"a": SensorLimits(0.2)}, clock=Clock())
+    sensors.add("a", 1.0, stamp=5.0)
+    assert sensors.read().problems == ("'a' has no sample that counts yet; dropped: 1",)
+
+
+@pytest.mark.parametrize("wrong", [{"a": 0.1}, ["a"], "a"])
+def test_limits_that_are_none_are_refused(wrong: Any):
+    with pytest.raises(UsageError, match="allowed: the SensorLimits of each input"):
+        Sensors(wrong)
+
+
+@pytest.mark.parametrize("stamp", ["1.0", "now", b"1"])
+def test_a_stamp_that_is_no_number_is_refused(stamp: Any):
+    with pytest.raises(UsageError, match=r"stamp is .*; allowed: a number of seconds"):
+        SensorBuffer(LIMITS).add(1.0, stamp=stamp)
+
+
 def test_samples_in_another_order_are_put_in_order_and_repeated_ones_dropped():
     buffer = SensorBuffer(LIMITS)
     for stamp, arrival in ((0.0, 10.0), (0.2, 10.2), (0.1, 10.21), (0.2, 10.22)):

@@ -200,7 +200,49 @@ def test_a_deadline_longer_than_a_step_is_refused_where_the_step_waits_for_it():
     with pytest.raises(UsageError, match="60 ms is longer than the control period of 50 ms") as caught:
         built(deadline_ms=60)
     assert "up to 50" in caught.value.fix
-    assert built(deadline_ms=60, controllers=["late"])[1].deadlines[0].deadline_ms == 60
+    with pytest.raises(UsageError, match="longer than the control period"):  # it infers within act
+        built(deadline_ms=60, controllers=["rtc"])
+    assert built(deadline_ms=60, controllers=["rtc:background=true"])[1].deadlines[0].deadline_ms == 60
+
+
+def test_a_faster_control_loop_has_a_shorter_step():
+    with pytest.raises(UsageError, match="11 ms is longer than the control period of 10 ms"):
+        built(deadline_ms=11, controllers=["interpolation:factor=5"])
+    assert built(deadline_ms=10, controllers=["interpolation:factor=5"])[1].deadlines[0].deadline_ms == 10
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [("hold_s", float("nan")), ("hold_s", -1), ("hold_s", float("inf")), ("hold_s", "1"), ("ramp_s", None),
+     ("ramp_s", float("nan")), ("policy_ms", 0), ("policy_ms", float("nan")), ("max_age_ms", "80"),
+     ("max_age_ms", -5)],
+)  # fmt: skip
+def test_a_number_of_a_fallback_that_is_out_of_its_range_is_refused(name: str, wrong: Any):
+    with pytest.raises(UsageError, match=f"^{name} is .*; allowed: "):
+        Fallback(**{name: wrong})
+
+
+@pytest.mark.parametrize("pose", [[1], [1, 2, 3], [float("nan"), 0], "home", [[1, 2]]])
+def test_a_start_that_is_no_pose_of_the_robot_is_refused(pose: Any):
+    with pytest.raises(UsageError, match="allowed: 2 finite numbers"):
+        build_stack(NumberedPolicy(spec_of(2, 1, POSITIONS)), fallback=Fallback(start=pose))
+
+
+def test_a_label_without_motion_is_refused_where_the_action_has_no_labels_to_choose_from():
+    with pytest.raises(UsageError, match="neutral is 'stop', and the action 'a' is not discrete"):
+        build_stack(NumberedPolicy(spec_of(2, 1, POSITIONS)), fallback=Fallback(neutral="stop"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [({"controllers": "rtc"}, "controllers is 'rtc'; allowed: a list"), ({"controllers": [3]}, "allowed: a list"),
+     ({"controllers": 3}, "controllers is 3"), ({"envelope": 3}, "envelope is 3; allowed: the name of a robot"),
+     ({"telemetry": "log.jsonl"}, "telemetry is 'log.jsonl'; allowed: a function"),
+     ({"fallback": 3}, "The fallback is 3; allowed: a policy")],
+)  # fmt: skip
+def test_an_argument_of_another_type_is_refused(asked: dict[str, Any], message: str):
+    with pytest.raises(UsageError, match=message):
+        build_stack(NumberedPolicy(spec_of(2, 1, POSITIONS)), **asked)
 
 
 def test_an_order_that_makes_no_sense_is_refused_with_the_reason(monkeypatch: pytest.MonkeyPatch):
@@ -358,11 +400,11 @@ def test_a_part_of_no_deadline_is_refused():
 @pytest.mark.parametrize(
     ("asked", "message"),
     [({"deadline_ms": float("inf"), "controllers": ["asynchronous"]}, "deadline_ms is inf"),
-     ({"envelope": 5}, "The envelope is 5"), ({"envelope": lambda _: None}, "returns a controller"),
+     ({"envelope": 5}, "envelope is 5"), ({"envelope": lambda _: None}, "returns a controller"),
      ({"envelope": lambda _: ChunkQueue(NumberedPolicy(spec_of()))}, "around the one that it is given"),
-     ({"telemetry": []}, "telemetry is a list"), ({"fallback": True}, "The fallback is True"),
-     ({"controllers": ["rtc:blend=2", "rtc:blend=4"]}, "named twice"), ({"controllers": "rtc"}, "the text 'rtc'"),
-     ({"controllers": [5]}, "A controller is 5")],
+     ({"telemetry": []}, r"telemetry is \[\]"), ({"fallback": True}, "The fallback is True"),
+     ({"controllers": ["rtc:blend=2", "rtc:blend=4"]}, "named twice"), ({"controllers": "rtc"}, "controllers is 'rtc'"),
+     ({"controllers": [5]}, r"controllers is \[5\]")],
 )  # fmt: skip
 def test_an_argument_that_would_have_no_effect_is_refused(asked: dict[str, Any], message: str):
     with pytest.raises(UsageError, match=message):

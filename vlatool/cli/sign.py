@@ -36,9 +36,10 @@ def sign(
     from vlatool.deployment import signature
 
     if (new_key is None) == (bundle is None) or (key is None) != (bundle is None):
-        raise UsageError(
-            "Nothing, or too much, to sign.", "vlatool sign BUNDLE --key KEY, or vlatool sign --new-key KEY"
-        )
+        given = {"BUNDLE": bundle, "--key": key, "--new-key": new_key}
+        names = [name for name, value in given.items() if value is not None]
+        raise UsageError(f"Got {' and '.join(names) or 'no arguments'}; allowed: BUNDLE and --key, or --new-key alone.",
+                         "write: vlatool sign BUNDLE --key KEY; or: vlatool sign --new-key KEY")  # fmt: skip
     if bundle is None or key is None:
         _answer_key(as_json, signature.new_key(Path(new_key or "")), signature)
         return

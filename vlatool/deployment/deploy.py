@@ -206,11 +206,14 @@ def _required_keys(pointer: Pointer, key: str) -> tuple[str, ...]:
 
 
 def _refuse_older(pointer: Pointer, bundle: Bundle, release: int, named: str) -> None:
-    """Refuse a bundle that is older than one that was deployed, unless it is named by its hash."""
-    why = _older(pointer, bundle, release)
-    if not why:
-        return
+    """Refuse a bundle that is older than one that was deployed, unless it is named by its hash, and one not named."""
     if len(named) >= HASH_CHARACTERS and bundle.hash.startswith(named):
+        return
+    why = _older(pointer, bundle, release)
+    if not why and named:
+        raise DeploymentError(f"{bundle.path} is not {named}, which --downgrade-to names, but {bundle.hash}.",
+                              "leave --downgrade-to out, or deploy the bundle that it names")  # fmt: skip
+    if not why:
         return
     raise DeploymentError(
         f"{bundle.path} {why}.",

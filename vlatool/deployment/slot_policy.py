@@ -19,6 +19,7 @@ from vlatool.deployment.pointer import Pointer, Slot, Trial
 from vlatool.deployment.store import LOCK_S, MAX_STARTS, Store
 from vlatool.errors import DeploymentError, GraphError, UsageError, VlatoolError
 from vlatool.runtime import load
+from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.interface import Action, Array, Policy
 
 MAX_EVENTS = 100
@@ -143,7 +144,7 @@ class SlotPolicy:
 
     def fail(self, reason: str) -> None:
         """Let the trial fail: what is outside of this policy, such as an envelope, found its actions to be wrong."""
-        self._failure = reason
+        self._failure = reason or "the controller gave no reason"
 
     def refresh(self) -> bool:
         """Open the bundle that the pointer names if it is another one; it answers from one of the next inferences on.
@@ -175,7 +176,15 @@ class SlotPolicy:
             return True
 
     def watch(self, period_s: float = 1.0) -> None:
-        """Call ``refresh`` in a thread of its own until ``close``."""
+        """Call ``refresh`` in a thread of its own until ``close``.
+
+        Args:
+            period_s: Seconds between two calls.
+
+        Raises:
+            UsageError: when the period is not a number above 0.
+        """
+        check_positive("period_s", period_s, "a number of seconds")
         self._watcher = threading.Thread(target=self._watch, args=(period_s,), daemon=True)
         self._watcher.start()
 
@@ -189,6 +198,7 @@ class SlotPolicy:
         self._end.set()
         if self._watcher is not None:
             self._watcher.join()
+        self._end_failed_trial()
         self._writer.shutdown()
         if self.on_trial:
             with contextlib.suppress(VlatoolError):
@@ -204,7 +214,13 @@ class SlotPolicy:
             self.close()
         else:
             self._end.set()
+            self._end_failed_trial()
             self._writer.shutdown()
+
+    def _end_failed_trial(self) -> None:
+        """Roll back a trial that ``fail`` has ended and no inference has come after."""
+        if self._failure and self.on_trial:
+            self._leave(self.slot, self._failure)
 
     def _start(self) -> _Running:
         """Open the active bundle, or the other one if that is not possible."""

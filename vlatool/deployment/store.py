@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle, digest_of, manifest_bytes
-from vlatool.deployment.pointer import Pointer, Slot, Trial, read_pointer, write_pointer
+from vlatool.deployment.pointer import FILES, NAMES, Pointer, Slot, Trial, read_pointer, write_pointer
 from vlatool.errors import BundleError, DeploymentError, OutputError
 from vlatool.files.durable import remove_tree, sync_folder, sync_tree, write_file
 from vlatool.files.verified_read import open_inside
@@ -27,6 +27,8 @@ LOCK_S = 10.0
 """Seconds for which a controller waits for another process that changes the pointer."""
 BLOCK = 1 << 20
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+MOUNT_NAMES = ("lost+found",)
+"""What a file system has in its root: a store may be a partition of its own."""
 VARIABLE = "VLATOOL_STORE"
 
 
@@ -84,12 +86,29 @@ class Store:
                 os.close(handle)
 
     def make(self) -> None:
-        """Make the directory of the store; raises OutputError when that is not possible."""
+        """Make the directory of the store.
+
+        Raises:
+            DeploymentError: when it is there and holds something else: a bundle, a policy, files of a user.
+            OutputError: when it cannot be made.
+        """
         with _write_errors(self.path):
+            self._refuse_other_files()
             missing = [parent for parent in (self.path, *self.path.parents) if not parent.exists()]
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             for folder in missing:
                 sync_folder(folder.parent)
+
+    def _refuse_other_files(self) -> None:
+        """Refuse a directory with other files than an interrupted first deployment or a file system leaves there."""
+        if self.path.exists() and not self.path.is_dir():
+            raise DeploymentError(f"{self.path} is not a store: it is a file.", "name a directory: --store DIR")
+        names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
+        others = {name for name in names - {*NAMES, *MOUNT_NAMES} if not name.startswith(".")}
+        if others and names.isdisjoint(FILES):
+            found = ", ".join(sorted(others)[:6])
+            raise DeploymentError(f"{self.path} is not a store: it holds other files (found: {found}).",
+                                  "name an empty directory, or one that is not there yet: --store DIR")  # fmt: skip
 
     def write(self, pointer: Pointer) -> Pointer:
         """Replace the pointer at once, while ``lock`` is held; the directory is flushed when this returns."""

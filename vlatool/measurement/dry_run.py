@@ -16,7 +16,7 @@ from vlatool.errors import GateFailed
 from vlatool.runtime import load
 from vlatool.runtime.interface import POLICY
 from vlatool.runtime.rungs import PolicyRung
-from vlatool.runtime.stack import Fallback, Stack, TickRecord
+from vlatool.runtime.stack import Fallback, Stack, TickRecord, rate_factor
 
 OBSERVATIONS = 16
 
@@ -74,7 +74,7 @@ class DryRun:
     Args:
         bundle: Name and version of the bundle.
         robot: Whose limits are kept; empty for none.
-        period_ms: Control period.
+        period_ms: Control period of the robot.
         deadline_ms: Time in which a control step is answered.
         layers: Layers from the robot to the graphs, each with what it does.
         inference: Times of ``infer`` of the open bundle alone.
@@ -130,7 +130,8 @@ def dry_run(
         UsageError, SpecError, BundleError, GraphError: as ``vlatool.runtime.load`` does.
     """
     plain = load(path, engine=engine, threads=threads, seed=0)
-    period_ms = 1000 / plain.spec.rate
+    rate = plain.spec.rate * rate_factor(controllers)
+    period_ms = 1000 / rate
     limit_ms = period_ms if deadline_ms is None else deadline_ms
     second = None if fallback is None else load(fallback, threads=threads, seed=0)
     records: list[TickRecord] = []
@@ -143,7 +144,7 @@ def dry_run(
     observations = observations_for(bundle, OBSERVATIONS)
     inference = Spread.of(_times(plain.infer, observations, steps))
     others = [] if second is None else [Spread.of(_times(second.infer, observations, steps))]
-    answers = _paced(stack, observations, steps)
+    answers = _paced(stack, observations, steps, rate)
     stack.close()
     return DryRun(
         f"{bundle.manifest.name} {bundle.manifest.version}",
@@ -168,11 +169,11 @@ def _times(call: Any, observations: Sequence[Any], count: int) -> list[float]:
     return times[len(observations) :]
 
 
-def _paced(stack: Stack, observations: Sequence[Any], count: int) -> list[float]:
-    """Return the milliseconds of control steps at the rate of the robot, from the call; the first one apart."""
+def _paced(stack: Stack, observations: Sequence[Any], count: int, rate: float) -> list[float]:
+    """Return the milliseconds of control steps at the rate of the robot in Hz, from the call; the first one apart."""
     times, begin = [], time.monotonic()
     for number in range(count + 1):
-        time.sleep(max(0.0, begin + number / stack.spec.rate - time.monotonic()))
+        time.sleep(max(0.0, begin + number / rate - time.monotonic()))
         called = time.perf_counter_ns()
         stack.act(observations[number % len(observations)])
         times.append((time.perf_counter_ns() - called) / 1e6)

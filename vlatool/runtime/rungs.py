@@ -196,6 +196,25 @@ class Stop(Hold):
         super().__init__(action, ramp=ramp, neutral=neutral, source=STOP)
 
 
+def start_pose(pose: Any, action: TensorSpec) -> Array:
+    """Return the pose that is held before the first action: (A,) float32.
+
+    Raises:
+        UsageError: when it is not one finite number for each element of the action.
+    """
+    try:
+        array = np.asarray(pose, np.float32)
+    except (TypeError, ValueError):
+        array = np.asarray(np.nan)
+    if array.shape != (action.robot_width,) or not np.isfinite(array).all():
+        raise UsageError(
+            f"The start is {pose!r:.80}; allowed: {action.robot_width} finite numbers, one for each element of "
+            f"'{action.name}'.",
+            "pass start=[...] with the pose of the robot",
+        )
+    return array
+
+
 def neutral_index(action: TensorSpec, label: str = "") -> int:
     """Return the index of the discrete action without motion: that of a label, or of the only one in ``NO_MOTION``.
 
@@ -204,13 +223,16 @@ def neutral_index(action: TensorSpec, label: str = "") -> int:
             motion.
     """
     if action.kind != "discrete":
-        raise UsageError(f"'{action.name}' is not discrete: no label of it means no motion.", "leave neutral out")
+        raise UsageError(
+            f"neutral is {label!r}, and the action '{action.name}' is not discrete: it has no label without motion.",
+            "leave neutral out",
+        )
     found = [index for index, name in enumerate(action.labels)
              if (name == label if label else name.lower() in NO_MOTION)]  # fmt: skip
     if len(found) != 1:
         known = ", ".join(action.labels[:20])
         raise UsageError(
             f"{len(found)} of the labels of '{action.name}' are {label or 'known to mean no motion'}; labels: {known}.",
-            "name the one without motion: Fallback(neutral=LABEL)",
+            "name the one without motion: Fallback(neutral=LABEL), or --neutral LABEL",
         )
     return found[0]

@@ -10,6 +10,7 @@ a clock that is set back by less than a minute: its samples count as late from t
 from __future__ import annotations
 
 import math
+import numbers
 import time
 import zlib
 from bisect import bisect_left, bisect_right
@@ -64,8 +65,7 @@ class SensorLimits:
         check_positive("latency_s", self.latency_s, "a number of seconds", zero=True)
         check_positive("settle_s", self.settle_s, "a number of seconds", zero=True)
         check_whole("capacity", self.capacity, 2)
-        if self.method not in (NEAREST, LINEAR, *ROTATIONS):
-            raise UsageError.unknown(f"There is no method '{self.method}'", self.method, (NEAREST, LINEAR, *ROTATIONS))
+        _check_method(self.method, (NEAREST, LINEAR, *ROTATIONS))
 
 
 class Sample(NamedTuple):
@@ -105,6 +105,9 @@ class SensorBuffer:
         Args:
             stamp: Time of the measurement by the sensor's own clock, in seconds; the arrival counts when None.
             arrival: When it came, by the monotonic clock; now when None.
+
+        Raises:
+            UsageError: when a time is not a number.
         """
         arrival = self._clock() if arrival is None else arrival
         moment, value = self._measured(stamp, arrival), _copied(value)
@@ -122,6 +125,9 @@ class SensorBuffer:
 
     def _measured(self, stamp: float | None, arrival: float) -> float | None:
         """Return when a sample was measured, by the monotonic clock; None where nobody knows."""
+        for name, value in (("stamp", stamp), ("arrival", arrival)):
+            if value is not None and not isinstance(value, numbers.Real):
+                raise UsageError(f"{name} is {value!r:.80}; allowed: a number of seconds.", "convert it to float")
         if not math.isfinite(arrival) or (stamp is not None and not math.isfinite(stamp)):
             return None
         late = 0.0 if stamp is None else self._offset.lateness(stamp, arrival)
@@ -142,6 +148,9 @@ class SensorBuffer:
         """Return the value at a time of the monotonic clock, None without samples; beyond the ends, the sample there.
 
         With ``nearest``, the later of two samples that are equally near.
+
+        Raises:
+            DataError: when the method is another one, and the samples are not numbers of one shape that it takes.
         """
         if not self._times:
             return None
@@ -247,6 +256,9 @@ class Sensors:
         check_positive("skew_s", skew_s, "a number of seconds", optional=True)
         if not limits:
             raise UsageError("No sensor is named.", "name one for each input")
+        if not isinstance(limits, Mapping) or not all(isinstance(each, SensorLimits) for each in limits.values()):
+            raise UsageError(f"limits is {limits!r:.80}; allowed: the SensorLimits of each input, by name.",
+                             'pass {"state": SensorLimits(stale_s=0.1)}')  # fmt: skip
         self.buffers = {name: SensorBuffer(each, clock) for name, each in limits.items()}
         self._skew_s, self._clock = skew_s, clock
 
@@ -261,7 +273,11 @@ class Sensors:
         return self.buffers[name].add(value, stamp, arrival)
 
     def read(self) -> Reading:
-        """Return the values at the newest time for which every sensor has a sample, with what is wrong with them."""
+        """Return the values at the newest time for which every sensor has a sample, with what is wrong with them.
+
+        Raises:
+            DataError: when nothing lies between two samples of a sensor that is not of the method ``nearest``.
+        """
         now = self._clock()
         newest = [buffer.newest for buffer in self.buffers.values() if buffer.newest is not None]
         moment = min([now, *newest])
@@ -270,10 +286,14 @@ class Sensors:
         ages = {name: now - sample.oldest for name, sample in there.items()}
         times = [sample.time for sample in there.values()]
         skew = max(times, default=0.0) - min(times, default=0.0)
-        problems = [*(f"'{name}' has no sample" for name in samples if name not in there), *self._stale(ages)]
+        problems = [*(self._missing(name) for name in samples if name not in there), *self._stale(ages)]
         if self._skew_s is not None and skew > self._skew_s:
             problems.append(f"the values are {skew:.3g} s apart; allowed: {self._skew_s:g} s")
         return Reading({name: each.value for name, each in there.items()}, moment, ages, skew, tuple(problems))
+
+    def _missing(self, name: str) -> str:
+        dropped = self.buffers[name].dropped
+        return f"'{name}' has no sample" + (f" that counts yet; dropped: {dropped}" if dropped else "")
 
     def _stale(self, ages: Mapping[str, float]) -> list[str]:
         limits = {name: buffer.limits.stale_s for name, buffer in self.buffers.items()}
@@ -307,8 +327,11 @@ def fuse(samples: Sequence[tuple[Any, float, float]], half_life_s: float, method
         method: ``linear``, or a form of ``ROTATIONS``, whose mean is taken along shortest arcs, in order.
 
     Raises:
-        DataError: when there is nothing to fuse: no sample, no trust, or a value that is not finite.
+        DataError: when there is nothing to fuse: no sample, no trust, or a value that is not finite; or values of
+            several shapes.
+        UsageError: when the method is unknown.
     """
+    _check_method(method, (LINEAR, *ROTATIONS))
     check_positive("half_life_s", half_life_s, "a number of seconds")
     weights = [trust * 2.0 ** (-max(0.0, age) / half_life_s) for _, age, trust in samples]
     values = [np.asarray(value, np.float64) for value, _, _ in samples]
@@ -323,13 +346,32 @@ def fuse(samples: Sequence[tuple[Any, float, float]], half_life_s: float, method
     return mean
 
 
+def _check_method(method: str, known: Sequence[str]) -> None:
+    if method not in known:
+        raise UsageError.unknown(f"There is no method '{method}'", method, known)
+
+
 def _between(before: Any, after: Any, share: float, method: str) -> Array:
-    """Return the value at a share of the way between two."""
-    one, other = np.asarray(before), np.asarray(after)
+    """Return the value at a share of the way between two; raises DataError where nothing lies between them."""
+    one, other = _numbers(before, method), _numbers(after, method)
+    if one.shape != other.shape:
+        raise DataError(f"Two values of a sensor have the shapes {one.shape} and {other.shape}.",
+                        "give samples of one shape")  # fmt: skip
     if method == LINEAR:
-        return np.asarray(one + (other - one) * share, np.result_type(one, np.float32))
+        return np.asarray(one + (other - one) * share, one.dtype)
     turned = slerp(to_quaternions(one, method), to_quaternions(other, method), share)
-    return convert_rotation(turned, "quaternion_xyzw", method, "keep").astype(np.result_type(one, np.float32))
+    return convert_rotation(turned, "quaternion_xyzw", method, "keep").astype(one.dtype)
+
+
+def _numbers(value: Any, method: str) -> Array:
+    """Return a value as an array of floats, so that differences of unsigned integers do not wrap around."""
+    array = np.asarray(value)
+    wanted = ROTATIONS.get(method)
+    if array.dtype.kind not in "iuf" or (wanted and array.shape[-1:] != (wanted,)):
+        elements = f"{wanted} numbers" if wanted else "numbers"
+        raise DataError(f"Between samples of {array.dtype} {array.shape} the method '{method}' knows no value; it "
+                        f"takes {elements}.", "use the method 'nearest', or the one of such values")  # fmt: skip
+    return array.astype(np.result_type(array, np.float32))
 
 
 def _copied(value: Any) -> Any:

@@ -8,6 +8,7 @@ control step and gives a record of it to a sink.
 from __future__ import annotations
 
 import gc
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +21,7 @@ from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError
 from vlatool.files.validate import short_repr
 from vlatool.runtime.arguments import check_positive
-from vlatool.runtime.control import build_layer, check_order, layers, options_of, takes_delay
+from vlatool.runtime.control import build_layer, check_order, layers, options_of
 from vlatool.runtime.control._elements import rotations_of
 from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.chunked import ChunkQueue
@@ -28,7 +29,7 @@ from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.control.fallback import HOLD_S, FallbackLadder
 from vlatool.runtime.interface import FALLBACK, STOP, Array, Controller, Origin, Policy, layers_of, origin_of
 from vlatool.runtime.policy import BundlePolicy
-from vlatool.runtime.rungs import ChunkRung, Hold, PolicyRung, Rung, Stop
+from vlatool.runtime.rungs import ChunkRung, Hold, PolicyRung, Rung, Stop, start_pose
 
 SWITCH_S = 0.0005
 """Longest that one Python thread may keep another from running, where there is a deadline: Python's own 5 ms would be
@@ -257,9 +258,11 @@ def build_stack(
         UsageError: when a value or a name is not allowed, or the layers make no sense together.
         SpecError: when the rate of the spec is unknown, and something needs it.
     """
+    _check_layers(controllers, envelope, telemetry)
     options = fallback if isinstance(fallback, Fallback) else Fallback(fallback)
     entries, chosen = layers(controllers), options_of(controllers)
-    check_deadline(policy.spec, deadline_ms, waits=not any(takes_delay(entry) for entry in entries))
+    waits = not any(given.get("background") for given in chosen.values())
+    check_deadline(policy.spec, deadline_ms, waits=waits, factor=rate_factor(controllers))
     own_ms = policy_ms(deadline_ms, options) if options.policy is not None else 0.0
     falls_back = deadline_ms is not None or fallback is not None
     wrappers = [entry for entry in entries if not hasattr(entry, "act")]
@@ -296,6 +299,24 @@ def _enveloped(controller: Controller, spec: PolicySpec, envelope: str | Wrapper
     return wrapped
 
 
+def _check_layers(controllers: Any, envelope: Any, telemetry: Any) -> None:
+    """Refuse arguments of another type than those of ``build_stack``; raises UsageError naming the first."""
+    listed = isinstance(controllers, Sequence) and not isinstance(controllers, str)
+    if not listed or not all(isinstance(name, str) for name in controllers):
+        raise UsageError(f"controllers is {controllers!r:.80}; allowed: a list of names.", 'pass controllers=["rtc"]')
+    if envelope is not None and not isinstance(envelope, str) and not callable(envelope):
+        raise UsageError(f"envelope is {envelope!r:.80}; allowed: the name of a robot, or a function that wraps a "
+                         "controller.", 'pass envelope="franka-panda"')  # fmt: skip
+    if telemetry is not None and not callable(telemetry):
+        raise UsageError(f"telemetry is {telemetry!r:.80}; allowed: a function that takes a record.",
+                         "pass telemetry=records.append")  # fmt: skip
+
+
+def rate_factor(controllers: Sequence[str]) -> int:
+    """Return the control rate of the robot by that of the policy: more than 1 with an interpolation."""
+    return math.prod(given.get("factor", 1) for given in options_of(controllers).values())
+
+
 def _limited(policy: Policy, deadline_ms: float | None, clock: Callable[[], float]) -> Policy:
     """Return a policy with the check of its actions, which an open bundle has already, and with its deadline."""
     checked = policy if isinstance(policy, BundlePolicy) else CheckedPolicy(policy)
@@ -310,26 +331,33 @@ def _ladder(
         check_same_actions(spec, options.policy.spec)
         second = ChunkQueue(_limited(options.policy, deadline_ms, clock), clock=clock)
         rungs.append(PolicyRung(second, FALLBACK))
+    start = None if options.start is None else start_pose(options.start, spec.action)
     ramp = max(1, round(options.ramp_s * spec.rate))
     steps = max(1, round(options.hold_s * spec.rate))
     rungs += [Hold(spec.action, steps, ramp=ramp, neutral=options.neutral),
               Stop(spec.action, ramp=ramp, neutral=options.neutral)]  # fmt: skip
     return FallbackLadder(player, rungs, misses=options.misses, window=options.window, recover=options.recover,
-                          latch=options.latch, start=options.start, clock=clock)  # fmt: skip
+                          latch=options.latch, start=start, clock=clock)  # fmt: skip
 
 
-def check_deadline(spec: PolicySpec, deadline_ms: float | None, *, waits: bool = True) -> None:
+def check_deadline(spec: PolicySpec, deadline_ms: float | None, *, waits: bool = True, factor: int = 1) -> None:
     """Refuse a deadline that is not a number above 0 or, where a control step waits for it, longer than the step.
+
+    Args:
+        factor: Control steps of the robot for each one of the policy.
 
     Raises:
         UsageError: naming the deadline and what is allowed.
     """
     check_positive("deadline_ms", deadline_ms, "a number of milliseconds", optional=True)
-    if deadline_ms is not None and waits and spec.control_hz and deadline_ms > (period := 1000 / spec.control_hz):
+    if deadline_ms is None or not waits or not spec.control_hz:
+        return
+    if deadline_ms > (period := 1000 / (spec.control_hz * factor)):
         raise UsageError(
             f"The deadline of {deadline_ms:g} ms is longer than the control period of {period:g} ms, and the "
             "controller waits for each inference: the next step would come before this one has its action.",
-            f"pass deadline_ms up to {period:g}, or a controller that acts while the policy infers",
+            f"pass deadline_ms up to {period:g}, or a controller that acts while the policy infers: "
+            "rtc:background=true",
         )
 
 

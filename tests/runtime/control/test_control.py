@@ -129,6 +129,9 @@ def test_wrappers_are_put_around_the_policy_and_the_controller_in_their_order():
     ("names", "delayed", "message"),
     [(("lat",), False, "Unknown controller 'lat'; did you mean 'late'"),
      (("chunked", "late"), False, "Both chunked and late play the chunks of the policy"),
+     (("rtc", "rtc"), False, "The controller rtc is named twice"),
+     (("rtc:blend=1", "shifted", "rtc:blend=2"), False, "The controller rtc is named twice"),
+     (("shifted", "shifted"), False, "The controller shifted is named twice"),
      (("every-step",), True, "The controller every-step waits for each inference: its actions cannot come late"),
      (("chunked",), True, "The controller chunked waits for each inference")],
 )  # fmt: skip

@@ -60,8 +60,8 @@ def layers(names: Sequence[str], *, delayed: bool = False) -> list[type]:
         delayed: Whether the controller should act while the policy infers.
 
     Raises:
-        UsageError: when a name, an option or a value is unknown, two entries play the policy, or the player does not
-            support a delay.
+        UsageError: when a name, an option or a value is unknown, an entry is named twice, two entries play the policy,
+            or the player does not support a delay.
     """
     return check_order([layer.entry for layer in _layers(names, delayed)])
 
@@ -126,9 +126,11 @@ def takes_delay(entry: type) -> bool:
 def _layers(names: Sequence[str], delayed: bool) -> list[_Layer]:
     if isinstance(names, str):
         raise UsageError(f"The controllers are the text '{names}'; allowed: names.", f"pass controllers=['{names}']")
-    found = dict(_named(name) for name in names)
-    if len(found) < len(names):
-        raise UsageError(f"A controller is named twice in {list(names)}.", "name each once, with all its options")
+    found: dict[str, _Layer] = {}
+    for name, layer in map(_named, names):
+        if name in found:
+            raise UsageError(f"The controller {name} is named twice.", "name each once, with all of its options")
+        found[name] = layer
     players = [name for name, layer in found.items() if _layer(layer.entry) == 1]
     if len(players) > 1:
         raise UsageError(f"Both {players[0]} and {players[1]} play the chunks of the policy.", "name one of them")
