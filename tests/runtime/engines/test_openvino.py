@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -218,7 +219,7 @@ def test_where_openvino_has_no_kernel_the_error_says_what_to_do(tmp_path: Path, 
         def read_model(self, *_):
             raise RuntimeError("bad combination")
 
-    monkeypatch.setattr("openvino.Core", Refusing)
+    monkeypatch.setattr("vlatool.runtime.engines.openvino.openvino_core", Refusing)
     monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
     if confined:
         monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", confined)
@@ -226,3 +227,23 @@ def test_where_openvino_has_no_kernel_the_error_says_what_to_do(tmp_path: Path, 
         OpenvinoSession(tmp_path / "any.onnx")
     assert re.search(says, caught.value.fix)
     assert "--layout ort" in caught.value.fix, "the variable may stand for a board, so that unsetting it is no remedy"
+
+
+SIGNALLED = """\
+import gc, signal, sys, threading
+from pathlib import Path
+from vlatool.runtime.engines.openvino import OpenvinoSession
+
+sessions = [OpenvinoSession(Path(sys.argv[1]), 1)]
+given_up = threading.Thread(target=lambda: (sessions.clear(), gc.collect()))
+given_up.start()
+given_up.join()
+signal.signal(signal.SIGUSR1, lambda *_: print("handled"))
+signal.raise_signal(signal.SIGUSR1)
+"""
+
+
+def test_a_signal_is_handled_after_another_thread_has_given_up_the_last_session(tmp_path: Path):
+    model = graph(tmp_path / "m.onnx", SUM)
+    done = subprocess.run([sys.executable, "-c", SIGNALLED, model], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "handled\n"), done.stderr

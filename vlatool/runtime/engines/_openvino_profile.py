@@ -11,14 +11,15 @@ import numpy as np
 from vlatool.errors import GraphError
 from vlatool.machine.engine_calls import REMEDY
 from vlatool.runtime.engine import BFLOAT16, FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
+from vlatool.runtime.engines._openvino_core import openvino_core
 
 
 class OpenvinoProfiled:
     """OpenVINO counts the time of every node of a compiled model on request."""
 
-    def __init__(self, openvino: Any, path: Path, compiled: Callable[[Any, Any], Any]) -> None:
+    def __init__(self, path: Path, compiled: Callable[[Any, Any], Any]) -> None:
         try:
-            core = openvino.Core()
+            core = openvino_core()
             model = core.read_model(str(path))
             known = {node.get_friendly_name(): str(node.get_type_name()) for node in model.get_ops()}
             self._compiled = compiled(core, model)

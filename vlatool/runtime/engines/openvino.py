@@ -20,6 +20,7 @@ from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Stages
+from vlatool.runtime.engines._openvino_core import openvino_core
 from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, precision
 from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
@@ -83,7 +84,7 @@ class OpenvinoSession(Engine):
         settings = settings_for(threads, compute)
         content = path if opened is None else opened
         try:
-            core = openvino.Core()
+            core = openvino_core()
             model = core.read_model(io.BytesIO(content) if isinstance(content, bytes) else str(content))
             declared = [[port.get_any_name() for port in ports] for ports in (model.inputs, model.outputs)]
             self._compiled = compile_for_cpu(core, model, settings)
@@ -240,9 +241,9 @@ class OpenvinoSession(Engine):
         Raises:
             MissingExtra: when openvino is not installed.
         """
-        openvino = require("openvino", "openvino")
+        require("openvino", "openvino")
         try:
-            core = openvino.Core()
+            core = openvino_core()
             compiled = core.compile_model(core.read_model(io.BytesIO(arithmetic.model())), DEVICE, settings_for(1, ""))
             return arithmetic.exactness(float(compiled(arithmetic.operand())[0].min()))
         except Exception:  # the seam: older processors lack the kernels of any int8 product
@@ -274,7 +275,7 @@ class OpenvinoSession(Engine):
     def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
         """Open a graph with OpenVINO's counters of every node on; raises GraphError when OpenVINO refuses it."""
         settings = {**settings_for(threads, compute), "PERF_COUNT": True}
-        return OpenvinoProfiled(cls.library(), path, lambda core, model: compile_for_cpu(core, model, settings))
+        return OpenvinoProfiled(path, lambda core, model: compile_for_cpu(core, model, settings))
 
     @classmethod
     def node_precision(cls, node: Node) -> str:
