@@ -20,9 +20,9 @@ import numpy as np
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError
 from vlatool.files.validate import short_repr
+from vlatool.runtime.action_elements import rotations_of
 from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.control import build_layer, check_order, layers, options_of
-from vlatool.runtime.control._elements import rotations_of
 from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline

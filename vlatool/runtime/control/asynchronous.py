@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import UsageError
+from vlatool.runtime.action_elements import ActionElements
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.control._elements import ActionElements
 from vlatool.runtime.control._inference import BackgroundInference, Inference, PlayedInference
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import CHUNK, HOLD, POLICY, Array, Origin, Policy

@@ -9,8 +9,8 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError, fix_for, suggest
+from vlatool.runtime.action_elements import ActionElements, minimum_jerk
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.control._elements import ActionElements, minimum_jerk
 from vlatool.runtime.interface import Array, Controller, Origin, origin_of
 
 METHODS: dict[str, Callable[[float], float]] = {"linear": float, "minimum_jerk": minimum_jerk}

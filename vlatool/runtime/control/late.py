@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.spec import TensorSpec
+from vlatool.runtime.action_elements import ActionElements
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.control._elements import ActionElements
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import CHUNK, HOLD, Action, Array, Policy
 

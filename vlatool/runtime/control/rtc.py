@@ -10,8 +10,8 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SpecError
+from vlatool.runtime.action_elements import STOPPABLE_MODES
 from vlatool.runtime.arguments import check_whole
-from vlatool.runtime.control._elements import STOPPABLE_MODES
 from vlatool.runtime.control.asynchronous import AsynchronousController
 from vlatool.runtime.interface import Array, Policy
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError, UsageError
+from vlatool.runtime.action_elements import ActionElements, minimum_jerk
 from vlatool.runtime.arguments import check_positive
-from vlatool.runtime.control._elements import ActionElements, minimum_jerk
 from vlatool.runtime.converter import newest_moment
 from vlatool.runtime.interface import Array, Controller, Origin, origin_of
 

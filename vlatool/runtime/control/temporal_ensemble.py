@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import UsageError
-from vlatool.runtime.control._elements import ActionElements
+from vlatool.runtime.action_elements import ActionElements
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import Array, Policy
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vlatool.bundle.spec import TensorSpec
-from vlatool.runtime.control._elements import ActionElements, rotations_of
+from vlatool.runtime.action_elements import ActionElements, rotations_of
 from vlatool.runtime.control.late import hold
 from vlatool.runtime.rotation import convert_rotation, product, slerp
 from vlatool.runtime.rungs import Hold
