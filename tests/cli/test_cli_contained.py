@@ -214,6 +214,7 @@ def test_a_policy_that_hangs_can_be_ended(tmp_path, folder, number, status, says
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.soak("Ctrl-C in an export: tests/test_wrong_inputs.py")
 def test_ctrl_c_while_torch_exports_is_no_advice(tmp_path: Path, folder) -> None:
     act = f"open({str(tmp_path / 'runs')!r}, 'w').close(); import time; time.sleep(600)"
     line = [sys.executable, "-m", "vlatool", "export", str(folder(in_forward=act)), "-o", str(tmp_path / "out")]

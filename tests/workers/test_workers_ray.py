@@ -111,6 +111,7 @@ def test_two_nodes_give_the_rows_of_one_process_and_say_how_they_differ(nodes: N
     assert disturbances_of(bundle, asked[0], context)[-1] == "push"
 
 
+@pytest.mark.soak("the rows of two nodes; a command that is killed: tests/episodes/test_episodes_kept.py")
 def test_a_worker_that_is_killed_loses_nothing(nodes: Nodes, bundle: Bundle):
     asked = jobs(bundle.path.parent / "policy", 16)
     told: list[str] = []
