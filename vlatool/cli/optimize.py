@@ -132,13 +132,11 @@ def optimize(
         inputs = (source, recipe, file_or_none(profile), cache, calibration, evaluation)
         refuse_existing(output, force, *inputs, kind=BUNDLE)
     board = load_profile(profile) if profile else None
-    limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
     shares = {"max_distance": max_distance, "max_motion": max_motion, "worst_task": worst_task}
-    asked = _limits(max_drop, shares, accept, limits)
-    effort: dict[str, Any] = {
-        "episodes": episodes, "iterations": iterations, "threads": threads, "every_candidate": every_candidate,
-        "environment_timeout": environment_timeout,
-    }  # fmt: skip
+    board_limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
+    asked = _limits(max_drop, shares, accept, board_limits)
+    effort: Any = {"episodes": episodes, "iterations": iterations, "threads": threads,
+                   "every_candidate": every_candidate, "environment_timeout": environment_timeout}  # fmt: skip
     recordings = RecordingOptions(str(calibration or ""), str(evaluation or ""), tuple(map_names or ()))
     chosen = _recipe(recipe, source_stage(source).with_recordings(recordings), board, asked, _given(effort))
     pruning = _pruning(chosen.pruning, trials, train_steps, study)

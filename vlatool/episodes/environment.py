@@ -195,7 +195,7 @@ def _takes_seed(reset: Any) -> bool:
 def _describe(value: Any) -> str:
     """Return what something is, as a part of a sentence."""
     if isinstance(value, tuple | list):
-        return f"{amount(len(value), 'value')}"
+        return amount(len(value), "value")
     if isinstance(value, np.ndarray):
         return f"an array of {value.dtype} with the shape {list(value.shape)}"
     name = type(value).__name__

@@ -1,7 +1,7 @@
 """Files and directories that are on the disk, and not only in its cache, when a function returns.
 
 A rename is durable once its directory is flushed (``fsync(2)``). Every change goes through ``os`` by path, so that the
-order of the calls can be recorded and cut at each point (``tests/validation/soak/update_crashes.py``).
+order of the calls can be recorded and cut at each point (``tests/validation/updates/update_crashes.py``).
 """
 
 from __future__ import annotations

@@ -80,9 +80,6 @@ def load(
 ) -> Policy | Stack:
     """Load a bundle, verify it, open its graphs and warm them up.
 
-    The last five arguments put layers around the policy, as ``vlatool.runtime.stack`` orders them; with any of them, a
-    controller is returned (``Stack``: ``act`` for each control step, ``reset``), else the policy.
-
     Args:
         path: The bundle directory.
         engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty or ``auto``.
@@ -92,23 +89,16 @@ def load(
         golden_tolerance: Largest relative L2 difference between the recorded golden action and this machine's, as the
             graphs give it and in physical units; what was measured of each when the bundle was made when None.
         accept: Names of findings in the manifest that are overruled, see ``vlatool inspect``.
-        first_run_s: Seconds that an inference of the warm-up may take before it is stopped. Inside this process ONNX
-            Runtime can only be stopped between two nodes of a graph: one node that takes hours is waited for, by
-            Ctrl-C as well. OpenVINO is not waited for, but may compute on until the process ends. The opening of a
-            graph cannot be stopped.
+        first_run_s: Seconds that an inference of the warm-up may take before it is stopped. ONNX Runtime can only be
+            stopped between two nodes: one that takes hours is waited for, by Ctrl-C as well. OpenVINO is not waited
+            for, but may compute on until the process ends. The opening of a graph cannot be stopped.
         memory_mb: Most that inputs and outputs of a graph may declare, and that the probe may take, in 10^6 bytes;
             2,000 and eight times the size of the graphs when None.
         probe: Do the first run in a child process, limited in time and memory, before this process opens a graph: for
             bundles of others. Whatever the child does, it is killed after ``first_run_s`` and 60 s for its start. Takes
             as long as loading twice and starting Python.
-        controllers: Names of entries of the kind ``control``: what plays the policy, and wrappers.
-        envelope: Robot whose limits no action leaves, by name; or a controller wrapper, called with the controller.
-        deadline_ms: Time until ``act`` returns, in milliseconds, whatever the engine does: a late inference is stopped
-            and never used, and a fallback answers. Lowers Python's switch interval and freezes its garbage collector
-            (``stack.prepare_process``).
-        fallback: What acts without an action in time, beside the rest of the last chunk, a hold and a stop: a second
-            bundle, by its directory, another policy, or a ``vlatool.runtime.stack.Fallback``.
-        telemetry: Called with a ``vlatool.runtime.stack.TickRecord`` after each control step.
+        controllers, envelope, deadline_ms, fallback, telemetry: Layers around the policy (``stack.build_stack``); with
+            any of them a ``Stack`` is returned. ``fallback`` may be the directory of a second bundle, too.
 
     Raises:
         BundleError: the directory is missing, incomplete, changed or too new.
@@ -118,11 +108,6 @@ def load(
         UsageError: an argument is invalid.
         MissingExtra: the engine is not installed.
         InstallationError: vlatool and vlatool-runtime are installed side by side.
-
-    Example:
-        >>> policy = load("out/vln-babyai")                                            # doctest: +SKIP
-        >>> policy.infer({"image": frames, "instruction": "go to the red ball"}).labels  # doctest: +SKIP
-        ('forward',)
     """
     from vlatool.bundle.bundle import Bundle
 
@@ -139,13 +124,18 @@ def load(
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
     bundle.verify()
     policy.warm_up(warmup, golden_tolerance, first_run_s)
-    if all(layer is None for layer in (controllers, envelope, deadline_ms, fallback, telemetry)):
+    layers = {"controllers": controllers, "envelope": envelope, "deadline_ms": deadline_ms, "telemetry": telemetry}
+    if fallback is None and all(layer is None for layer in layers.values()):
         return policy
-    from vlatool.runtime.stack import build_stack, prepare_process
-
     if isinstance(fallback, str | os.PathLike):
         fallback = load(fallback, threads=threads, seed=seed, accept=accept)
-    if deadline_ms is not None:
+    return _stack_of(policy, fallback=fallback, **layers)
+
+
+def _stack_of(policy: Policy, **layers: Any) -> Stack:
+    """Return the layers around a policy, in a process that is prepared for a deadline."""
+    from vlatool.runtime.stack import build_stack, prepare_process
+
+    if layers["deadline_ms"] is not None:
         prepare_process()
-    return build_stack(policy, controllers=controllers or (), envelope=envelope, deadline_ms=deadline_ms,
-                       fallback=fallback, telemetry=telemetry)  # fmt: skip
+    return build_stack(policy, **{**layers, "controllers": layers["controllers"] or ()})

@@ -252,7 +252,17 @@ def build_stack(
     telemetry: Sink | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Stack:
-    """Return the layers around a policy; see ``vlatool.runtime.load``.
+    """Return the layers around a policy.
+
+    Args:
+        controllers: Names of entries of the kind ``control``: what plays the policy, and wrappers.
+        envelope: Robot whose limits no action leaves, by name; or a controller wrapper, called with the controller.
+        deadline_ms: Time until ``act`` returns, in milliseconds, whatever the engine does: a late inference is stopped
+            and never used, and a fallback answers. ``load`` also calls ``prepare_process``.
+        fallback: What acts without an action in time, beside the rest of the last chunk, a hold and a stop: another
+            policy, or a ``Fallback``.
+        telemetry: Called with a ``TickRecord`` after each control step.
+        clock: Returns seconds.
 
     Raises:
         UsageError: when a value or a name is not allowed, or the layers make no sense together.
