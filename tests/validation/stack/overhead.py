@@ -2,6 +2,7 @@
 
     python tests/validation/stack/overhead.py BUNDLE --pairs 20000
     python tests/validation/stack/overhead.py --small --pairs 20000     # a product of 7 x 7, within a robot's envelope
+    python tests/validation/stack/overhead.py --layers                  # each layer of it in a loop of its own
 
 Deadline, fallback and telemetry are on. Both calls of a pair get the same observation; who goes first alternates. A
 pair counts where the stack infers. The processor's time is that of all threads of the process, which neighbours do not
@@ -11,6 +12,7 @@ lengthen; the rest is by the clock.
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import tempfile
 import time
@@ -28,7 +30,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.data import observations_for
 from vlatool.runtime import load
-from vlatool.runtime.envelope import RobotLimits
+from vlatool.runtime.control.chunked import ChunkQueue
+from vlatool.runtime.control.deadline import Deadline
+from vlatool.runtime.envelope import RobotLimits, envelope_of
 from vlatool.runtime.stack import Fallback, Stack
 
 SHARES = (10, 50, 99, 99.9)
@@ -86,23 +90,57 @@ def differences(
             "the same of the processor's time": whole_used - bare_used}  # fmt: skip
 
 
+def layers(path: str, pose: dict[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
+    """Return microseconds of each call in a loop of its own: the engine, then one layer more each time.
+
+    The clock of the envelope goes on by a control period with each step.
+    """
+    plain, inside = (load(path, threads=1, seed=0) for _ in range(2))
+    deadline, player = Deadline(inside, 0.9e3 / plain.spec.rate), ChunkQueue(load(path, threads=1, seed=0))
+    step = plain.program.steps[0]
+    session = getattr(plain.program.sessions[step.graph], "_session")  # noqa: B009
+    feeds = {name: plain.encode(pose)[value] for name, value in step.feeds.items()}
+    ticks = itertools.count()
+    envelope = envelope_of(plain.spec, RobotLimits.named(ROBOT), clock=lambda: next(ticks) / plain.spec.rate)
+    envelope.start(pose["q"].tolist())
+    action = plain.infer(pose).chunk[0]
+    calls = {
+        "bare run()": lambda: session.run(None, feeds), "infer()": lambda: plain.infer(pose),
+        "a player": lambda: player.act(pose), "infer() with a deadline": lambda: deadline.infer(pose),
+        "an envelope's step": lambda: envelope.step(action),
+    }  # fmt: skip
+    found = {}
+    for name, call in calls.items():
+        times = []
+        for _ in range(count + 200):
+            begin = time.perf_counter_ns()
+            call()
+            times.append((time.perf_counter_ns() - begin) / 1e3)
+        found[name] = np.array(times[200:])
+    deadline.close()
+    return found
+
+
 def main() -> None:
     """Print percentiles."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bundle", nargs="?", default="")
     parser.add_argument("--small", action="store_true", help="the small policy in the place of a bundle")
+    parser.add_argument("--layers", action="store_true", help="each layer around the small policy by itself")
     parser.add_argument("--pairs", type=int, default=20_000)
     parser.add_argument("--deadline-ms", type=float)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        if options.small:
-            pose = {"q": np.array([0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8], np.float32)}
+        pose = {"q": np.array([0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8], np.float32)}
+        if options.layers:
+            found = layers(small_bundle(Path(folder)), pose, options.pairs)
+        elif options.small:
             found = differences(small_bundle(Path(folder)), options.pairs, options.deadline_ms, ROBOT, [pose])
         else:
             found = differences(options.bundle, options.pairs, options.deadline_ms)
     for name, values in found.items():
         shown = ", ".join(f"p{share:g} {np.percentile(values, share):.1f}" for share in SHARES)
-        print(f"{name}: {shown} us ({len(values)} pairs)")
+        print(f"{name}: {shown} us (of {len(values)})")
 
 
 if __name__ == "__main__":
