@@ -98,6 +98,7 @@ PLAN = record(
 )  # fmt: skip
 PHASE = record(name=TEXT, runs=INTEGER, ms=NUMBER, shares=by_name(NUMBER), parts=by_name(NUMBER))
 SHIFT = record(recorded=TEXT, installed=TEXT)
+PART_TIME = record(part=TEXT, steps=INTEGER, mean_ms=NUMBER, p50_ms=NUMBER, p99_ms=NUMBER, max_ms=NUMBER, share=NUMBER)
 GAUGE = record(unit=TEXT, min=NUMBER, mean=NUMBER, max=NUMBER, times=many(NUMBER), values=many(NUMBER), note=TEXT)
 COUNTER = record(unit=TEXT, difference=NUMBER, seconds=NUMBER, note=TEXT)
 SLOT = record(
@@ -226,6 +227,7 @@ def _documents_of_machines() -> dict[str, Schema]:
             bundle=TEXT, robot=TEXT, period_ms=NUMBER, deadline_ms=NUMBER, layers=many(record(layer=TEXT, does=TEXT)),
             inference=SPREAD, answer=SPREAD, missed=NUMBER,
             rungs=many(record(source=TEXT, time={"anyOf": [SPREAD, {"type": "null"}]})),
+            cadence=record(parts=many(PART_TIME), misses=INTEGER),
         ),
         "simulation": document(
             "Predicted, not measured; latency_ms: value, low, high.",
