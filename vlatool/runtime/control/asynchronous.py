@@ -42,7 +42,6 @@ class AsynchronousController(ChunkQueue):
     ) -> None:
         check_whole("delay", delay, 0)
         check_whole("memory", memory, 1)
-        check_whole("execute", execute, 0, policy.spec.chunk)
         self._elements = ActionElements(policy.spec.action)
         self.background = background
         """Whether inferences run in a thread of their own."""
