@@ -6,11 +6,12 @@ Needs numpy and one inference engine; never torch, onnx, pydantic, typer, rich o
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, overload
 
 from vlatool.errors import refuse_two_distributions
-from vlatool.runtime.arguments import check_load
+from vlatool.runtime.arguments import REQUIRE, WARN, check_load
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
@@ -36,6 +37,7 @@ def load(
     first_run_s: float = ...,
     memory_mb: float | None = ...,
     probe: bool = ...,
+    engine_proof: str = ...,
 ) -> Policy: ...
 
 
@@ -52,6 +54,7 @@ def load(
     first_run_s: float = ...,
     memory_mb: float | None = ...,
     probe: bool = ...,
+    engine_proof: str = ...,
     controllers: Sequence[str] | None = ...,
     envelope: str | Wrapper | None = ...,
     deadline_ms: float | None = ...,
@@ -72,6 +75,7 @@ def load(
     first_run_s: float = FIRST_RUN_S,
     memory_mb: float | None = None,
     probe: bool = False,
+    engine_proof: str = "",
     controllers: Sequence[str] | None = None,
     envelope: str | Wrapper | None = None,
     deadline_ms: float | None = None,
@@ -97,6 +101,10 @@ def load(
         probe: Do the first run in a child process, limited in time and memory, before this process opens a graph: for
             bundles of others. Whatever the child does, it is killed after ``first_run_s`` and 60 s for its start. Takes
             as long as loading twice and starting Python.
+        engine_proof: ``record`` has the engine say in the warm-up what it runs of each graph, on what and in which
+            precision (``Policy.engine_record``); ``warn`` also warns where that is not what the bundle promises, and
+            ``require`` refuses it. This takes some milliseconds for a hundred nodes. When empty, only what an engine
+            says by itself is looked at: its providers, devices and the dtype that it was asked for.
         controllers, envelope, deadline_ms, fallback, telemetry: Layers around the policy (``stack.build_stack``); with
             any of them a ``Stack`` is returned. ``fallback`` may be the directory of a second bundle, too.
 
@@ -112,7 +120,7 @@ def load(
     from vlatool.bundle.bundle import Bundle
 
     refuse_two_distributions()
-    check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
+    check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb, engine_proof)
     engine = "" if engine == AUTO else engine
     bundle = Bundle.open_lazily(path)
     refuse_findings(bundle, accept)
@@ -121,15 +129,28 @@ def load(
         from vlatool.runtime.probe import probe as run_once
 
         run_once(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
-    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
+    traced = bool(engine_proof)
+    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb, traced=traced)
     bundle.verify()
-    policy.warm_up(warmup, golden_tolerance, first_run_s)
+    policy.warm_up(max(warmup, traced), golden_tolerance, first_run_s)
+    _check_record(policy, engine_proof)
     layers = {"controllers": controllers, "envelope": envelope, "deadline_ms": deadline_ms, "telemetry": telemetry}
     if fallback is None and all(layer is None for layer in layers.values()):
         return policy
     if isinstance(fallback, str | os.PathLike):
         fallback = load(fallback, threads=threads, seed=seed, accept=accept)
     return _stack_of(policy, fallback=fallback, **layers)
+
+
+def _check_record(policy: Policy, proof: str) -> None:
+    """Warn of an engine that did not run as asked, or refuse it; see ``engine_proof`` of ``load``."""
+    if proof not in (WARN, REQUIRE):
+        return
+    record = policy.engine_record()
+    if proof == REQUIRE:
+        record.check()
+    for problem in record.problems:
+        warnings.warn(f"{record.library}: {problem}", RuntimeWarning, stacklevel=3)
 
 
 def _stack_of(policy: Policy, **layers: Any) -> Stack:

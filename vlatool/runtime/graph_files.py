@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -19,7 +20,9 @@ WHOLE = 4 * MIB
 """Bytes of a graph up to which the engine gets its content; a larger one would be in memory twice."""
 
 
-def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: int | None) -> Any:
+def open_graph(
+    bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: int | None, traced: bool = False
+) -> Any:
     """Return the session of an engine on a graph of a bundle.
 
     The engine gets the verified content. A graph that is large or has weights beside it is opened by name, in a
@@ -28,6 +31,7 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
     Args:
         bundle: Where it is; its files are verified here.
         engine: A class of ``vlatool/runtime/engines``.
+        traced: Whether the session is to tell what it ran (``node_runs``), where the engine can.
 
     Raises:
         BundleError: when a file is not what the manifest says or is changed meanwhile, or the graph keeps weights in a
@@ -35,7 +39,8 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
         GraphError: when the engine refuses the graph.
     """
     with engine_call(engine, f"opened the graph '{graph.file.rpartition('/')[2].removesuffix('.onnx')}'"):
-        return _opened(bundle, graph, engine, threads)
+        more = {"traced": True} if traced and getattr(engine, "traces", False) else {}
+        return _opened(bundle, graph, functools.partial(engine, **more), threads)
 
 
 def _opened(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: int | None) -> Any:

@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.observation import EncodedObservation, ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
+
+if TYPE_CHECKING:
+    from vlatool.runtime.engine_record import EngineRecord
 
 FLOAT_ROUNDING = 1e-3
 """Relative difference of a float32 golden action that a different order of summation explains; observed: up to 6e-7."""
@@ -88,8 +91,13 @@ class BundlePolicy:
         threads: int | None = None,
         seed: int | None = None,
         memory_mb: float | None = None,
+        traced: bool = False,
     ) -> BundlePolicy:
-        """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``."""
+        """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``.
+
+        Args:
+            traced: Whether ``engine_record`` is to tell what ran.
+        """
         manifest = bundle.manifest
         if not manifest.graphs:
             raise no_graph_error(bundle, "run")
@@ -100,7 +108,7 @@ class BundlePolicy:
         session = engine_class(engine)
         check_files(manifest)
         sessions: dict[str, Session] = {
-            name: open_graph(bundle, graph, session, threads) for name, graph in manifest.graphs.items()
+            name: open_graph(bundle, graph, session, threads, traced) for name, graph in manifest.graphs.items()
         }
         check_graphs(manifest, sessions, limit_mb)
         outputs = [tensor.name for tensor in manifest.spec.outputs]
@@ -110,6 +118,17 @@ class BundlePolicy:
     def identity(self) -> str:
         """``sha256:...`` over all that decides how a robot behaves with this policy: for telemetry and logs."""
         return policy_identity(self.bundle)
+
+    def engine_record(self) -> EngineRecord:
+        """Return what the engine ran of each graph, on what and in which precision, against what the bundle promises.
+
+        The policy must be opened for it (``load(..., engine_proof="record")``) and have inferred once: ONNX Runtime
+        notes the nodes of the first run of each graph, and no others.
+        Where nothing has been noted, that is one of its problems.
+        """
+        from vlatool.runtime.engine_record import engine_record
+
+        return engine_record(self.engine, self.bundle.manifest.graphs, self.program.sessions)
 
     def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
         """Return the next action chunk.

@@ -19,9 +19,9 @@ from vlatool.machine.engine_calls import REMEDY
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
-from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Stages
+from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, NodeRun, Profiled, Stages
 from vlatool.runtime.engines._openvino_core import openvino_core
-from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, precision
+from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, node_runs, precision, products
 from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
 
@@ -59,6 +59,7 @@ class OpenvinoSession(Engine):
         threads: Threads; the cores that this process may use when None.
         compute: Dtype of what is not quantized: ``float32`` (also when empty) or ``bfloat16``.
         opened: What is opened instead of ``path``: the content of the file, or another name of it.
+        traced: Whether ``node_runs`` is to count the products that OpenVINO merges with others.
 
     Raises:
         GraphError: when OpenVINO refuses the file or computes in another dtype than asked for.
@@ -68,6 +69,7 @@ class OpenvinoSession(Engine):
     title = "OpenVINO"
     package = "openvino"
     extra = "openvino"
+    traces = True
     advice = "fastest on Intel"
     computes = ("float32", "bfloat16")
     confined = True
@@ -78,7 +80,12 @@ class OpenvinoSession(Engine):
     remedy = "quantize again with --reduce-range, or with --layout ort for ONNX Runtime, whose products are exact"
 
     def __init__(
-        self, path: Path, threads: int | None = None, compute: str = "", opened: Path | bytes | None = None
+        self,
+        path: Path,
+        threads: int | None = None,
+        compute: str = "",
+        opened: Path | bytes | None = None,
+        traced: bool = False,
     ) -> None:
         openvino = require("openvino", "openvino")
         settings = settings_for(threads, compute)
@@ -86,6 +93,7 @@ class OpenvinoSession(Engine):
         try:
             core = openvino_core()
             model = core.read_model(io.BytesIO(content) if isinstance(content, bytes) else str(content))
+            self._products = products(model) if traced else {}
             declared = [[port.get_any_name() for port in ports] for ports in (model.inputs, model.outputs)]
             self._compiled = compile_for_cpu(core, model, settings)
             self._request = self._compiled.create_infer_request()
@@ -179,6 +187,10 @@ class OpenvinoSession(Engine):
             self._check(feeds)
             self._request.start_async(feeds)
 
+    def node_runs(self) -> list[NodeRun]:
+        """Return the nodes of the compiled model, each as it runs once, with the kernels that OpenVINO chose."""
+        return node_runs(self._compiled, self._products)
+
     def stop(self) -> None:
         """End the run in progress between two nodes; it and later ones raise TimeoutError until ``resume``.
 
@@ -233,6 +245,11 @@ class OpenvinoSession(Engine):
                 raise GraphError(
                     f"OpenVINO failed in {self.path.name}: '{name}' is {actual}; wanted {expected}.", FEEDS
                 )
+
+    @classmethod
+    def targets(cls) -> tuple[str, ...]:
+        """Return the device."""
+        return (DEVICE,)
 
     @staticmethod
     def arithmetic() -> str:
