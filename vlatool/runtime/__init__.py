@@ -17,7 +17,8 @@ from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
 if TYPE_CHECKING:
-    from vlatool.runtime.stack import Fallback, Sink, Stack, Wrapper
+    from vlatool.runtime.stack import Fallback, Stack, Wrapper
+    from vlatool.runtime.telemetry import Sink, Telemetry
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 AUTO = "auto"
@@ -59,7 +60,7 @@ def load(
     envelope: str | Wrapper | None = ...,
     deadline_ms: float | None = ...,
     fallback: Any = ...,
-    telemetry: Sink | None = ...,
+    telemetry: Sink | Telemetry | None = ...,
 ) -> Policy | Stack: ...
 
 
@@ -80,7 +81,7 @@ def load(
     envelope: str | Wrapper | None = None,
     deadline_ms: float | None = None,
     fallback: str | os.PathLike[str] | Fallback | Any = None,
-    telemetry: Sink | None = None,
+    telemetry: Sink | Telemetry | None = None,
 ) -> Policy | Stack:
     """Load a bundle, verify it, open its graphs and warm them up.
 
