@@ -175,6 +175,12 @@ def gpus(root: Path = ROOT) -> tuple[str, ...]:
     return tuple(match[1] for match in models if match)
 
 
+def intel_devices(kind: str, root: Path = ROOT) -> list[str]:
+    """Return Intel's devices, as the kernel names them; the kind is ``drm/renderD*`` (graphics) or ``accel/accel*``."""
+    files = sorted((root / "sys/class").glob(f"{kind}/device/vendor"))
+    return [path.parts[-3] for path in files if read_text(root, path.relative_to(root).as_posix()) == "0x8086"]
+
+
 def gpu_driver(root: Path = ROOT) -> str | None:
     """Version of NVIDIA's driver in the kernel; None when it is not loaded."""
     match = re.search(r"^NVRM version:.*?\s(\d+\.\d[\d.]*)\s", read_text(root, "proc/driver/nvidia/version") or "")

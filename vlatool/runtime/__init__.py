@@ -17,12 +17,13 @@ from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
 if TYPE_CHECKING:
+    from vlatool.bundle.bundle import Bundle
     from vlatool.runtime.stack import Fallback, Stack, Wrapper
     from vlatool.runtime.telemetry import Sink, Telemetry
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 AUTO = "auto"
-"""Name that stands for the engine that a bundle was made for."""
+"""Name that stands for the engine that a bundle was made for, or another where that cannot be used."""
 
 
 @overload
@@ -87,7 +88,9 @@ def load(
 
     Args:
         path: The bundle directory.
-        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty or ``auto``.
+        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty. ``auto`` is
+            that one, too, and where it cannot be used here the first one that can, with a warning;
+            ``Policy.engine_reason`` says why.
         threads: Intra-op threads of the engine; the cores that this process may use when None.
         seed: Seed of the noise that a program draws; fresh entropy when None.
         warmup: Inferences on the golden observation before this returns (the first is the slowest).
@@ -122,9 +125,11 @@ def load(
 
     refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb, engine_proof)
-    engine = "" if engine == AUTO else engine
     bundle = Bundle.open_lazily(path)
     refuse_findings(bundle, accept)
+    reason = ""
+    if engine == AUTO:
+        engine, reason = _chosen(bundle)
     bundle.verify("data/")
     if probe:
         from vlatool.runtime.probe import probe as run_once
@@ -132,6 +137,7 @@ def load(
         run_once(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
     traced = bool(engine_proof)
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb, traced=traced)
+    policy.engine_reason = reason
     bundle.verify()
     policy.warm_up(max(warmup, traced), golden_tolerance, first_run_s)
     _check_record(policy, engine_proof)
@@ -141,6 +147,16 @@ def load(
     if isinstance(fallback, str | os.PathLike):
         fallback = load(fallback, threads=threads, seed=seed, accept=accept)
     return _stack_of(policy, fallback=fallback, **layers)
+
+
+def _chosen(bundle: Bundle) -> tuple[str, str]:
+    """Return the engine that ``auto`` stands for and why; warns where the bundle was made for another."""
+    from vlatool.runtime.engine_choice import choose_engine
+
+    choice = choose_engine(bundle.manifest)
+    if choice.replaces:
+        warnings.warn(f"engine='auto' is {choice.engine}: {choice.reason}", RuntimeWarning, stacklevel=3)
+    return choice.engine, choice.reason
 
 
 def _check_record(policy: Policy, proof: str) -> None:

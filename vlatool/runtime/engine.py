@@ -164,6 +164,9 @@ class Engine:
         cls.library()
         return None
 
+    caches: ClassVar[bool] = False
+    """Whether a session takes ``cache``, a key of what it builds from a graph, and ``shapes`` of the graph's inputs."""
+
     @classmethod
     def targets(cls) -> tuple[str, ...]:
         """Return what its nodes are to run on, as ``NodeRun.provider`` names it; empty where it does not tell."""

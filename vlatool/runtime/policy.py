@@ -16,11 +16,19 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
 from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.spec import PolicySpec
-from vlatool.errors import BundleError, GraphError, UsageError
+from vlatool.errors import BundleError, GraphError, UsageError, VlatoolError
 from vlatool.files.printable import printable
 from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.arithmetic import int8_trouble, machine
-from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, written_as_declared
+from vlatool.runtime.contract import (
+    Outputs,
+    allowed_mb,
+    check_chunk,
+    check_graphs,
+    check_sizes,
+    input_shapes,
+    written_as_declared,
+)
 from vlatool.runtime.converter import newest_moment
 from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
@@ -76,6 +84,8 @@ class BundlePolicy:
         self._sequence = 0
         self._turn = threading.RLock()  # a signal handler may call while this thread holds it
         self._busy = False
+        self.engine_reason = ""
+        """Why the engine was chosen, as a sentence; empty where it was named, or is the bundle's."""
         self.limit_s: float | None = None
         """Time limit of an inference in seconds, after which it is stopped; no limit when None."""
         self.spent_ns: tuple[int, int, int, int] | None = None
@@ -110,7 +120,8 @@ class BundlePolicy:
         session = engine_class(engine)
         check_files(manifest)
         sessions: dict[str, Session] = {
-            name: open_graph(bundle, graph, session, threads, traced) for name, graph in manifest.graphs.items()
+            name: open_graph(bundle, graph, session, threads, traced, input_shapes(manifest, name))
+            for name, graph in manifest.graphs.items()
         }
         check_graphs(manifest, sessions, limit_mb)
         outputs = [tensor.name for tensor in manifest.spec.outputs]
@@ -314,8 +325,16 @@ class BundlePolicy:
             DataError: when the golden file cannot be read.
             GraphError: when the difference is larger or not a number, or an inference takes longer.
         """
-        self.replay_golden(inferences, first_run_s)
-        self.check_golden(tolerance)
+        caches = [cache for session in self.program.sessions.values() if (cache := getattr(session, "cache", None))]
+        try:
+            self.replay_golden(inferences, first_run_s)
+            self.check_golden(tolerance)
+        except VlatoolError:
+            for cache in caches:
+                cache.discard()
+            raise
+        for cache in caches if self.golden_error is not None else ():
+            cache.keep()
 
     def replay_golden(self, inferences: int, first_run_s: float = FIRST_RUN_S) -> None:
         """Run the golden observations as ``warm_up`` does, and store how far the actions are from the recorded ones.

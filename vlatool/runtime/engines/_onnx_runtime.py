@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, MissingExtra, require
 from vlatool.machine.engine_calls import REMEDY
-from vlatool.machine.host import gpu_driver, gpus, versions
+from vlatool.machine.host import board, gpu_driver, gpus, os_name, versions
 from vlatool.runtime import arithmetic
 from vlatool.runtime.engine import Engine, Node, NodeRun, Profiled, computing
 from vlatool.runtime.engines._bound_buffers import HOST, BoundBuffers, port_of
@@ -82,7 +82,8 @@ class OnnxRuntimeSession(Engine):
                 f"use the engine {computing(compute)}",
             )
         try:
-            self._session = self._open(ort, model, threads, self._trace.folder if self._trace else None)
+            folder = self._trace.folder if self._trace else None
+            self._session = self._open(ort, model, threads, folder, self._providers_for(model))
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
             words, remedy = self._why_refused(ort, model, error)
             raise GraphError(f"ONNX Runtime {ort.__version__} refuses {path}: {words}", remedy) from error
@@ -265,25 +266,38 @@ class OnnxRuntimeSession(Engine):
             timer.cancel()
 
     @classmethod
-    def _open(cls, ort: Any, model: Path | bytes, threads: int | None, trace: str | None = None) -> Any:
+    def _open(
+        cls,
+        ort: Any,
+        model: Path | bytes,
+        threads: int | None,
+        trace: str | None = None,
+        providers: Providers | None = None,
+    ) -> Any:
         """Open a session, with other options where the first break the graph; the first error is reported.
 
         Args:
             trace: Directory in which ONNX Runtime notes each node that it runs; it does not where this is None.
+            providers: Where it is opened; those of the class when None.
         """
+        providers = cls.providers if providers is None else providers
         first, *others = (traced_into(trace, options) for options in cls._option_sets(ort, model, threads))
         try:
-            return open_session(ort, model, first, cls.providers)
+            return open_session(ort, model, first, providers)
         except Exception:
             for options in others:
                 with contextlib.suppress(Exception):
-                    return open_session(ort, model, options, cls.providers)
+                    return open_session(ort, model, options, providers)
             raise
 
     @staticmethod
     def _option_sets(ort: Any, model: Path | bytes, threads: int | None) -> list[Any]:
         """Return the options to try, one after the other."""
         return [session_options(ort, threads)]
+
+    def _providers_for(self, model: Path | bytes) -> Providers:
+        """Return the execution providers with the options for this graph."""
+        return self.providers
 
     @classmethod
     def _names(cls) -> list[str]:
@@ -301,8 +315,10 @@ class OnnxRuntimeSession(Engine):
 
     @classmethod
     def hardware(cls) -> tuple[str, str]:
-        """Return the processor, or the graphics cards and their driver."""
-        return super().hardware() if cls._names() == [CPU] else (", ".join(gpus()), gpu_driver() or "")
+        """Return the processor, or the graphics cards (a Jetson's board) and their driver (a Jetson's release)."""
+        if cls._names() == [CPU]:
+            return super().hardware()
+        return ", ".join(gpus()) or board() or "", gpu_driver() or os_name() or ""
 
     @classmethod
     def _hardware(cls) -> str:

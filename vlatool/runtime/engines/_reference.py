@@ -48,9 +48,11 @@ class BranchesSession(OrtCpuSession):
     """
 
     @classmethod
-    def _open(cls, ort: Any, model: Path | bytes, threads: int | None, trace: str | None = None) -> Any:
+    def _open(
+        cls, ort: Any, model: Path | bytes, threads: int | None, trace: str | None = None, providers: Any = None
+    ) -> Any:
         if arithmetic.ort_product(ort) >= arithmetic.EXACT_SUM:
-            return super()._open(ort, model, threads, trace)
+            return super()._open(ort, model, threads, trace, providers)
         options = traced_into(trace, session_options(ort, threads))
         options.add_session_config_entry(*arithmetic.UNFUSED_OPTION)
         return open_session(ort, model, options)
