@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from vlatool.runtime.control.late import LateController
 from vlatool.runtime.envelope import RobotLimits
 from vlatool.runtime.interface import CHUNK, FALLBACK, HOLD, POLICY, STOP, Action, Controller, Origin, origin_of
 from vlatool.runtime.stack import SWITCH_S, Fallback, Stack, TickRecord, build_stack, prepare_process
+from vlatool.runtime.telemetry import PARTS
 
 POSITIONS = TensorSpec("a", (1, 1, 2), labels=("x", "gripper"), mode="absolute")
 
@@ -101,6 +104,7 @@ def test_an_action_goes_through_all_layers_and_says_so():
         clock.now = step * 0.05 + 0.001
         action = stack.act({"t": step}, scheduled=step * 0.05)
         assert action[0] == [0, 100, 101, 101][step]
+        assert stack.telemetry.flush()
         np.testing.assert_array_equal(records[-1].action, action)
     assert [record.origin.source for record in records] == [POLICY, POLICY, CHUNK, HOLD]
     assert [record.missed for record in records] == [False, False, True, True]
@@ -118,6 +122,7 @@ def test_an_envelope_stops_the_robot_itself_where_it_can():
     _, stack, clock = built([0.0, 0.0, *[99.0] * 3], deadline_ms=10, envelope=Stopping, telemetry=records.append)
     first = [float(stack.act({"t": step})[0]) for step in range(6) for clock.now in [step * 0.05]]
     assert first == [0, 100, 101, -1, -2, -3], "the third miss escalates, and recovery takes five"
+    stack.close()
     assert [record.origin.source for record in records] == [POLICY, POLICY, CHUNK, STOP, STOP, STOP]
 
 
@@ -179,7 +184,9 @@ def test_a_sink_that_fails_does_not_stop_the_robot():
 
     _, stack, _ = built(telemetry=full)
     assert stack.act({"t": 1})[0] == 100
+    stack.close()
     assert stack.failed_records == 1
+    assert stack.telemetry.outlets[0].error == "OSError: no space left on device"
 
 
 def test_an_error_is_recorded_and_raised_where_nothing_answers():
@@ -187,6 +194,7 @@ def test_an_error_is_recorded_and_raised_where_nothing_answers():
     _, stack, _ = built([99.0], deadline_ms=10, telemetry=records.append)
     with pytest.raises(DeadlineMissed):
         stack.act({"t": 0})
+    stack.close()
     assert (records[0].missed, records[0].action, records[0].origin) == (True, None, Origin(""))
 
 
@@ -203,6 +211,21 @@ def test_a_deadline_longer_than_a_step_is_refused_where_the_step_waits_for_it():
     with pytest.raises(UsageError, match="longer than the control period"):  # it infers within act
         built(deadline_ms=60, controllers=["rtc"])
     assert built(deadline_ms=60, controllers=["rtc:background=true"])[1].deadlines[0].deadline_ms == 60
+
+
+@pytest.mark.parametrize(
+    ("named", "period"),
+    [(["deadline:deadline_ms=60"], 50), (["deadline:deadline_ms=60", "rtc"], 50),
+     (["deadline:deadline_ms=11", "interpolation:factor=5"], 10), (["deadline", "interpolation:factor=2"], 25)],
+)  # fmt: skip
+def test_a_deadline_by_name_is_no_longer_than_a_step_either(named: list[str], period: int):
+    with pytest.raises(UsageError, match=f"longer than the control period of {period} ms"):
+        built(controllers=named)
+
+
+def test_a_deadline_by_name_that_fits_is_there():
+    for named in (["deadline"], ["deadline:deadline_ms=60", "rtc:background=true"]):
+        assert len(built(controllers=named)[1].deadlines) == 1
 
 
 def test_a_faster_control_loop_has_a_shorter_step():
@@ -345,18 +368,30 @@ def test_a_robot_by_name_is_stopped_as_its_envelope_has_proven_where_the_policy_
     assert abs(np.diff(speeds) * 50).max() < 15.1, "rad/s^2"
 
 
-def pace(stack: Any) -> None:
+def pace(stack: Any, period_s: float = 0.02) -> None:
     """Let the envelope see a control period go by."""
     envelope = stack.controller.envelope
-    envelope.clock = lambda: envelope._time + 0.02 if envelope.ready else 0.0
+    envelope.clock = lambda: envelope._time + period_s if envelope.ready else 0.0
+
+
+@pytest.mark.parametrize("factor", [1, 5, 20])
+def test_the_envelope_of_a_faster_control_loop_has_its_period(factor: int):
+    stack = build_stack(panda(), controllers=[f"interpolation:factor={factor}"], envelope="franka-panda")
+    for step in range(29):
+        pace(stack, 0.02 / factor)
+        stack.act({"t": step, "q": np.array(READY)})
+        assert "early" not in stack.controller.result.checks
+    assert stack.controller.envelope.period_s == pytest.approx(0.02 / factor)
 
 
 @pytest.mark.parametrize(
     ("robot", "policy", "error", "message"),
     [("no-such-robot", panda(), ProfileError, "no-such-robot"),
      ("franka-panda", NumberedPolicy(spec_of()), UsageError, "has 2 elements"),
-     ("franka-panda", panda(labels=()), UsageError, "0 inputs have the labels of the action")],
-    ids=["robot", "width", "position"],
+     ("franka-panda", panda(labels=()), UsageError, "0 inputs have the labels of the action"),
+     ("franka-panda", panda(unit="deg"), UsageError, "'q' measures .*joint1 in deg; its limits are in rad"),
+     ("franka-panda", panda(unit=("rad",) * 6 + ("m",)), UsageError, "'q' measures .*joint7 in m")],
+    ids=["robot", "width", "position", "unit", "unit of one"],
 )  # fmt: skip
 def test_limits_that_do_not_fit_are_refused(robot: str, policy: Any, error: type, message: str):
     with pytest.raises(error, match=message):
@@ -434,3 +469,45 @@ def test_a_second_policy_with_another_form_of_rotations_is_refused():
     other = spec_of(action=replace(first.action, convert=(turning,)))
     with pytest.raises(UsageError, match="other rotations"):
         build_stack(NumberedPolicy(first), fallback=NumberedPolicy(other))
+
+
+@pytest.mark.parametrize("more", [{}, {"deadline_ms": 90}, {"deadline_ms": 90, "controllers": ["temporal_ensemble"]}])
+def test_the_layers_of_a_stack_say_where_its_time_went(tmp_path: Path, more: dict[str, Any]):
+    labels = ("x", "z")
+    pose = TensorSpec("x", (1, 2), labels=labels)
+    action = TensorSpec("y", (1, 2), labels=labels, mode="absolute")
+    path = written(tmp_path / "bundle", "g (float[1,2] x) => (float[1,2] y) { y = Neg(x) }", (pose,), (action,)).path
+    records: list[TickRecord] = []
+    stack = load(path, threads=1, seed=0, telemetry=records.append, **more)
+    assert isinstance(stack, Stack)
+    for _ in range(5):
+        stack.act({"x": [1.0, 2.0]}, scheduled=time.monotonic() - 0.001)
+    stack.close()
+    for each in records:
+        parts = dict(zip(PARTS, each.parts_ms, strict=True))
+        assert sum(each.parts_ms) + each.waited_ms == pytest.approx(each.answer_ms)
+        assert min(parts[name] for name in ("encode", "infer", "decode", "control")) > 0
+        assert (parts["handover"] > 0) is ("deadline_ms" in more)
+        assert parts["envelope"] == 0
+        assert each.waited_ms >= 1
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{"deadline_ms": 1000}, {"deadline_ms": 1000, "fallback": NumberedPolicy(spec_of(2, 1, POSITIONS, hz=1))},
+     {"controllers": ["rtc:background=true"]}, {"deadline_ms": 1000, "envelope": Stopping}],
+)  # fmt: skip
+def test_the_threads_of_a_stack_that_nobody_holds_end_without_close(more: dict[str, Any]):
+    before = set(threading.enumerate())
+    stack = build_stack(NumberedPolicy(spec_of(2, 1, POSITIONS, hz=1)), **more)
+    stack.act({"t": 0})
+    started = set(threading.enumerate()) - before
+    assert started
+    gc.disable()  # objects that were frozen for a deadline are never collected
+    try:
+        del stack
+        for thread in started:
+            thread.join(10)
+    finally:
+        gc.enable()
+    assert not any(thread.is_alive() for thread in started)

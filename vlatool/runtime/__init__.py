@@ -16,7 +16,8 @@ from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
 if TYPE_CHECKING:
-    from vlatool.runtime.stack import Fallback, Sink, Stack, Wrapper
+    from vlatool.runtime.stack import Fallback, Stack, Wrapper
+    from vlatool.runtime.telemetry import Sink, Telemetry
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 AUTO = "auto"
@@ -56,7 +57,7 @@ def load(
     envelope: str | Wrapper | None = ...,
     deadline_ms: float | None = ...,
     fallback: Any = ...,
-    telemetry: Sink | None = ...,
+    telemetry: Sink | Telemetry | None = ...,
 ) -> Policy | Stack: ...
 
 
@@ -76,7 +77,7 @@ def load(
     envelope: str | Wrapper | None = None,
     deadline_ms: float | None = None,
     fallback: str | os.PathLike[str] | Fallback | Any = None,
-    telemetry: Sink | None = None,
+    telemetry: Sink | Telemetry | None = None,
 ) -> Policy | Stack:
     """Load a bundle, verify it, open its graphs and warm them up.
 

@@ -75,6 +75,8 @@ class BundlePolicy:
         self._busy = False
         self.limit_s: float | None = None
         """Time limit of an inference in seconds, after which it is stopped; no limit when None."""
+        self.spent_ns: tuple[int, int, int, int] | None = None
+        """Nanoseconds of the last inference: encoding, graphs, decoding, and 0 for the way to another thread."""
         self.golden_error: float | None = None
         self.golden_chunk_error: float | None = None
         self.golden_conversion_error: float | None = None
@@ -161,8 +163,10 @@ class BundlePolicy:
             try:
                 self._busy = True
                 encoded = self.encode(observation)
+                ready = self._inferred = time.perf_counter_ns()
                 if self._direct:
                     values = self.program.run(encoded, noise)
+                    self._inferred = time.perf_counter_ns()
                     outputs = {name: values[name] for name in self._outputs.names}
                     chunk, labels = self._decode(outputs[self._action], encoded.state)
                 else:
@@ -172,12 +176,15 @@ class BundlePolicy:
                 self._sequence += 1
             finally:
                 self._busy = False
-        taken_ms = (time.perf_counter_ns() - start) / 1e6
+        end, inferred = time.perf_counter_ns(), self._inferred
+        self.spent_ns = ready - start, inferred - ready, end - inferred, 0
+        taken_ms = (end - start) / 1e6
         return Action(chunk, labels, taken_ms, sequence, outputs, age_ms=taken_ms)
 
     def _answer(
         self, state: Array | None, values: dict[str, Any]
     ) -> tuple[dict[str, Array], tuple[Array, tuple[str, ...]]]:
+        self._inferred = time.perf_counter_ns()
         outputs = self._outputs(values)
         return outputs, self._decode(outputs[self._action], state)
 

@@ -42,8 +42,9 @@ class AsynchronousController(ChunkQueue):
     ) -> None:
         check_whole("delay", delay, 0)
         check_whole("memory", memory, 1)
-        check_whole("execute", execute, 0, policy.spec.chunk)
         self._elements = ActionElements(policy.spec.action)
+        self.background = background
+        """Whether inferences run in a thread of their own."""
         self._inference: Inference = BackgroundInference(policy) if background else PlayedInference(policy, delay)
         self._delays: deque[int] = deque(maxlen=memory)
         self._first_delay = delay
