@@ -79,9 +79,9 @@ def test_a_client_that_is_silent_makes_way(monkeypatch: pytest.MonkeyPatch):
     server = built(names={"t": "state.t"}, clients=2)
     assert all(isinstance(ask(server, see(1), client), list) for client in (b"a", b"b", b"a"))
     assert "2 clients use the policy" in ask(server, see(1), b"c")["error"]
-    monkeypatch.setattr("vlatool.serving.gr00t.IDLE_S", -1.0)
+    monkeypatch.setattr("vlatool.serving._clients.IDLE_S", -1.0)
     assert isinstance(ask(server, see(1), b"c"), list)
-    assert set(server._sessions) == {b"a", b"c"}
+    assert len(server._clients.all()) == 2
 
 
 def test_the_endpoints():

@@ -28,7 +28,7 @@ UNKNOWN_RATE_MS = 60_000.0
 
 def serve(
     bundle: BundlePath,
-    protocol: Annotated[str, typer.Option(help="openpi or gr00t, or several with commas between")] = "openpi",
+    protocol: Annotated[str, typer.Option(help="openpi, gr00t or lerobot, or several with commas between")] = "openpi",
     host: Annotated[str, typer.Option(help="address; another one than this machine's own needs --key")] = "127.0.0.1",
     port: Annotated[
         int | None,
@@ -72,7 +72,7 @@ def serve(
     seed: Annotated[int | None, typer.Option(min=0, help="seed of the noise; a new one when not given")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Serve a bundle to programs that speak openpi's or GR00T's protocol, until Ctrl-C or SIGTERM.
+    """Serve a bundle to programs that speak openpi's, GR00T's or LeRobot's protocol, until Ctrl-C or SIGTERM.
 
     Each client has an episode of its own. An answer that would come after the deadline is refused instead.
     """

@@ -17,7 +17,7 @@ from vlatool.files.array_bytes import DTYPE, array_of, short_reason
 from vlatool.files.limits import check_limit
 from vlatool.files.validate import short_repr
 
-EXTRA = "serve"
+EXTRA = "remote"
 MAX_ITEMS = 16_384
 """Elements of a list and entries of a mapping in a message; arrays do not count. Lists are allocated before they
 are read, at each of up to 1,024 levels."""

@@ -9,6 +9,7 @@ from vlatool.errors import ServingError
 from vlatool.serving._access import Access
 from vlatool.serving._service import Service
 
+EXTRA = "serve"
 CLOSE_S = 2.0
 """How long the clients have to take the last answers when a server ends."""
 

@@ -109,7 +109,8 @@ class Service:
         self._limited = Deadline(checked, deadline_ms, clock=clock) if deadline_ms is not None else None
         self._infers: Policy = self._limited or checked
         self._stateful = next((layer for layer in layers_of(policy) if hasattr(layer, "restore")), None)
-        self._clients = clients if self._stateful is not None else 1
+        self.clients = clients if self._stateful is not None else 1
+        """Clients at a time: one where nothing can put their episodes in and take them out."""
         self._sessions: set[Session] = set()
         self._turn, self._count = threading.Lock(), threading.Lock()
         self._last: Session | None = None
@@ -127,7 +128,7 @@ class Service:
         """
         session = Session(self, client)
         with self._count:
-            if len(self._sessions) >= self._clients:
+            if len(self._sessions) >= self.clients:
                 raise ServingError(f"{len(self._sessions)} clients use the policy already.", "wait until one has gone")
             self._sessions.add(session)
         return session
@@ -140,7 +141,7 @@ class Service:
     @property
     def full(self) -> bool:
         """Whether there are as many clients as there may be."""
-        return len(self._sessions) >= self._clients
+        return len(self._sessions) >= self.clients
 
     def new_envelope(self) -> ChunkEnvelope | None:
         """Return the envelope of a robot that is at rest; None where no robot was named."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
@@ -15,15 +13,14 @@ from vlatool.errors import DataError, ServingError, UsageError, VlatoolError, re
 from vlatool.files.array_bytes import npy_array, npy_bytes
 from vlatool.files.limits import limit
 from vlatool.files.validate import short_repr
-from vlatool.runtime.openpi_messages import EXTRA, decode_message, encode_message, flat
+from vlatool.runtime.openpi_messages import decode_message, encode_message, flat
 from vlatool.serving._access import Access
-from vlatool.serving._endpoint import CLOSE_S, Endpoint
+from vlatool.serving._clients import Clients
+from vlatool.serving._endpoint import CLOSE_S, EXTRA, Endpoint
 from vlatool.serving._service import Service, Session
 
 ARRAY, CONFIG = "__ndarray_class__", "__ModalityConfig_class__"
 POLL_MS = 100
-IDLE_S = 60.0
-"""After so long without a request a client makes way for another one: the protocol does not say when one goes."""
 MAX_QUEUED = 4
 """Requests of one connection that wait."""
 ENDPOINTS = ("get_action", "get_modality_config", "kill", "ping", "reset")
@@ -42,7 +39,7 @@ class Gr00tServer(Endpoint):
         super().__init__(service, access, port, on_kill)
         self._zmq = require("zmq", EXTRA)
         require("msgpack", EXTRA)
-        self._sessions: OrderedDict[bytes, tuple[Session, float]] = OrderedDict()
+        self._clients: Clients[Session] = Clients(service, "gr00t", lambda session: session)
         self._ranks = {tensor.name: len(tensor.observation.shape) - 1 for tensor in service.spec.inputs}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name="vlatool-gr00t", daemon=True)
@@ -111,7 +108,7 @@ class Gr00tServer(Endpoint):
             return self._kill()
         if endpoint == "get_modality_config":
             return self._modalities()
-        session = self._session(client)
+        session = self._clients.get(client)
         return self._reset(session, data) if endpoint == "reset" else self._act(session, data)
 
     def _kill(self) -> None:
@@ -159,21 +156,6 @@ class Gr00tServer(Endpoint):
         }  # fmt: skip
         names = list(spec.action.parts) or [spec.action.name]
         return {**found, "action": _config(names, range(spec.chunk))}
-
-    def _session(self, client: bytes) -> Session:
-        """Return the episode of a client; the one that was silent for longest makes way for a new one."""
-        now = time.monotonic()
-        if client not in self._sessions:
-            if self.service.full and self._sessions:
-                oldest, (idle, last) = next(iter(self._sessions.items()))
-                if now - last > IDLE_S:
-                    idle.close()
-                    del self._sessions[oldest]
-            self._sessions[client] = self.service.session(f"gr00t {client.hex()[:16]}"), now
-        session = self._sessions[client][0]
-        self._sessions[client] = session, now
-        self._sessions.move_to_end(client)
-        return session
 
 
 def _modality(tensor: TensorSpec) -> str:

@@ -14,9 +14,9 @@ from vlatool.errors import DataError, DeadlineMissed, UsageError, VlatoolError, 
 from vlatool.files.limits import limit
 from vlatool.files.messages import to_json
 from vlatool.machine.version import VERSION
-from vlatool.runtime.openpi_messages import EXTRA, flat, pack, unpack
+from vlatool.runtime.openpi_messages import flat, pack, unpack
 from vlatool.serving._access import Access
-from vlatool.serving._endpoint import CLOSE_S, Endpoint
+from vlatool.serving._endpoint import CLOSE_S, EXTRA, Endpoint
 from vlatool.serving._service import Answer, Service, Session
 
 OPEN_S = 10.0
@@ -139,8 +139,10 @@ def describe(service: Service) -> dict[str, Any]:
     bundle = getattr(service.policy, "bundle", None)
     named = {} if bundle is None else {"name": bundle.manifest.name, "version": bundle.manifest.version,
                                        "identity": getattr(service.policy, "identity", "")}  # fmt: skip
-    return {"vlatool": VERSION, **named, "spec": to_json(service.spec, defaults=False), "execute": service.execute,
-            "deadline_ms": service.deadline_ms, "robot": service.robot}  # fmt: skip
+    return {
+        "vlatool": VERSION, **named, "spec": to_json(service.spec, defaults=False), "names": service.names.sources,
+        "execute": service.execute, "deadline_ms": service.deadline_ms, "robot": service.robot,
+    }  # fmt: skip
 
 
 def message_of(answer: Answer, previous_ms: float | None = None) -> dict[str, Any]:
