@@ -51,6 +51,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
     "run": ("dry_run",),
+    "record": ("recorded_run",),
+    "replay": ("replayed_run",),
     "simulate": ("simulation",),
     "telemetry": ("telemetry",),
     "profiles list": ("profiles",),
@@ -226,6 +228,14 @@ def _documents_of_machines() -> dict[str, Schema]:
             inference=SPREAD, answer=SPREAD, missed=NUMBER,
             rungs=many(record(source=TEXT, time={"anyOf": [SPREAD, {"type": "null"}]})),
             cadence=record(parts=many(PART_TIME), misses=INTEGER),
+        ),
+        "recorded_run": document(
+            "A file of recorded control steps.", file=TEXT, bytes=INTEGER, steps=INTEGER, seed=INTEGER, failed=INTEGER
+        ),
+        "replayed_run": document(
+            "Control steps that were computed again; note: why the recording ends before its run.",
+            steps=INTEGER, equal=FLAG, note=TEXT, difference={"anyOf": [{"type": "null"}, record(
+                step=INTEGER, output=TEXT, element=many(INTEGER), recorded=TEXT, replayed=TEXT)]},
         ),
         "simulation": document(
             "Predicted, not measured; latency_ms: value, low, high.",
