@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _fake_clock import FakeWorker
 from _slots import OBSERVATION, TRIAL, Clock, FakePolicy, bundle_of, install
 
 from vlatool.bundle.bundle import Bundle
@@ -14,8 +15,9 @@ from vlatool.deployment.judge import LATE_SHARE, MEMORY_PERIOD, MIN_LATE, Judge
 from vlatool.deployment.pointer import FILES
 from vlatool.deployment.slot_policy import SlotPolicy
 from vlatool.deployment.store import MAX_STARTS, Store
-from vlatool.errors import DataError, DeploymentError, GraphError, UsageError
+from vlatool.errors import DataError, DeadlineMissed, DeploymentError, GraphError, UsageError
 from vlatool.runtime import ChunkQueue
+from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.interface import Action, Policy
 
 
@@ -149,6 +151,99 @@ def test_overruns_roll_back_and_their_actions_are_used(store, bundles):
     assert "took longer than 100 ms" in store.read().rollback
 
 
+class Stoppable(FakePolicy):
+    """Knows whether it was told to stop, and what it kept."""
+
+    stopped = False
+    snapshot = property(lambda self: self.inferences)
+
+    def stop(self) -> None:
+        self.stopped = True
+
+    def resume(self) -> None:
+        self.stopped = False
+
+    def restore(self, snapshot: int) -> None:
+        self.inferences = snapshot
+
+
+def limited(store, bundles, delays_ms, monkeypatch) -> tuple[Robot, Deadline]:
+    """A deadline of 50 ms around a store whose bundles can be stopped; each inference takes so many milliseconds."""
+    monkeypatch.setitem(Robot.__init__.__globals__, "FakePolicy", Stoppable)
+    clock = Clock()
+
+    def act(_number: int) -> None:
+        clock.now += delays_ms.pop(0) / 1e3
+        if clock.now > due[0]:
+            robot.policy.stop()
+            raise TimeoutError
+
+    robot = Robot(store, bundles, act)
+    deadline = Deadline(robot.policy, 50, clock=clock, worker=FakeWorker(clock))
+    due = [0.0]
+    infer = deadline.infer
+
+    def timed(observation):
+        due[0] = clock.now + 0.05
+        return infer(observation)
+
+    deadline.infer = timed
+    return robot, deadline
+
+
+def test_a_deadline_stops_and_takes_back_whichever_bundle_answers(store, bundles, monkeypatch):
+    robot, deadline = limited(store, bundles, [10, 70, 10], monkeypatch)
+    assert deadline.infer(OBSERVATION).sequence == 0
+    with pytest.raises(DeadlineMissed):
+        deadline.infer(OBSERVATION)
+    assert robot.policy._running.policy.stopped
+    assert robot.policy._running.standby.policy.stopped
+    assert deadline.infer(OBSERVATION).sequence == 1
+    assert not robot.policy._running.policy.stopped
+    robot.policy.close()
+
+
+def test_missed_deadlines_of_a_trial_count_as_late_and_the_bundle_before_does_not_answer_them(
+    store, bundles, monkeypatch
+):
+    robot, deadline = limited(store, bundles, [10] + [70] * MIN_LATE, monkeypatch)
+    deadline.infer(OBSERVATION)
+    for _ in range(MIN_LATE):
+        assert robot.policy.on_trial
+        with pytest.raises(DeadlineMissed):
+            deadline.infer(OBSERVATION)
+    assert deadline.infer(OBSERVATION).chunk[0, 0] == 1.0
+    robot.policy.close()
+    assert "took longer than 100 ms, or were stopped" in store.read().rollback
+
+
+def test_what_a_late_inference_kept_is_taken_back(store, bundles, monkeypatch):
+    monkeypatch.setitem(Robot.__init__.__globals__, "FakePolicy", Stoppable)
+    robot = Robot(store, bundles)
+    robot.policy.infer(OBSERVATION)
+    kept = robot.policy.snapshot
+    robot.policy.infer(OBSERVATION)
+    robot.policy.restore(kept)
+    assert robot.policy.snapshot == kept
+    assert robot.policy._running.policy.inferences == 1
+    robot.policy.close()
+
+
+def test_a_new_bundle_that_fails_before_a_standby_without_time_is_left(store, bundles, monkeypatch):
+    robot = Robot(store, bundles, raising(GraphError))
+    standby = robot.policy._running.standby.policy
+
+    def stopped(_observation, *, noise=None):
+        robot.policy.stop()
+        raise TimeoutError
+
+    monkeypatch.setattr(standby, "infer", stopped)
+    with pytest.raises(GraphError):
+        robot.policy.infer(OBSERVATION)
+    assert not robot.policy.on_trial
+    robot.policy.close()
+
+
 def test_growth_rolls_back(store, bundles):
     grown = []
     robot = Robot(store, bundles, lambda number: grown.append(np.ones(350_000)))  # 2.8 MB each; 64 are allowed
@@ -248,6 +343,13 @@ def test_what_is_not_a_policy_is_refused_and_nothing_is_rolled_back(store, bundl
     with pytest.raises(UsageError, match="does not infer"):
         SlotPolicy(store, open_policy=lambda path: path)
     assert active(store, bundles) == (2, True)
+
+
+@pytest.mark.parametrize("wrong", [3, None, b"store", ["store"]])
+def test_what_is_no_path_is_no_store(wrong):
+    for opened in (SlotPolicy, Store):
+        with pytest.raises(UsageError, match="The path of the store is a"):
+            opened(wrong)
 
 
 def test_an_empty_store_is_refused(tmp_path):
@@ -364,6 +466,15 @@ def test_watching_finds_a_new_bundle(tmp_path, bundles):
         threading.Event().wait(0.002)
     robot.policy.close()
     assert active(store, bundles) == (2, True)
+
+
+def test_nobody_watches_for_a_policy_that_nobody_holds(store, bundles):
+    policy = SlotPolicy(store, open_policy=lambda path: FakePolicy(Bundle.open(path).manifest.spec, 1.0))
+    policy.watch(3600)
+    watcher = policy._watcher
+    del policy
+    watcher.join(10)
+    assert not watcher.is_alive()
 
 
 @pytest.mark.parametrize("late", [0, MIN_LATE - 1])

@@ -165,3 +165,30 @@ def test_closing_stops_what_runs_and_waits_for_its_end():
     assert task.calls == ["begin", "stop", "undo"]
     assert not worker.busy
     assert "closing" not in [thread.name for thread in threading.enumerate()]
+
+
+def gone(thread: threading.Thread) -> bool:
+    thread.join(10)
+    return not thread.is_alive()
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_the_thread_of_a_worker_that_nobody_holds_ends(busy: bool):
+    worker, task = Worker("forgotten"), Steps(ends=False, stops=False)
+    assert worker.call(Steps(), soon()) == 1
+    if busy:
+        with pytest.raises(TimeoutError):
+            worker.call(task, soon(0.01))
+    (thread,) = [each for each in threading.enumerate() if each.name == "forgotten"]
+    del worker
+    task.done.set()
+    assert gone(thread), "without a collection of garbage, since frozen objects are never collected"
+
+
+def test_a_worker_that_was_closed_is_collected_without_a_word(capfd: pytest.CaptureFixture[str]):
+    worker = Worker("closed")
+    for _ in range(2):
+        worker.call(Steps(), soon())
+        worker.close()
+    del worker
+    assert capfd.readouterr().err == ""

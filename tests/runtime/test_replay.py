@@ -92,8 +92,9 @@ def lateness(infer: Any, random: np.random.Generator) -> Any:
     [{}, {"deadline_ms": None, "controllers": ["late:delay=2"]}, {"controllers": ["rtc:delay=3"]},
      {"controllers": ["temporal_ensemble", "interpolation:factor=2"], "deadline_ms": 40},
      {"fallback": Fallback(max_age_ms=5.0, hold_s=0.2, recover=2, misses=2)},
-     {"controllers": ["asynchronous:delay=2"]}],
-    ids=["deadline", "late", "rtc", "ensemble", "fallback", "asynchronous"],
+     {"controllers": ["asynchronous:delay=2"]},
+     {"controllers": ["deadline:deadline_ms=40"], "deadline_ms": None, "fallback": Fallback()}],
+    ids=["deadline", "late", "rtc", "ensemble", "fallback", "asynchronous", "named"],
 )  # fmt: skip
 def test_a_run_is_computed_again_bit_by_bit(bundle: Path, tmp_path: Path, more: dict[str, Any]):
     actions = run(bundle, tmp_path / "run", **more)
@@ -102,7 +103,7 @@ def test_a_run_is_computed_again_bit_by_bit(bundle: Path, tmp_path: Path, more: 
         if action is not None:
             assert frame.arrays["action"].tobytes() == action.tobytes()
     misses = sum("late" in answer for frame in frames for answer in frame.values["answers"])
-    assert (misses > 0) is ("deadline_ms" not in more or more["deadline_ms"] is not None)
+    assert (misses > 0) is (more.get("controllers") != ["late:delay=2"])
     assert replay(tmp_path / "run", bundle) == ReplayResult(30, True, None, "")
 
 
@@ -150,6 +151,10 @@ def bit(name: str, index: tuple[int, ...]) -> Any:
     return edit
 
 
+def moved(values: Any, arrays: Any) -> None:
+    arrays["seen.x"][0] += 1
+
+
 def pop(*names: str) -> Any:
     def edit(values: Any, arrays: Any) -> None:
         (arrays if names[0] in arrays else values).pop(names[0])
@@ -160,7 +165,7 @@ def pop(*names: str) -> Any:
 @pytest.mark.parametrize(
     ("step", "edit", "expected"),
     [(3, bit("action", (1,)), ("action", (1,))), (0, bit("output.0.y", (0, 4, 1)), ("y", (0, 4, 1))),
-     (6, bit("chunk.0", (5, 0)), ("chunk", (5, 0))), (2, bit("seen.x", (0,)), ("y", (0, 0, 0))),
+     (6, bit("chunk.0", (5, 0)), ("chunk", (5, 0))), (2, moved, ("y", (0, 0, 0))),
      (4, lambda values, arrays: values["clock"].append(1.0), ("clock", ())),
      (4, lambda values, arrays: values["clock"].clear(), ("clock", ())),
      (2, lambda values, arrays: values["answers"].clear(), ("inference", ())),

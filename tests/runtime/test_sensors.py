@@ -211,11 +211,18 @@ def test_what_is_missing_or_too_far_apart_is_said():
 @pytest.mark.parametrize(
     "arguments",
     [{"stale_s": 0}, {"stale_s": 1, "method": "cubic"}, {"stale_s": 1, "capacity": 1}, {"stale_s": 1, "latency_s": -1},
-     {"stale_s": 1, "settle_s": -1}, {"stale_s": True}],
+     {"stale_s": 1, "settle_s": -1}, {"stale_s": True}, {"stale_s": np.inf}, {"stale_s": np.nan},
+     {"stale_s": 1, "latency_s": np.inf}],
 )  # fmt: skip
 def test_limits_out_of_range_are_refused(arguments: dict[str, Any]):
     with pytest.raises(UsageError):
         SensorLimits(**arguments)
+
+
+@pytest.mark.parametrize("skew_s", [0, -1, np.inf, np.nan, "1"])
+def test_a_skew_that_is_no_limit_is_refused(skew_s: Any):
+    with pytest.raises(UsageError, match="skew_s is"):
+        Sensors({"a": LIMITS}, skew_s=skew_s)
 
 
 @pytest.mark.parametrize("kind", [*Faults.KINDS, "all"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -212,6 +213,21 @@ def test_a_deadline_longer_than_a_step_is_refused_where_the_step_waits_for_it():
     assert built(deadline_ms=60, controllers=["rtc:background=true"])[1].deadlines[0].deadline_ms == 60
 
 
+@pytest.mark.parametrize(
+    ("named", "period"),
+    [(["deadline:deadline_ms=60"], 50), (["deadline:deadline_ms=60", "rtc"], 50),
+     (["deadline:deadline_ms=11", "interpolation:factor=5"], 10), (["deadline", "interpolation:factor=2"], 25)],
+)  # fmt: skip
+def test_a_deadline_by_name_is_no_longer_than_a_step_either(named: list[str], period: int):
+    with pytest.raises(UsageError, match=f"longer than the control period of {period} ms"):
+        built(controllers=named)
+
+
+def test_a_deadline_by_name_that_fits_is_there():
+    for named in (["deadline"], ["deadline:deadline_ms=60", "rtc:background=true"]):
+        assert len(built(controllers=named)[1].deadlines) == 1
+
+
 def test_a_faster_control_loop_has_a_shorter_step():
     with pytest.raises(UsageError, match="11 ms is longer than the control period of 10 ms"):
         built(deadline_ms=11, controllers=["interpolation:factor=5"])
@@ -352,18 +368,30 @@ def test_a_robot_by_name_is_stopped_as_its_envelope_has_proven_where_the_policy_
     assert abs(np.diff(speeds) * 50).max() < 15.1, "rad/s^2"
 
 
-def pace(stack: Any) -> None:
+def pace(stack: Any, period_s: float = 0.02) -> None:
     """Let the envelope see a control period go by."""
     envelope = stack.controller.envelope
-    envelope.clock = lambda: envelope._time + 0.02 if envelope.ready else 0.0
+    envelope.clock = lambda: envelope._time + period_s if envelope.ready else 0.0
+
+
+@pytest.mark.parametrize("factor", [1, 5, 20])
+def test_the_envelope_of_a_faster_control_loop_has_its_period(factor: int):
+    stack = build_stack(panda(), controllers=[f"interpolation:factor={factor}"], envelope="franka-panda")
+    for step in range(29):
+        pace(stack, 0.02 / factor)
+        stack.act({"t": step, "q": np.array(READY)})
+        assert "early" not in stack.controller.result.checks
+    assert stack.controller.envelope.period_s == pytest.approx(0.02 / factor)
 
 
 @pytest.mark.parametrize(
     ("robot", "policy", "error", "message"),
     [("no-such-robot", panda(), ProfileError, "no-such-robot"),
      ("franka-panda", NumberedPolicy(spec_of()), UsageError, "has 2 elements"),
-     ("franka-panda", panda(labels=()), UsageError, "0 inputs have the labels of the action")],
-    ids=["robot", "width", "position"],
+     ("franka-panda", panda(labels=()), UsageError, "0 inputs have the labels of the action"),
+     ("franka-panda", panda(unit="deg"), UsageError, "'q' measures .*joint1 in deg; its limits are in rad"),
+     ("franka-panda", panda(unit=("rad",) * 6 + ("m",)), UsageError, "'q' measures .*joint7 in m")],
+    ids=["robot", "width", "position", "unit", "unit of one"],
 )  # fmt: skip
 def test_limits_that_do_not_fit_are_refused(robot: str, policy: Any, error: type, message: str):
     with pytest.raises(error, match=message):
@@ -462,3 +490,24 @@ def test_the_layers_of_a_stack_say_where_its_time_went(tmp_path: Path, more: dic
         assert (parts["handover"] > 0) is ("deadline_ms" in more)
         assert parts["envelope"] == 0
         assert each.waited_ms >= 1
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{"deadline_ms": 1000}, {"deadline_ms": 1000, "fallback": NumberedPolicy(spec_of(2, 1, POSITIONS, hz=1))},
+     {"controllers": ["rtc:background=true"]}, {"deadline_ms": 1000, "envelope": Stopping}],
+)  # fmt: skip
+def test_the_threads_of_a_stack_that_nobody_holds_end_without_close(more: dict[str, Any]):
+    before = set(threading.enumerate())
+    stack = build_stack(NumberedPolicy(spec_of(2, 1, POSITIONS, hz=1)), **more)
+    stack.act({"t": 0})
+    started = set(threading.enumerate()) - before
+    assert started
+    gc.disable()  # objects that were frozen for a deadline are never collected
+    try:
+        del stack
+        for thread in started:
+            thread.join(10)
+    finally:
+        gc.enable()
+    assert not any(thread.is_alive() for thread in started)

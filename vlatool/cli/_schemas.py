@@ -46,7 +46,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "deploy": ("deployment",),
     "rollback": ("store",),
     "status": ("store",),
-    "sign": ("signature", "key"),
+    "sign": ("signature", "openssf", "key"),
     "verify-signature": ("signature",),
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
@@ -212,6 +212,8 @@ def _documents_of_deployment() -> dict[str, Schema]:
                                shadow=SHADOW),
         "signature": document("A signature of a bundle.", path=TEXT, schema=INTEGER, bundle=TEXT, release=INTEGER,
                               key=TEXT, signature=TEXT),
+        "openssf": document("A signature of a bundle for the tools of OpenSSF Model Signing.", path=TEXT, bundle=TEXT,
+                            key=TEXT),
         "key": document("A key that was made.", private=TEXT, public=TEXT, key=TEXT),
     }  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Callable
 from typing import Any
@@ -62,6 +63,11 @@ class Judge:
         """Return what is wrong with the time of an inference, or with the memory after it; the action may be used."""
         return self._time(latency_ms) or self._memory()
 
+    def count_stop(self) -> str:
+        """Count an inference that was stopped before it ended as late; return what is wrong, as ``overrun``."""
+        self.count += 1
+        return self._time(math.inf)
+
     def wrong_action(self, chunk: Any) -> str:
         """Return what is wrong with the next chunk, which then must not be used; empty when nothing is."""
         self.count += 1
@@ -78,7 +84,7 @@ class Judge:
         self.late += 1
         if self.late < MIN_LATE or self.late <= LATE_SHARE * self.count:
             return ""
-        return f"{self.late} of {self.count} inferences took longer than {self._latency_ms:g} ms"
+        return f"{self.late} of {self.count} inferences took longer than {self._latency_ms:g} ms, or were stopped"
 
     def _memory(self) -> str:
         if not self._memory_mb or self.count % MEMORY_PERIOD:

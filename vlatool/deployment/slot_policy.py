@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -55,7 +56,7 @@ class SlotPolicy:
     files are changed by another thread, never within an inference.
 
     Args:
-        store: directory of the store.
+        store: a store, or its directory.
         standby: whether the bundle before stays open during a trial: it answers in the same inference in which the
             trial fails. Otherwise that inference raises, and the next one that finds it open uses it.
         clock: function that returns seconds.
@@ -63,6 +64,7 @@ class SlotPolicy:
         options: arguments of ``vlatool.load``.
 
     Raises:
+        UsageError: when the store is not a path.
         DeploymentError: when the store is unreadable or holds no bundle.
         VlatoolError: what ``vlatool.load`` raises of the active bundle, when the other one cannot be loaded either.
 
@@ -90,6 +92,7 @@ class SlotPolicy:
         self._watcher: threading.Thread | None = None
         self._end = threading.Event()
         self._refresh_turn, self._exchange_turn = threading.Lock(), threading.Lock()
+        self._stopped = False
         self._failed: set[str] = set()
         self._failure = ""
         self._sequence = 0
@@ -124,6 +127,38 @@ class SlotPolicy:
         number = self._sequence
         self._sequence += 1
         return action if action.sequence == number else action._replace(sequence=number)
+
+    def stop(self) -> None:
+        """End the inference in progress, from another thread, in whichever bundle it is; see ``BundlePolicy.stop``."""
+        self._stopped = True
+        for policy in self._policies("stop"):
+            policy.stop()
+
+    def resume(self) -> None:
+        """Allow inferences again after ``stop``."""
+        self._stopped = False
+        for policy in self._policies("resume"):
+            policy.resume()
+
+    @property
+    def snapshot(self) -> tuple[int, list[tuple[Any, Any]]]:
+        """What ``restore`` takes: the sequence number, and what each open bundle kept."""
+        return self._sequence, [(policy, policy.snapshot) for policy in self._policies("restore")]
+
+    def restore(self, snapshot: tuple[int, list[tuple[Any, Any]]]) -> None:
+        """Take back the last inference: what bundles kept is as it was. One that was rolled back stays rolled back."""
+        self._sequence, values = snapshot
+        for policy, kept in values:
+            policy.restore(kept)
+
+    def _policies(self, method: str) -> list[Any]:
+        """Return the policies that are open, which an inference may come to, as far as they have a method.
+
+        The next one is looked at first: when another thread exchanges them meanwhile, it is the one that answers.
+        """
+        found = [self._next, self._running]
+        found += [running.standby for running in found if running is not None]
+        return [running.policy for running in found if running is not None and hasattr(running.policy, method)]
 
     def observe(self, observation: Mapping[str, Any]) -> None:
         """Keep the observation of a control step without an inference."""
@@ -176,7 +211,7 @@ class SlotPolicy:
             return True
 
     def watch(self, period_s: float = 1.0) -> None:
-        """Call ``refresh`` in a thread of its own until ``close``.
+        """Call ``refresh`` in a thread of its own until ``close``, or until nobody holds this policy.
 
         Args:
             period_s: Seconds between two calls.
@@ -185,8 +220,10 @@ class SlotPolicy:
             UsageError: when the period is not a number above 0.
         """
         check_positive("period_s", period_s, "a number of seconds")
-        self._watcher = threading.Thread(target=self._watch, args=(period_s,), daemon=True)
+        arguments = weakref.ref(self), self._end, period_s
+        self._watcher = threading.Thread(target=_watch, args=arguments, name="vlatool-watch", daemon=True)
         self._watcher.start()
+        weakref.finalize(self, self._end.set)
 
     def wait(self) -> None:
         """Wait until the changes of the store that were begun are on the disk."""
@@ -325,7 +362,11 @@ class SlotPolicy:
             if wrong:
                 raise GraphError(f"{running.slot.name} on trial: {wrong}.", "the bundle before it answers from now on")
         except Exception as error:
-            return self._answer_instead(running, observation, noise, error)
+            if not self._stopped:
+                return self._answer_instead(running, observation, noise, error)
+            if late := judge.count_stop():
+                self._fall_back(running, late)
+            raise
         overrun = self._failure or judge.overrun(1e3 * (self._clock() - start))
         if running.trial is None:
             return action
@@ -348,6 +389,8 @@ class SlotPolicy:
         try:
             action: Action = running.standby.policy.infer(observation, noise=noise)
         except Exception:
+            if self._stopped:  # it had taken the observation, and no time was left
+                self._fall_back(running, _reason(error))
             raise error from None
         self._fall_back(running, _reason(error))
         return action
@@ -385,10 +428,6 @@ class SlotPolicy:
         except Exception as error:
             self._note(f"not done: {_reason(error)}")
 
-    def _watch(self, period_s: float) -> None:
-        while not self._end.wait(period_s):
-            self._save(self.refresh)
-
     def _later(self, work: Callable[[], object]) -> None:
         """Do something in another thread, one after the other: a flush of a file may take longer than a tick."""
         try:
@@ -398,6 +437,12 @@ class SlotPolicy:
 
     def _note(self, text: str) -> None:
         self.events.append(text)
+
+
+def _watch(of: weakref.ref[SlotPolicy], end: threading.Event, period_s: float) -> None:
+    while not end.wait(period_s) and (policy := of()) is not None:
+        policy._save(policy.refresh)
+        del policy
 
 
 def _follow(policy: Any, observation: Mapping[str, Any]) -> None:

@@ -20,6 +20,7 @@ from vlatool.deployment.pointer import FILES, NAMES, Pointer, Slot, Trial, read_
 from vlatool.errors import BundleError, DeploymentError, OutputError
 from vlatool.files.durable import remove_tree, sync_folder, sync_tree, write_file
 from vlatool.files.verified_read import open_inside
+from vlatool.runtime.arguments import check_path
 
 MAX_STARTS = 3
 """Starts of a trial that did not end in an orderly way, after which it is rolled back: a loop of crashes."""
@@ -41,12 +42,16 @@ def default_store() -> Path:
 class Store:
     """A directory with two slots and a pointer.
 
+    Raises:
+        UsageError: when the path is none.
+
     Example:
         >>> Store("/var/lib/robot/policy").read().active     # doctest: +SKIP
         'a'
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
+        check_path(path, "store")
         self.path = Path(path)
 
     def read(self) -> Pointer:

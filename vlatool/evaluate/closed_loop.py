@@ -38,7 +38,8 @@ from vlatool.measures.success import SUCCESS
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.module.source import describe
 from vlatool.report import Report, Row
-from vlatool.runtime.control import build_controller, layers
+from vlatool.runtime.control import build_controller, layers, options_of
+from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.interface import Action
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.identity import with_identity
@@ -163,6 +164,7 @@ class ClosedLoop(Measure):
             message = f"{option} is of inferences, and {self.control} actions need none."
             raise UsageError(message, f"leave {option} or --control out")
         layers(self.controller, delayed=self.latency_in_the_loop)
+        _refuse_real_time(self.controller)
         if source is not None and not self.control:
             build_controller(_Unopened(source.manifest.spec), self.controller, int(self.latency_in_the_loop))
         if "strength" in self.options() and not self.disturb:
@@ -374,6 +376,17 @@ class ClosedLoop(Measure):
         job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control,
                           controller=self.controller, timeout_s=timeout)  # fmt: skip
         return jobs_for(job, tasks, self.episodes, self.first_seed)
+
+
+def _refuse_real_time(controllers: Sequence[str]) -> None:
+    """Refuse controllers whose actions depend on the speed of this machine; raises UsageError naming the first."""
+    for entry, options in options_of(controllers).items():
+        if options.get("background") or entry is Deadline:
+            what = f"a {entry.__name__} with background=true" if entry is not Deadline else "a deadline"
+            raise UsageError(
+                f"What {what} does depends on the speed of this machine, which says nothing of a robot.",
+                "give the delay in control steps, such as rtc:delay=8, or add --latency-in-the-loop",
+            )
 
 
 class _Unopened:

@@ -12,11 +12,11 @@ from vlatool.errors import UsageError
 MOST_THREADS = 1024
 
 
-def check_path(path: Any) -> None:
+def check_path(path: Any, of: str = "bundle") -> None:
     """Refuse anything but a path; raises UsageError naming what it is."""
     if not isinstance(path, str | os.PathLike):
         raise UsageError(
-            f"The path of the bundle is a {type(path).__name__}; allowed: text or a Path.",
+            f"The path of the {of} is a {type(path).__name__}; allowed: text or a Path.",
             "pass the path as a str or a pathlib.Path",
         )
 

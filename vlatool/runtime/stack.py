@@ -285,8 +285,10 @@ def build_stack(
     _check_layers(controllers, envelope, telemetry)
     options = fallback if isinstance(fallback, Fallback) else Fallback(fallback)
     entries, chosen = layers(controllers), options_of(controllers)
-    waits = not any(given.get("background") for given in chosen.values())
-    check_deadline(policy.spec, deadline_ms, waits=waits, factor=rate_factor(controllers))
+    waits, factor = not any(given.get("background") for given in chosen.values()), rate_factor(controllers)
+    limits_ms = [deadline_ms, _named_deadline(policy.spec, chosen[Deadline]) if Deadline in chosen else None]
+    for limit_ms in limits_ms:
+        check_deadline(policy.spec, limit_ms, waits=waits, factor=factor)
     own_ms = policy_ms(deadline_ms, options) if options.policy is not None else 0.0
     falls_back = deadline_ms is not None or fallback is not None
     wrappers = [entry for entry in entries if not hasattr(entry, "act")]
@@ -303,7 +305,7 @@ def build_stack(
     for entry in outer:
         inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry), clock=reader)
     if envelope is not None:
-        inner = _enveloped(inner, policy.spec, envelope, clock)
+        inner = _enveloped(inner, policy.spec, envelope, factor, clock)
         if ladder is not None and hasattr(inner, "stop"):
             for rung in ladder.rungs:
                 if isinstance(rung, Hold):
@@ -343,9 +345,16 @@ def _record_layers(recorder: Recorder | Replay, inside: Sequence[Any]) -> None:
             recorder.wrap_envelope(layer.envelope)
 
 
-def _enveloped(controller: Controller, spec: PolicySpec, envelope: str | Wrapper, clock: Callable[[], float]) -> Any:
+def _named_deadline(spec: PolicySpec, options: Mapping[str, Any]) -> float:
+    """Return the deadline of the layer that ``controllers`` name, in milliseconds."""
+    return options.get("deadline_ms") or 1000 / spec.rate
+
+
+def _enveloped(
+    controller: Controller, spec: PolicySpec, envelope: str | Wrapper, factor: int, clock: Callable[[], float]
+) -> Any:
     """Return a controller with the envelope of a robot, or a wrapper, around it."""
-    wrapper = robot_envelope(spec, envelope, clock) if isinstance(envelope, str) else envelope
+    wrapper = robot_envelope(spec, envelope, factor, clock) if isinstance(envelope, str) else envelope
     wrapped = wrapper(controller) if callable(wrapper) else None
     if not isinstance(wrapped, Controller) or controller not in layers_of(wrapped):
         raise UsageError(
@@ -472,20 +481,28 @@ def check_same_actions(first: PolicySpec, second: PolicySpec) -> None:
         )
 
 
-def robot_envelope(spec: PolicySpec, robot: str, clock: Callable[[], float] = time.monotonic) -> Wrapper:
+def robot_envelope(
+    spec: PolicySpec, robot: str, factor: int = 1, clock: Callable[[], float] = time.monotonic
+) -> Wrapper:
     """Return the wrapper that keeps the actions of a policy within the limits of a robot.
+
+    Args:
+        factor: Control steps of the robot for each one of the policy.
 
     Raises:
         ProfileError: when no robot has that name.
-        UsageError: when the limits do not fit the action, or no input is known to be the measured position.
+        UsageError: when the limits do not fit the action, no input is known to be the measured position, or it has
+            another unit than the limits.
     """
     from vlatool.runtime.control.envelope import EnvelopeController
-    from vlatool.runtime.envelope import RobotLimits, envelope_of
+    from vlatool.runtime.envelope import RobotLimits, check_position, envelope_of
 
     limits = RobotLimits.named(robot)
-    envelope = envelope_of(spec, limits, clock=clock)
+    envelope = envelope_of(spec, limits, period_s=1 / (spec.rate * factor), clock=clock)
     bounded = any(joint.low is not None for joint in limits.joints)
     position = measured_position(spec) if bounded else None
+    if position is not None:
+        check_position(next(tensor for tensor in spec.inputs if tensor.name == position), envelope.limits)
     return lambda controller: EnvelopeController(controller, envelope, position=position)
 
 

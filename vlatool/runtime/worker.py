@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import atexit
+import contextlib
 import threading
 import time
 import weakref
@@ -46,8 +47,53 @@ class _Call:
         self.error: BaseException | None = None
 
 
+class _Desk:
+    """What a worker and its thread share; the thread does not hold the worker, and ends when nobody does."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self.lock = _thread.allocate_lock()
+        self.wake = _thread.allocate_lock()
+        self.wake.acquire()
+        self.call: _Call | None = None
+        self._clock = clock
+        self._left = False
+
+    def serve(self) -> None:
+        """Perform one call after the other; return when there is none after ``wake``, or nobody is left to call."""
+        while not self._left and self._perform_next():
+            pass
+
+    def leave(self) -> None:
+        """End the thread, after the call in progress."""
+        self._left = True
+        with contextlib.suppress(RuntimeError):  # a call is there that the thread has not begun: it looks afterwards
+            self.wake.release()
+
+    def _perform_next(self) -> bool:
+        self.wake.acquire()
+        if (call := self.call) is None:
+            return False
+        with self.lock:
+            if not call.abandoned:
+                call.task.begin()
+                call.began = True
+        try:
+            if call.began:
+                call.result = call.task.run()
+        except BaseException as error:  # the caller's thread raises it
+            call.error = error
+        with self.lock:
+            call.in_time = not call.abandoned and self._clock() <= call.due
+            if not call.in_time and call.began and call.error is None:
+                call.task.undo()
+                call.result = None
+            self.call = None
+        call.ended.release()
+        return True
+
+
 class Worker:
-    """Runs tasks in one thread, which is started with the first and kept.
+    """Runs tasks in one thread, which is started with the first and kept until the worker is closed or collected.
 
     A task that does not end by its time is stopped and taken back, and its result is never returned. One that cannot be
     stopped keeps the thread: the worker is then ``busy``, takes no other task, and starts no other thread. The thread
@@ -60,16 +106,14 @@ class Worker:
 
     def __init__(self, name: str = "vlatool-worker", clock: Callable[[], float] = time.monotonic) -> None:
         self._name, self._clock = name, clock
-        self._lock = _thread.allocate_lock()
-        self._wake = _thread.allocate_lock()
-        self._wake.acquire()
-        self._call: _Call | None = None
+        self._desk = _Desk(clock)
         self._thread: threading.Thread | None = None
+        weakref.finalize(self, self._desk.leave).atexit = False  # ``_close_all`` waits for the thread
 
     @property
     def busy(self) -> bool:
         """Whether a task is running."""
-        return self._call is not None
+        return self._desk.call is not None
 
     def call(self, task: Task, due: float) -> Any:
         """Return the result of a task that ends by a time of the clock.
@@ -79,15 +123,15 @@ class Worker:
             UsageError: when another caller is waiting.
         """
         left = due - self._clock()
-        with self._lock:
-            if self._call is not None:
-                self._refuse(self._call)
+        with self._desk.lock:
+            if self._desk.call is not None:
+                self._refuse(self._desk.call)
             if left <= 0:
                 raise TimeoutError("no time is left for it")
-            call = self._call = _Call(task, due)
+            call = self._desk.call = _Call(task, due)
         if self._thread is None:
             self._start()
-        self._wake.release()
+        self._desk.wake.release()
         try:
             in_time = call.ended.acquire(True, left)
         except BaseException:  # Ctrl-C: nobody waits for it any more
@@ -111,8 +155,8 @@ class Worker:
 
     def _abandon(self, call: _Call) -> bool:
         """Give a call up unless it has ended; returns whether it was."""
-        with self._lock:
-            if self._call is not call:
+        with self._desk.lock:
+            if self._desk.call is not call:
                 return False
             call.abandoned = True
             if call.began:
@@ -121,43 +165,18 @@ class Worker:
 
     def _start(self) -> None:
         _WORKERS.add(self)
-        self._thread = threading.Thread(target=self._work, name=self._name, daemon=True)
+        self._thread = threading.Thread(target=self._desk.serve, name=self._name, daemon=True)
         self._thread.start()
-
-    def _work(self) -> None:
-        while True:
-            self._wake.acquire()
-            if (call := self._call) is None:
-                return
-            self._perform(call)
-
-    def _perform(self, call: _Call) -> None:
-        with self._lock:
-            if not call.abandoned:
-                call.task.begin()
-                call.began = True
-        try:
-            if call.began:
-                call.result = call.task.run()
-        except BaseException as error:  # the caller's thread raises it
-            call.error = error
-        with self._lock:
-            call.in_time = not call.abandoned and self._clock() <= call.due
-            if not call.in_time and call.began and call.error is None:
-                call.task.undo()
-                call.result = None
-            self._call = None
-        call.ended.release()
 
     def close(self, seconds: float = EXIT_S) -> None:
         """End the thread; the next call starts another. A task that runs is stopped, and waited for so many seconds."""
-        call, thread = self._call, self._thread
+        call, thread = self._desk.call, self._thread
         if call is not None:
             self._abandon(call)
             call.ended.acquire(True, seconds)
         if not self.busy and thread is not None:
             self._thread = None
-            self._wake.release()
+            self._desk.wake.release()
             thread.join()
 
 

@@ -7,7 +7,11 @@ import pytest
 from _numbered import NumberedPolicy, spec_of
 
 from vlatool.bundle.spec import TensorSpec
+from vlatool.errors import UsageError
 from vlatool.runtime import Action, ChunkQueue, load
+from vlatool.runtime.control.asynchronous import AsynchronousController
+from vlatool.runtime.control.late import LateController
+from vlatool.runtime.control.rtc import RealTimeController
 from vlatool.runtime.interface import CHUNK, POLICY, Origin
 
 
@@ -63,9 +67,12 @@ def test_a_discrete_action_is_a_scalar():
     assert queue.act({}).shape == ()
 
 
-@pytest.mark.parametrize("execute", [5, 9])
-def test_more_than_the_chunk_is_the_chunk(execute):
-    assert play(ChunkQueue(NumberedPolicy(spec_of(chunk=2)), execute), 3) == [0, 1, 200]
+@pytest.mark.parametrize("player", [ChunkQueue, LateController, AsynchronousController, RealTimeController])
+@pytest.mark.parametrize("execute", [3, 99, -1, 1.0, True])
+def test_no_more_of_a_chunk_can_be_executed_than_it_has(player, execute):
+    assert player(NumberedPolicy(spec_of(chunk=2)), 2).execute == 2
+    with pytest.raises(UsageError, match="allowed: a whole number from 0 to 2"):
+        player(NumberedPolicy(spec_of(chunk=2)), execute)
 
 
 class Aged(NumberedPolicy):

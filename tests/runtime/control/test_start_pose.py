@@ -24,6 +24,12 @@ def spec(mode: str) -> PolicySpec:
     return PolicySpec((*spec_of().inputs, PLACE), (action,), HZ, 2)
 
 
+def in_units(mode: str, place: Any, move: Any) -> PolicySpec:
+    number, state = spec(mode).inputs
+    action = replace(spec(mode).action, unit=move)
+    return replace(spec(mode), inputs=(number, replace(state, unit=place)), outputs=(action,))
+
+
 class World:
     """A robot that moves by what it is commanded, in the way of a mode."""
 
@@ -96,6 +102,26 @@ def test_a_robot_that_does_not_arrive_is_an_error():
 def test_what_does_not_fit_is_refused(arguments: dict[str, Any], of: PolicySpec, message: str):
     with pytest.raises(UsageError, match=message):
         StartPose(build_controller(NumberedPolicy(of)), spec=of, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("mode", "place", "move", "wanted"),
+    [("absolute", "deg", "rad", "deg"), ("delta", "mm", "m", "mm"), ("velocity", "m", "m", "m/s"),
+     ("velocity", "m", "mm/s", "m/s"), ("absolute", ("m", "rad"), ("m", "deg"), "rad"), ("delta", "m", "m/s", "m")],
+)  # fmt: skip
+def test_a_state_in_other_units_than_the_action_is_refused(mode: str, place: Any, move: Any, wanted: str):
+    one = in_units(mode, place, move)
+    with pytest.raises(UsageError, match=f"wanted: {wanted}"):
+        StartPose(build_controller(NumberedPolicy(one)), spec=one)
+
+
+@pytest.mark.parametrize(
+    ("mode", "place", "move"),
+    [("absolute", "m", "m"), ("velocity", "m", "m/s"), ("delta", "", "m"), ("velocity", "rad", "")],
+)
+def test_units_that_agree_or_are_not_stated_are_taken(mode: str, place: str, move: str):
+    one = in_units(mode, place, move)
+    assert StartPose(build_controller(NumberedPolicy(one)), spec=one).moving
 
 
 def test_an_observation_without_the_position_is_refused():

@@ -45,7 +45,6 @@ class AsynchronousController(ChunkQueue):
     ) -> None:  # fmt: skip
         check_whole("delay", delay, 0)
         check_whole("memory", memory, 1)
-        check_whole("execute", execute, 0, policy.spec.chunk)
         self._elements = ActionElements(policy.spec.action)
         self.background = background
         """Whether inferences run in a thread of their own."""

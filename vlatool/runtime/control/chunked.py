@@ -25,12 +25,12 @@ class ChunkQueue:
         clock: Returns seconds; the age of actions is measured with it.
 
     Raises:
-        UsageError: when ``execute`` is not a whole number from 0.
+        UsageError: when ``execute`` is not a whole number from 0 to the length of a chunk.
         PluginError: when inputs of the policy hold several moments, and it has no ``observe``.
     """
 
     def __init__(self, policy: Policy, execute: int = 0, *, clock: Callable[[], float] = time.monotonic) -> None:
-        check_whole("execute", execute, 0)
+        check_whole("execute", execute, 0, policy.spec.chunk)
         self.policy = policy
         self._observer = observer_of(policy)
         self.execute = execute or policy.spec.execute or policy.spec.chunk

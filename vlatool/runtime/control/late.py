@@ -30,7 +30,7 @@ class LateController(ChunkQueue):
         clock: Returns seconds; the age of actions is measured with it.
 
     Raises:
-        UsageError: when ``execute`` or ``delay`` is not a whole number from 0.
+        UsageError: when ``delay`` is not a whole number from 0, or ``execute`` one from 0 to the length of a chunk.
     """
 
     def __init__(

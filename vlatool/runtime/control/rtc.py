@@ -57,8 +57,8 @@ class RealTimeController(AsynchronousController):
         self, policy: Policy, execute: int = 0, *, delay: int = 0, memory: int = 10, background: bool = False,
         blend: int | None = None, stretch: bool = True, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
-        check_whole("blend", blend, 0, optional=True)
         spec = policy.spec
+        check_whole("blend", blend, 0, spec.chunk, optional=True)
         self._guides = _guides(spec)
         self._stretched = stretch and spec.action.kind != "discrete" and spec.action.mode in PACED_MODES
         blend = min(MAX_BLEND, spec.chunk // 2) if blend is None else blend

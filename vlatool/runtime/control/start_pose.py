@@ -162,4 +162,18 @@ def _state_of(spec: PolicySpec, name: str) -> TensorSpec:
             f"{f' and the name {name!r}' if name else ''}; wanted: one, with the position of each.",
             "name it: start_pose:state=NAME",
         )
+    _check_units(vectors[0], action)
     return vectors[0]
+
+
+def _check_units(state: TensorSpec, action: TensorSpec) -> None:
+    """Refuse a state in other units than the action moves it in, as far as both are stated; raises UsageError."""
+    per_second = "/s" if action.mode == "velocity" else ""
+    for index, (position, move) in enumerate(zip(state.units(), action.units(), strict=True)):
+        commanded = index != action.gripper or action.mode == "absolute"
+        if position and move and commanded and move != position + per_second:
+            raise UsageError(
+                f"Element {index} of '{state.name}' is in {position}, that of '{action.name}' in {move}; wanted: "
+                f"{position}{per_second}.",
+                "convert one of them in policy.yaml, or leave start_pose out",
+            )

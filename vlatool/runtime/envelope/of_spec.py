@@ -40,6 +40,20 @@ def envelope_of(spec: PolicySpec, limits: RobotLimits, *, period_s: float | None
     return Envelope(limits, period, mode=action.mode, **options)
 
 
+def check_position(tensor: TensorSpec, limits: RobotLimits) -> None:
+    """Refuse an input that measures where the robot is in another unit than its limits, which are in its order.
+
+    Raises:
+        UsageError: naming the joint and both units.
+    """
+    for joint, unit in zip(limits.joints, tensor.units(), strict=True):
+        if unit not in ("", joint.unit):
+            raise UsageError(
+                f"'{tensor.name}' measures {joint.name} in {unit}; its limits are in {joint.unit}.",
+                "convert the input in policy.yaml, or the limits: limits.in_degrees() for degrees",
+            )
+
+
 def _in_order(action: TensorSpec, limits: RobotLimits) -> RobotLimits:
     names = {joint.name for joint in limits.joints}
     if action.labels and names.issuperset(action.labels):

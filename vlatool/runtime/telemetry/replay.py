@@ -13,7 +13,7 @@ import numpy as np
 from vlatool.errors import DataError, DeadlineMissed, GraphError
 from vlatool.files.messages import from_json
 from vlatool.runtime.control.deadline import Deadline
-from vlatool.runtime.interface import Action, Array, Policy, observer_of
+from vlatool.runtime.interface import Action, Array, Policy, layers_of, observer_of
 from vlatool.runtime.telemetry.recorder import CALLS
 from vlatool.runtime.telemetry.run_file import OF_A_FUNCTION, Frame, FrameKind, RunHeader, read_run
 
@@ -203,7 +203,7 @@ class _ReplayedPolicy:
     """A policy without its deadline: whether it was late is in the recording."""
 
     def __init__(self, policy: Policy, replay: Replay, index: int) -> None:
-        self.policy: Any = policy.policy if isinstance(policy, Deadline) else policy
+        self.policy = _without_deadline(policy)
         self.spec, self._replay, self._index = policy.spec, replay, index
         self._known = not isinstance(self.policy, RecordedAnswers)
         self._observer = observer_of(policy)
@@ -243,6 +243,16 @@ class _ReplayedPolicy:
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode; see ``Policy.reset``."""
         self.policy.reset(seed)
+
+
+def _without_deadline(policy: Any) -> Any:
+    """Return a policy without the deadlines around it and inside it."""
+    while isinstance(policy, Deadline):
+        policy = policy.policy
+    for layer in layers_of(policy):
+        while isinstance(getattr(layer, "policy", None), Deadline):
+            layer.policy = layer.policy.policy
+    return policy
 
 
 class RecordedAnswers:
