@@ -25,7 +25,7 @@ ENGINE = "ort_cpu"
 TARGET = 3.0
 """Speed-up that is wanted where int8 has instructions of its own: three quarters of what a large product gains."""
 TARGET_OF_256_BITS = 2.65
-"""The same for VNNI of 256 bits (AVX2_VNNI), where the product gains 3.5 times, not 3.9 (docs/measurements/peers.md)."""
+"""The same for VNNI of 256 bits (AVX2_VNNI), where it gains 3.5 times, not 3.9 (docs/measurements/peers.md)."""
 TARGETS_OF_ORT = {"vit-s": 2.6, "resnet18": 2.8, "vla-45m": 2.44, "vit-b": 3.11, "action-expert": 3.47}
 """The same where ONNX Runtime alone runs the graph, without matrix units (AMX)."""
 SATURATING_TARGETS = {"vit-s": 1.65, "resnet18": 2.2, "vla-45m": 1.55, "vit-b": 1.65, "action-expert": 1.65}
