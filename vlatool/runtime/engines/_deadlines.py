@@ -38,12 +38,12 @@ class Watchdog:
         """
         call = object()
         with self._changed:
-            self._calls[call] = deadline, stop
             if self._wakes is None:
-                self._wakes = deadline
                 threading.Thread(target=self._watch, name="deadlines", daemon=True).start()
+                self._wakes = deadline  # not before: where no thread can be started, the next call tries again
             elif deadline < self._wakes:
                 self._changed.notify()
+            self._calls[call] = deadline, stop
         try:
             yield
         finally:
