@@ -199,8 +199,7 @@ def gone(pid: int) -> bool:
     ("number", "status", "says"),
     [
         (signal.SIGINT, 130, "interrupted; finished stages are kept\n"),
-        *small_or_full([], [(signal.SIGTERM, 143, "")]),
-        (signal.SIGKILL, -9, ""),
+        *small_or_full([], [(signal.SIGTERM, 143, ""), (signal.SIGKILL, -9, "")]),
     ],
 )
 def test_a_policy_that_hangs_can_be_ended(tmp_path, folder, number, status, says, group) -> None:
@@ -229,7 +228,9 @@ def test_ctrl_c_while_torch_exports_is_no_advice(tmp_path: Path, folder) -> None
     assert err.endswith("interrupted; finished stages are kept\n")
 
 
-@pytest.mark.parametrize("redirect", ["2>&-", ">&-", "<&-", ">&- 2>&-", "2>/dev/full"])
+@pytest.mark.parametrize(
+    "redirect", small_or_full(["<&- >&- 2>&-", "2>/dev/full"], ["2>&-", ">&-", "<&-", ">&- 2>&-", "2>/dev/full"])
+)
 def test_closed_and_full_streams_do_not_change_the_exit_code(float_bundle, redirect: str) -> None:
     shell = f'"{sys.executable}" -m vlatool inspect "{float_bundle.path}" {redirect}'
     assert subprocess.run(["sh", "-c", shell], check=False).returncode == 0
@@ -263,7 +264,7 @@ def test_an_error_keeps_its_code_with_stderr_closed(tmp_path: Path, folder) -> N
         assert subprocess.run(["sh", "-c", shell], check=False).returncode == 3
 
 
-@pytest.mark.parametrize("module", ["vlatool", "vlatool.cli"])
+@pytest.mark.parametrize("module", ["vlatool", *small_or_full([], ["vlatool.cli"])])
 def test_a_distribution_in_the_current_directory_adds_nothing(tmp_path, module):
     """``python -m`` puts the current directory on the search path, and names of methods are looked up along it."""
     info = tmp_path / "acme-1.0.dist-info"

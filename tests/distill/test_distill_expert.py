@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _full import small_or_full
 from _trainings import Killed, digest, distilled, killed_after, raise_killed, training_of
 from safetensors.numpy import load_file
 
@@ -149,8 +150,9 @@ def test_a_control_is_never_handed_out_silently(
 
 
 @pytest.mark.parametrize("options", [
-    {"alpha": 0.5, "label_share": 0.5}, {"alpha": 0}, {"control": "noise"}, {"alpha": 0.5, "patience": 9},
-], ids=["both", "expert", "noise", "patience"])  # fmt: skip
+    pytest.param({"alpha": 0.5, "label_share": 0.5, "patience": 9}, id="both and patience"),
+    *small_or_full([], [pytest.param({"alpha": 0}, id="expert"), pytest.param({"control": "noise"}, id="noise")]),
+])  # fmt: skip
 def test_however_often_it_is_killed_it_goes_on_to_the_same_bundle(
     pruned_once: Bundle, tmp_path: Path, options: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ):

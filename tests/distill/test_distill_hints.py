@@ -11,6 +11,7 @@ import pytest
 import torch
 from _deep import write_deep
 from _flow import write_flow
+from _full import small_or_full
 from _trainings import Killed, digest, distilled, killed_after, raise_killed, training_of
 from safetensors.numpy import load_file
 
@@ -143,7 +144,7 @@ def test_rows_that_are_held_out_are_judged_by_their_actions_alone(shallow: Bundl
     assert training_of(hinted)["losses"][0] > training_of(plain)["losses"][0] + 1e-3
 
 
-@pytest.mark.parametrize("batches", [True, False], ids=["batches", "rows"])
+@pytest.mark.parametrize("batches", small_or_full([True], [True, False]))
 def test_a_student_with_fewer_heads_and_neurons_is_compared_too(batches: bool, tmp_path: Path):
     folder = write_deep(tmp_path / "policy", *([MANY] if batches else []), layers=2)
     narrow = run_transform(

@@ -463,7 +463,7 @@ def kill_client() -> None:
                 child.kill()
 
 
-@pytest.mark.parametrize("how", ["server", "client"])
+@pytest.mark.parametrize("how", ["server", *small_or_full([], ["client"])])
 def test_the_connection_ends_while_files_are_sent(there, large, server, how):
     def tell(what: str, share: float | None) -> None:
         if what.startswith("sending") and share:
@@ -474,7 +474,7 @@ def test_the_connection_ends_while_files_are_sent(there, large, server, how):
         there.measure(large, tell=tell)
 
 
-@pytest.mark.parametrize("how", ["server", "client"])
+@pytest.mark.parametrize("how", ["client", *small_or_full([], ["server"])])
 def test_the_connection_ends_while_it_measures(there, bundle, server, how):
     def tell(what: str, _share: float | None) -> None:
         if what == "waiting":
@@ -525,7 +525,7 @@ def test_a_target_that_takes_nothing(there, large, monkeypatch):
     os.kill(bootstraps(there)[0], signal.SIGCONT)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", small_or_full([signal.SIGINT], [signal.SIGINT, signal.SIGKILL]))
 def test_a_command_that_is_ended_ends_the_run_there(there, bundle, tmp_path, number):
     code = f"""
     import sys
@@ -616,7 +616,7 @@ def ended_by(there: Target, bundle: Bundle, kill: Callable[[], None]) -> None:
         there.measure(bundle, do="wait", tell=tell)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGKILL, *small_or_full([], [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])])
 def test_a_signal_to_what_serves_the_run(there, bundle, number):
     ended_by(there, bundle, lambda: os.kill(bootstraps(there)[0], number))
 
@@ -636,7 +636,7 @@ def test_what_a_run_left_that_was_killed_with_its_guard_is_removed_by_the_next(t
     ("number", "said"),
     [
         (signal.SIGKILL, r"was killed \(SIGKILL\), as it is when memory runs out"),
-        (signal.SIGSEGV, "was ended by SIGSEGV"),
+        *small_or_full([], [(signal.SIGSEGV, "was ended by SIGSEGV")]),
     ],
 )
 def test_an_agent_that_is_killed(there, bundle, number, said):
@@ -644,7 +644,7 @@ def test_an_agent_that_is_killed(there, bundle, number, said):
         there.measure(bundle, do="die", signal=int(number))
 
 
-@pytest.mark.parametrize("code", [0, 1])
+@pytest.mark.parametrize("code", small_or_full([0], [0, 1]))
 def test_an_agent_that_ends_without_a_result(there, bundle, code):
     with pytest.raises(TargetError, match=f"ended with code {code} and without a result; .*ValueError: it broke"):
         there.measure(bundle, do="leave", code=code)

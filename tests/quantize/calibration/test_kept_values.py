@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _full import small_or_full
 from _recurrent import LENGTH, exported, recorded
 
 from vlatool.bundle.bundle import Bundle
@@ -91,7 +92,7 @@ def test_gptq_gives_layers_what_is_kept(tmp_path: Path, monkeypatch: pytest.Monk
     assert np.concatenate(seen).reshape(-1, 2)[:, 0].tolist() == 2 * list(range(1, LENGTH + 1))
 
 
-@pytest.mark.parametrize("stage", [StaticInt8(), DynamicInt8()])
+@pytest.mark.parametrize("stage", [StaticInt8(), *small_or_full([], [DynamicInt8()])])
 def test_a_recurrent_layer_that_stays_float32_is_named(tmp_path: Path, stage: Transform):
     """ONNX has one operator for nn.GRU, and none that multiplies its weights in int8."""
     said = {}
