@@ -6,6 +6,8 @@ import stat
 
 import pytest
 from _slots import OBSERVATION, bundle_of, install
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
@@ -57,6 +59,23 @@ def test_signing_twice_needs_force(run, tmp_path):
     assert run("sign", bundle.path, "--key", tmp_path / "key")[0] == 0
     assert run("sign", bundle.path, "--key", tmp_path / "key")[0] == 3
     assert run("sign", bundle.path, "--key", tmp_path / "key", "--force")[0] == 0
+
+
+def test_a_signature_for_other_tools_is_a_file_beside_the_bundle(run, tmp_path):
+    bundle, key = bundle_of(tmp_path / "one", 1), tmp_path / "key"
+    text = serialization
+    private = ec.generate_private_key(ec.SECP256R1())
+    key.write_bytes(private.private_bytes(text.Encoding.PEM, text.PrivateFormat.PKCS8, text.NoEncryption()))
+    key.chmod(0o600)
+    command = ("sign", bundle.path, "--key", key, "--openssf", tmp_path / "one.sig")
+    code, out, _ = run(*command, "--json")
+    assert (code, json.loads(out)["path"]) == (0, str(tmp_path / "one.sig"))
+    assert json.loads((tmp_path / "one.sig").read_text())["dsseEnvelope"]
+    code, _, err = run(*command)
+    assert (code, "exists already" in err) == (3, True)
+    assert run(*command, "--force")[0] == 0
+    assert run(*command, "--release", 1)[0] == 2
+    assert run("sign", "--new-key", tmp_path / "own", "--openssf", tmp_path / "x")[0] == 2
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from vlatool.runtime.control.late import LateController
 from vlatool.runtime.envelope import RobotLimits
 from vlatool.runtime.interface import CHUNK, FALLBACK, HOLD, POLICY, STOP, Action, Controller, Origin, origin_of
 from vlatool.runtime.stack import SWITCH_S, Fallback, Stack, TickRecord, build_stack, prepare_process
+from vlatool.runtime.telemetry import PARTS
 
 POSITIONS = TensorSpec("a", (1, 1, 2), labels=("x", "gripper"), mode="absolute")
 
@@ -102,6 +104,7 @@ def test_an_action_goes_through_all_layers_and_says_so():
         clock.now = step * 0.05 + 0.001
         action = stack.act({"t": step}, scheduled=step * 0.05)
         assert action[0] == [0, 100, 101, 101][step]
+        assert stack.telemetry.flush()
         np.testing.assert_array_equal(records[-1].action, action)
     assert [record.origin.source for record in records] == [POLICY, POLICY, CHUNK, HOLD]
     assert [record.missed for record in records] == [False, False, True, True]
@@ -119,6 +122,7 @@ def test_an_envelope_stops_the_robot_itself_where_it_can():
     _, stack, clock = built([0.0, 0.0, *[99.0] * 3], deadline_ms=10, envelope=Stopping, telemetry=records.append)
     first = [float(stack.act({"t": step})[0]) for step in range(6) for clock.now in [step * 0.05]]
     assert first == [0, 100, 101, -1, -2, -3], "the third miss escalates, and recovery takes five"
+    stack.close()
     assert [record.origin.source for record in records] == [POLICY, POLICY, CHUNK, STOP, STOP, STOP]
 
 
@@ -180,7 +184,9 @@ def test_a_sink_that_fails_does_not_stop_the_robot():
 
     _, stack, _ = built(telemetry=full)
     assert stack.act({"t": 1})[0] == 100
+    stack.close()
     assert stack.failed_records == 1
+    assert stack.telemetry.outlets[0].error == "OSError: no space left on device"
 
 
 def test_an_error_is_recorded_and_raised_where_nothing_answers():
@@ -188,6 +194,7 @@ def test_an_error_is_recorded_and_raised_where_nothing_answers():
     _, stack, _ = built([99.0], deadline_ms=10, telemetry=records.append)
     with pytest.raises(DeadlineMissed):
         stack.act({"t": 0})
+    stack.close()
     assert (records[0].missed, records[0].action, records[0].origin) == (True, None, Origin(""))
 
 
@@ -462,6 +469,27 @@ def test_a_second_policy_with_another_form_of_rotations_is_refused():
     other = spec_of(action=replace(first.action, convert=(turning,)))
     with pytest.raises(UsageError, match="other rotations"):
         build_stack(NumberedPolicy(first), fallback=NumberedPolicy(other))
+
+
+@pytest.mark.parametrize("more", [{}, {"deadline_ms": 90}, {"deadline_ms": 90, "controllers": ["temporal_ensemble"]}])
+def test_the_layers_of_a_stack_say_where_its_time_went(tmp_path: Path, more: dict[str, Any]):
+    labels = ("x", "z")
+    pose = TensorSpec("x", (1, 2), labels=labels)
+    action = TensorSpec("y", (1, 2), labels=labels, mode="absolute")
+    path = written(tmp_path / "bundle", "g (float[1,2] x) => (float[1,2] y) { y = Neg(x) }", (pose,), (action,)).path
+    records: list[TickRecord] = []
+    stack = load(path, threads=1, seed=0, telemetry=records.append, **more)
+    assert isinstance(stack, Stack)
+    for _ in range(5):
+        stack.act({"x": [1.0, 2.0]}, scheduled=time.monotonic() - 0.001)
+    stack.close()
+    for each in records:
+        parts = dict(zip(PARTS, each.parts_ms, strict=True))
+        assert sum(each.parts_ms) + each.waited_ms == pytest.approx(each.answer_ms)
+        assert min(parts[name] for name in ("encode", "infer", "decode", "control")) > 0
+        assert (parts["handover"] > 0) is ("deadline_ms" in more)
+        assert parts["envelope"] == 0
+        assert each.waited_ms >= 1
 
 
 @pytest.mark.parametrize(

@@ -46,11 +46,12 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "deploy": ("deployment",),
     "rollback": ("store",),
     "status": ("store",),
-    "sign": ("signature", "key"),
+    "sign": ("signature", "openssf", "key"),
     "verify-signature": ("signature",),
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
     "run": ("dry_run",),
+    "serve": ("served",),
     "simulate": ("simulation",),
     "telemetry": ("telemetry",),
     "profiles list": ("profiles",),
@@ -98,6 +99,7 @@ PLAN = record(
 )  # fmt: skip
 PHASE = record(name=TEXT, runs=INTEGER, ms=NUMBER, shares=by_name(NUMBER), parts=by_name(NUMBER))
 SHIFT = record(recorded=TEXT, installed=TEXT)
+PART_TIME = record(part=TEXT, steps=INTEGER, mean_ms=NUMBER, p50_ms=NUMBER, p99_ms=NUMBER, max_ms=NUMBER, share=NUMBER)
 GAUGE = record(unit=TEXT, min=NUMBER, mean=NUMBER, max=NUMBER, times=many(NUMBER), values=many(NUMBER), note=TEXT)
 COUNTER = record(unit=TEXT, difference=NUMBER, seconds=NUMBER, note=TEXT)
 SLOT = record(
@@ -209,6 +211,8 @@ def _documents_of_deployment() -> dict[str, Schema]:
                                shadow=SHADOW),
         "signature": document("A signature of a bundle.", path=TEXT, schema=INTEGER, bundle=TEXT, release=INTEGER,
                               key=TEXT, signature=TEXT),
+        "openssf": document("A signature of a bundle for the tools of OpenSSF Model Signing.", path=TEXT, bundle=TEXT,
+                            key=TEXT),
         "key": document("A key that was made.", private=TEXT, public=TEXT, key=TEXT),
     }  # fmt: skip
 
@@ -224,6 +228,12 @@ def _documents_of_machines() -> dict[str, Schema]:
             bundle=TEXT, robot=TEXT, period_ms=NUMBER, deadline_ms=NUMBER, layers=many(record(layer=TEXT, does=TEXT)),
             inference=SPREAD, answer=SPREAD, missed=NUMBER,
             rungs=many(record(source=TEXT, time={"anyOf": [SPREAD, {"type": "null"}]})),
+            cadence=record(parts=many(PART_TIME), misses=INTEGER),
+        ),
+        "served": document(
+            "What was served; times until an answer in ms where there were answers.",
+            bundle=TEXT, addresses=by_name(TEXT), seconds=NUMBER, requests=INTEGER, missed=INTEGER, failed=INTEGER,
+            times=by_name(NUMBER), lost_records=INTEGER,
         ),
         "simulation": document(
             "Predicted, not measured; latency_ms: value, low, high.",

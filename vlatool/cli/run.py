@@ -65,14 +65,18 @@ def run(
 
 def lines(found: DryRun) -> Iterator[str]:
     """Return what a person reads: the layers from the robot inwards, then the times."""
+    from vlatool.runtime.telemetry.cadence import cadence_lines
+
     yield f"{found.bundle}{f' on {found.robot}' if found.robot else ''}, from the robot to the graphs:"
     width = max(len(note.layer) for note in found.layers)
     for note in found.layers:
         yield f"  {note.layer:{width}}  {note.does}"
+    yield from found.engine.lines()
     yield f"control period {found.period_ms:g} ms, deadline {found.deadline_ms:g} ms"
     yield f"  inference  p50 {found.inference.p50:.3f} ms, p99 {found.inference.p99:.3f} ms"
     share = f"{found.missed:.1%} of {found.answer.samples} steps without an action of the policy in time"
     yield f"  act        p50 {found.answer.p50:.3f} ms, p99 {found.answer.p99:.3f} ms; {share}"
+    yield from cadence_lines(found.cadence)
     yield "a control step is answered by the first of these that has an action:"
     for number, rung in enumerate(found.rungs):
         time = "" if rung.time is None else f"  p50 {rung.time.p50:.3f} ms, p99 {rung.time.p99:.3f} ms"

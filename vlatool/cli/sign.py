@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -29,12 +30,19 @@ def sign(
         Path | None,
         typer.Option("--new-key", help="make a key: this file, for you alone, and its public key in FILE.pub"),
     ] = None,
+    openssf: Annotated[
+        Path | None,
+        typer.Option(help="write an OpenSSF model signature to this file instead; the key is ECDSA, P-256 to P-521"),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="replace a signature that exists")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Sign a bundle with Ed25519: every file of it, and the number of its release."""
     from vlatool.deployment import signature
 
+    if openssf is not None and (bundle is None or release is not None):
+        raise UsageError("--openssf signs a BUNDLE, and that format has no release number.",
+                         "write: vlatool sign BUNDLE --key KEY --openssf FILE")  # fmt: skip
     if (new_key is None) == (bundle is None) or (key is None) != (bundle is None):
         given = {"BUNDLE": bundle, "--key": key, "--new-key": new_key}
         names = [name for name, value in given.items() if value is not None]
@@ -44,11 +52,24 @@ def sign(
         _answer_key(as_json, signature.new_key(Path(new_key or "")), signature)
         return
     opened = Bundle.open(bundle)
+    if openssf is not None:
+        _sign_openssf(as_json, opened, key, openssf, force)
+        return
     if not force and (bundle / signature.SIGNATURE).exists():
         raise OutputError(f"{bundle} is signed already.", "pass --force to sign it again")
     made = signature.sign(opened, key, release or time.time_ns() // 10**9)
     line = f"{bundle}: release {made.release} signed with the key {made.key[:16]}"
     answer(as_json, {**asdict(made), "path": str(bundle / signature.SIGNATURE)}, [line])
+
+
+def _sign_openssf(as_json: bool, bundle: Bundle, key: Path, output: Path, force: bool) -> None:
+    from vlatool.deployment import openssf
+
+    if not force and os.path.lexists(output):
+        raise OutputError(f"{output} exists already.", "pass --force to replace it")
+    public = openssf.sign(bundle, key, output)
+    line = f"{output}: OpenSSF signature of {bundle.path} with the key {public[:16]}"
+    answer(as_json, {"path": str(output), "bundle": bundle.hash, "key": public}, [line])
 
 
 def _answer_key(as_json: bool, public: Path, module: Any) -> None:

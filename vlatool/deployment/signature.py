@@ -109,7 +109,9 @@ def sign(bundle: Bundle, key: Path, release: int) -> Signature:
         OutputError: when the signature cannot be written.
         MissingExtra: without ``cryptography``.
     """
-    private = _private_key(key)
+    private = private_key(key)
+    if not isinstance(private, _ed25519().Ed25519PrivateKey):
+        raise SignatureError(f"{key} is a private key, but not of Ed25519.", NEW_KEY)
     text = _serialization()
     public = private.public_key().public_bytes(text.Encoding.Raw, text.PublicFormat.Raw).hex()
     signature = Signature(bundle.hash, release, public, private.sign(signed_bytes(bundle.hash, release)).hex())
@@ -194,15 +196,22 @@ def public_key(path: Path) -> str:
     return str(key.public_bytes(text.Encoding.Raw, text.PublicFormat.Raw).hex())
 
 
-def _private_key(path: Path) -> Any:
+def private_key(path: Path, fix: str = NEW_KEY) -> Any:
+    """Return the private key in a PEM file, of whatever kind.
+
+    Args:
+        path: its file, which nobody else can read.
+        fix: what to do when it is not one.
+
+    Raises:
+        SignatureError: when it cannot be read, is not a private key, has a passphrase, or others can read it.
+        MissingExtra: without ``cryptography``.
+    """
     text, content = _serialization(), _key_bytes(path, private=True)
     try:
-        key = text.load_pem_private_key(content, None)
+        return text.load_pem_private_key(content, None)
     except Exception as error:
-        raise SignatureError(f"{path} is not a private key in PEM without a passphrase.", NEW_KEY) from error
-    if not isinstance(key, _ed25519().Ed25519PrivateKey):
-        raise SignatureError(f"{path} is a private key, but not of Ed25519.", NEW_KEY)
-    return key
+        raise SignatureError(f"{path} is not a private key in PEM without a passphrase.", fix) from error
 
 
 def _key_bytes(path: Path, *, private: bool = False) -> bytes:

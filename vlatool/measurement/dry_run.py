@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,12 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import GateFailed
 from vlatool.runtime import load
+from vlatool.runtime.arguments import RECORD
+from vlatool.runtime.engine_record import EngineRecord
 from vlatool.runtime.interface import POLICY
 from vlatool.runtime.rungs import PolicyRung
-from vlatool.runtime.stack import Fallback, Stack, TickRecord, rate_factor
+from vlatool.runtime.stack import Fallback, Stack, rate_factor
+from vlatool.runtime.telemetry.cadence import Cadence, CadenceReport
 
 OBSERVATIONS = 16
 
@@ -80,7 +83,9 @@ class DryRun:
         inference: Times of ``infer`` of the open bundle alone.
         answer: Times of ``act`` of all layers, called at the rate of the robot.
         missed: Share of the control steps at which the policy had no action in time.
+        engine: What the engine ran of the bundle, on what and in which precision.
         rungs: What answers a control step, in the order in which it is asked, each with the time of an answer.
+        cadence: Where the time of the control steps went, all but the first.
     """
 
     bundle: str
@@ -91,11 +96,13 @@ class DryRun:
     inference: Spread
     answer: Spread
     missed: float
+    engine: EngineRecord
     rungs: tuple[RungNote, ...]
+    cadence: CadenceReport
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
-        return asdict(self)
+        return {**asdict(self), "engine": self.engine.to_dict()}
 
     def check(self) -> None:
         """Refuse a policy that a robot would hardly ever hear; raises GateFailed."""
@@ -129,15 +136,15 @@ def dry_run(
     Raises:
         UsageError, SpecError, BundleError, GraphError: as ``vlatool.runtime.load`` does.
     """
-    plain = load(path, engine=engine, threads=threads, seed=0)
+    plain = load(path, engine=engine, threads=threads, seed=0, engine_proof=RECORD)
     rate = plain.spec.rate * rate_factor(controllers)
     period_ms = 1000 / rate
     limit_ms = period_ms if deadline_ms is None else deadline_ms
     second = None if fallback is None else load(fallback, threads=threads, seed=0)
-    records: list[TickRecord] = []
+    cadence = Cadence(steps)
     options = Fallback(second, neutral=neutral)
     stack = load(path, engine=engine, threads=threads, seed=0, controllers=controllers, envelope=robot or None,
-                 deadline_ms=limit_ms, fallback=options, telemetry=records.append)  # fmt: skip
+                 deadline_ms=limit_ms, fallback=options, telemetry=_without_first(cadence))  # fmt: skip
     if not isinstance(stack, Stack):
         raise TypeError("a deadline makes a stack")
     bundle = Bundle.open(path)
@@ -154,8 +161,10 @@ def dry_run(
         tuple(LayerNote(type(layer).__name__, _what(layer)) for layer in stack.layers),
         inference,
         Spread.of(answers),
-        sum(record.missed for record in records[1:]) / steps,
+        cadence.report().misses / steps,
+        plain.engine_record(),
         tuple(_rungs(stack, [inference, *others])),
+        cadence.report(),
     )
 
 
@@ -175,9 +184,13 @@ def _paced(stack: Stack, observations: Sequence[Any], count: int, rate: float) -
     for number in range(count + 1):
         time.sleep(max(0.0, begin + number / rate - time.monotonic()))
         called = time.perf_counter_ns()
-        stack.act(observations[number % len(observations)])
+        stack.act(observations[number % len(observations)], scheduled=begin + number / rate)
         times.append((time.perf_counter_ns() - called) / 1e6)
     return times[1:]
+
+
+def _without_first(cadence: Cadence) -> Callable[[Any], None]:
+    return lambda record: cadence(record) if record.step else None
 
 
 def _what(layer: Any) -> str:

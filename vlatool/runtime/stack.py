@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,11 @@ from vlatool.runtime.control.fallback import HOLD_S, FallbackLadder
 from vlatool.runtime.interface import FALLBACK, STOP, Array, Controller, Origin, Policy, layers_of, origin_of
 from vlatool.runtime.policy import BundlePolicy
 from vlatool.runtime.rungs import ChunkRung, Hold, PolicyRung, Rung, Stop, start_pose
+from vlatool.runtime.telemetry.cadence import Stopwatch
+from vlatool.runtime.telemetry.record import Delivery, Sink, TickRecord
+from vlatool.runtime.telemetry.writer import Telemetry
 
+__all__ = ["Fallback", "Sink", "Stack", "TickRecord", "Wrapper", "build_stack", "prepare_process"]
 SWITCH_S = 0.0005
 """Longest that one Python thread may keep another from running, where there is a deadline: Python's own 5 ms would be
 added to the answer when an inference is in Python code at its deadline (``sys.setswitchinterval``)."""
@@ -86,43 +90,13 @@ class Fallback:
             raise UsageError("policy_ms is for a second policy, and there is none.", "pass Fallback(policy=...), too")
 
 
-class TickRecord(NamedTuple):
-    """What one control step was like.
-
-    Args:
-        step: Number of the step since the stack was built, from 0.
-        started: Time at which it was to begin, in seconds of the clock.
-        waited_ms: Time until the call of ``act``.
-        answer_ms: Time from when it was to begin until its action was there.
-        missed: Whether the policy had no action.
-        rung: Index of the rung that answered, 0 for the policy.
-        level: Index of the rung that the ladder stands on afterwards.
-        origin: Where the action comes from.
-        error: Why the policy had no action; empty where it had one.
-        action: A copy of the action.
-    """
-
-    step: int
-    started: float
-    waited_ms: float
-    answer_ms: float
-    missed: bool
-    rung: int
-    level: int
-    origin: Origin
-    error: str
-    action: Array | None
-
-
-Sink = Callable[[TickRecord], Any]
-
-
 class Stack:
     """A controller of several layers.
 
     Args:
         controller: The outermost layer.
-        telemetry: Called with the record of each control step. What it raises is counted, not passed on.
+        telemetry: What gets the record of each control step, in a thread of its own (``Telemetry``): a function of it,
+            or a ``Telemetry`` with several.
         clock: Returns seconds.
 
     Raises:
@@ -133,23 +107,21 @@ class Stack:
         self,
         controller: Controller,
         *,
-        telemetry: Sink | None = None,
+        telemetry: Sink | Telemetry | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        if telemetry is not None and not callable(telemetry):
-            raise UsageError(
-                f"telemetry is a {type(telemetry).__name__}; allowed: a function of a record, or None.",
-                "pass a function, such as records.append",
-            )
+        self.telemetry = telemetry if telemetry is None or isinstance(telemetry, Telemetry) else Telemetry(telemetry)
+        """What gets the records; None without telemetry."""
         self.controller = controller
         self.layers = layers_of(controller)
         self.policy = self.layers[-1]
         self.spec: PolicySpec = self.policy.spec
         self.ladder = next((layer for layer in self.layers if isinstance(layer, FallbackLadder)), None)
         self.deadlines = [layer for layer in self._all() if isinstance(layer, Deadline)]
-        self.failed_records = 0
-        """Records that the sink did not take."""
-        self._sink, self._clock, self._step = telemetry, clock, 0
+        self._alarms = [layer for layer in self.layers if hasattr(layer, "alarms")]
+        beside = any(getattr(layer, "background", False) for layer in self.layers)
+        self._stopwatch = Stopwatch(self._chains(), beside=beside)
+        self._clock, self._step, self._answered = clock, 0, 0.0
         self._stop = (
             None
             if self.ladder is None
@@ -159,11 +131,19 @@ class Stack:
         )
         self._stopped = False
 
+    def _chains(self) -> list[list[Any]]:
+        """Return the layers of each policy."""
+        below = [] if self.ladder is None else self.ladder.rungs[1:]
+        return [self.layers, *(layers_of(rung.controller) for rung in below if isinstance(rung, PolicyRung))]
+
     def _all(self) -> list[Any]:
         """Return the layers, those of a second policy after them."""
-        below = [] if self.ladder is None else self.ladder.rungs[1:]
-        return self.layers + [layer for rung in below if isinstance(rung, PolicyRung)
-                              for layer in layers_of(rung.controller)]  # fmt: skip
+        return [layer for chain in self._chains() for layer in chain]
+
+    @property
+    def failed_records(self) -> int:
+        """Records that sinks did not take."""
+        return 0 if self.telemetry is None else self.telemetry.failure_count
 
     @property
     def fresh(self) -> bool:
@@ -176,22 +156,26 @@ class Stack:
         origin = origin_of(self.controller)
         return origin._replace(source=STOP) if self._stopped else origin
 
-    def act(self, observation: Mapping[str, Any], *, scheduled: float | None = None) -> Array:
+    def act(
+        self, observation: Mapping[str, Any], *, scheduled: float | None = None, sensed: float | None = None
+    ) -> Array:
         """Return the action of this control step: (A,) float32, or a 0-d int64 index of a discrete action.
 
         Args:
             observation: As ``infer`` takes it.
             scheduled: Time of the clock at which the step was to begin, from which the deadline counts; now when None.
+            sensed: Time of the clock at which the (oldest) value of the observation was measured, for telemetry.
 
         Raises:
             Exception: what the policy raised, where no layer has an action.
         """
-        called = self._clock() if scheduled is None or self._sink is not None else scheduled
+        called = self._clock() if scheduled is None or self.telemetry is not None else scheduled
         started = called if scheduled is None else scheduled
         for deadline in self.deadlines:
             deadline.started = started
-        if self._sink is None:
+        if self.telemetry is None:
             return self._act(observation)
+        self._stopwatch.begin()
         action, error = None, ""
         try:
             action = self._act(observation)
@@ -200,7 +184,12 @@ class Stack:
             error = f"{type(caught).__name__}: {caught}"
             raise
         finally:
-            self._record(started, called, action, error)
+            self._record(started, called, sensed, action, error)
+
+    def note_delivery(self) -> None:
+        """Say that the last action has reached the robot, for telemetry."""
+        if self.telemetry is not None:
+            self.telemetry.put(Delivery(self._step - 1, (self._clock() - self._answered) * 1e3))
 
     def _act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of the controller, or the next of the envelope's proven stop where it has none."""
@@ -216,30 +205,34 @@ class Stack:
             except UsageError:  # the envelope does not know yet where the robot is
                 raise error from None
 
-    def _record(self, started: float, called: float, action: Array | None, error: str) -> None:
+    def _record(self, started: float, called: float, sensed: float | None, action: Array | None, error: str) -> None:
         rung, level, cause = 0, 0, error
         if self.ladder is not None:
             rung, level = self.ladder.rung, self.ladder.level
             cause = cause or ("" if self.ladder.error is None else str(self.ladder.error))
-        now = self._clock()
+        self._answered = now = self._clock()
         waited_ms, answer_ms = (called - started) * 1e3, (now - started) * 1e3
         origin = self.origin if action is not None else Origin("")
         copied = None if action is None else np.array(action)  # what a sink does to it must not reach the robot
-        record = TickRecord(self._step, started, waited_ms, answer_ms, bool(cause), rung, level, origin, cause, copied)
+        self.telemetry.put(  # type: ignore[union-attr]
+            TickRecord(
+                self._step, started, waited_ms, answer_ms, bool(cause), rung, level, origin, cause, copied,
+                None if sensed is None else (started - sensed) * 1e3, self._stopwatch.parts_ms(answer_ms - waited_ms),
+                tuple(name for layer in self._alarms for name in layer.alarms),
+            )
+        )  # fmt: skip
         self._step += 1
-        try:
-            self._sink(record)  # type: ignore[misc]
-        except Exception:  # the seam: a full disk is no reason to stop the robot
-            self.failed_records += 1
 
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode of every layer; see ``Controller.reset``."""
         self.controller.reset(seed)
 
     def close(self) -> None:
-        """End the threads of the deadlines."""
+        """End the threads of the deadlines and of the telemetry, which writes what is left."""
         for deadline in self.deadlines:
             deadline.close()
+        if self.telemetry is not None:
+            self.telemetry.close()
 
 
 def build_stack(
@@ -249,7 +242,7 @@ def build_stack(
     envelope: str | Wrapper | None = None,
     deadline_ms: float | None = None,
     fallback: Fallback | Policy | None = None,
-    telemetry: Sink | None = None,
+    telemetry: Sink | Telemetry | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Stack:
     """Return the layers around a policy.
@@ -261,7 +254,7 @@ def build_stack(
             and never used, and a fallback answers. ``load`` also calls ``prepare_process``.
         fallback: What acts without an action in time, beside the rest of the last chunk, a hold and a stop: another
             policy, or a ``Fallback``.
-        telemetry: Called with a ``TickRecord`` after each control step.
+        telemetry: Gets a ``TickRecord`` of each control step, off its path: a function, or ``Telemetry(...)``.
         clock: Returns seconds.
 
     Raises:
@@ -324,8 +317,8 @@ def _check_layers(controllers: Any, envelope: Any, telemetry: Any) -> None:
     if envelope is not None and not isinstance(envelope, str) and not callable(envelope):
         raise UsageError(f"envelope is {envelope!r:.80}; allowed: the name of a robot, or a function that wraps a "
                          "controller.", 'pass envelope="franka-panda"')  # fmt: skip
-    if telemetry is not None and not callable(telemetry):
-        raise UsageError(f"telemetry is {telemetry!r:.80}; allowed: a function that takes a record.",
+    if telemetry is not None and not callable(telemetry) and not isinstance(telemetry, Telemetry):
+        raise UsageError(f"telemetry is {telemetry!r:.80}; allowed: a function that takes a record, or Telemetry(...).",
                          "pass telemetry=records.append")  # fmt: skip
 
 

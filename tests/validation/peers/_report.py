@@ -23,7 +23,9 @@ TOLERANCE = 0.02
 BUDGET = 0.04
 ENGINE = "ort_cpu"
 TARGET = 3.0
-"""Speed-up that is wanted where int8 has instructions of its own."""
+"""Speed-up that is wanted where int8 has instructions of its own: three quarters of what a large product gains."""
+TARGET_OF_256_BITS = 2.65
+"""The same for VNNI of 256 bits (AVX2_VNNI), where it gains 3.5 times, not 3.9 (docs/measurements/peers.md)."""
 TARGETS_OF_ORT = {"vit-s": 2.6, "resnet18": 2.8, "vla-45m": 2.44, "vit-b": 3.11, "action-expert": 3.47}
 """The same where ONNX Runtime alone runs the graph, without matrix units (AMX)."""
 SATURATING_TARGETS = {"vit-s": 1.65, "resnet18": 2.2, "vla-45m": 1.55, "vit-b": 1.65, "action-expert": 1.65}
@@ -209,9 +211,15 @@ class Table:
         inside = [row for row in ours if row.error <= BUDGET]
         if not inside:
             return Check(False, f"(b) none of ours has an error of at most {BUDGET}")
-        target = SATURATING_TARGETS.get(self.workload, 0.0) if self.saturates else TARGET
+        target = self._target()
         reached = self.speedup(inside[0])[0] >= target
         return Check(reached, f"(b) our fastest at error <= {BUDGET}: {self.told(inside[0])}; wanted {target:g}x")
+
+    def _target(self) -> float:
+        """Return the speed-up that is wanted on this instruction set."""
+        if self.saturates:
+            return SATURATING_TARGETS.get(self.workload, 0.0)
+        return TARGET_OF_256_BITS if self.set == "AVX2_VNNI" else TARGET
 
     def _check_fastest(self, own: Contestant, peer: Contestant) -> Check:
         text = f"(c) our fastest {self.told(own)} takes {self.share(own, peer)} of the time of the fastest peer "

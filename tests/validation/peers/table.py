@@ -37,6 +37,7 @@ from vlatool.machine.host import isa  # noqa: E402
 from vlatool.machine.instruction_sets import rung  # noqa: E402
 
 PACKAGES = ("torch", "torchao", "onnx", "onnxruntime", "openvino", "nncf", "numpy")
+UNITS = ("avx2", "avx_vnni", "avx512f", "avx512_vnni", "avx512_bf16", "amx_int8", "amx_bf16")
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
@@ -177,9 +178,7 @@ def processor() -> str:
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     facts = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
     flags = facts.get("flags", "").split()
-    units = [
-        flag for flag in ("avx2", "avx512f", "avx512_vnni", "avx512_bf16", "amx_int8", "amx_bf16") if flag in flags
-    ]
+    units = [flag for flag in UNITS if flag in flags]
     return f"{facts.get('model name', platform.machine())} ({', '.join(units)}), {os.cpu_count()} cores"
 
 

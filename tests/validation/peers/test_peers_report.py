@@ -61,6 +61,13 @@ def test_a_set_without_vnni_has_targets_of_its_own():
     assert not checks([measured("ours:static-int8", 25.0), rows[1]])["(b)"]
 
 
+def test_vnni_of_256_bits_gains_less_than_that_of_512():
+    rows = [measured("ours:static-int8", 15.0), measured("ort:static", 30.0)]
+    assert checks(rows, "AVX2_VNNI")["(b)"], "2.67x"
+    assert not checks(rows, "AVX512_CORE_VNNI")["(b)"]
+    assert not checks([measured("ours:static-int8", 15.5), rows[1]], "AVX2_VNNI")["(b)"]
+
+
 def test_the_share_of_the_reachable_adds_up_what_each_dtype_would_take():
     half = measured("ours:static-int8", 40.0, int8=0.5, float32=0.5)
     table = Table("vit-s", [half, measured("ort:static", 60.0), *LIMITS], "cpu", 2**31)

@@ -16,7 +16,6 @@ import itertools
 import sys
 import tempfile
 import time
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,10 @@ from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.envelope import RobotLimits, envelope_of
 from vlatool.runtime.stack import Fallback, Stack
+from vlatool.runtime.telemetry import Telemetry
+from vlatool.runtime.telemetry.cadence import Cadence
+from vlatool.runtime.telemetry.json_lines import JsonLines
+from vlatool.runtime.telemetry.prometheus import Prometheus
 
 SHARES = (10, 50, 99, 99.9)
 ROBOT = "franka-panda"
@@ -49,21 +52,30 @@ def small_bundle(folder: Path) -> str:
 
 
 def differences(
-    path: str, pairs: int, deadline_ms: float | None = None, robot: str | None = None, seen: Any = None
+    path: str,
+    pairs: int,
+    deadline_ms: float | None = None,
+    robot: str | None = None,
+    seen: Any = None,
+    *,
+    telemetry_on: bool = True,
 ) -> dict[str, np.ndarray]:
     """Return microseconds of the bare calls, of the stack's, and stack minus bare of each pair.
 
     Args:
         robot: Whose envelope is around the stack; its clock goes on by a control period with each step.
         seen: Observations; recorded or random ones when None.
+        telemetry_on: Whether lines of JSON, a file for Prometheus and a cadence report are written meanwhile.
     """
     plain = load(path, threads=1, seed=0)
     spec = plain.spec
     neutral = spec.action.labels[-1] if spec.action.kind == "discrete" else ""
     hold = Fallback(start=np.zeros(spec.action.robot_width), neutral=neutral)
-    sink: deque[Any] = deque(maxlen=1000)
+    folder = Path(path).parent
+    sinks = JsonLines(folder / "run.jsonl"), Prometheus(folder / "run.prom"), Cadence()
     limit = 0.9e3 / spec.rate if deadline_ms is None else deadline_ms
-    stack = load(path, threads=1, seed=0, envelope=robot, deadline_ms=limit, fallback=hold, telemetry=sink.append)
+    telemetry = Telemetry(*sinks) if telemetry_on else None
+    stack = load(path, threads=1, seed=0, envelope=robot, deadline_ms=limit, fallback=hold, telemetry=telemetry)
     assert isinstance(stack, Stack)
     if robot is not None:
         envelope = stack.controller.envelope
@@ -81,10 +93,11 @@ def differences(
             calls[kind](pair % len(observations))
             times[kind] = (time.perf_counter_ns() - begin) / 1e3
             times[2 + kind] = (time.process_time_ns() - used) / 1e3
-            counts &= kind == 0 or (stack.fresh and not sink[-1].missed)
+            counts &= kind == 0 or (stack.fresh and stack.ladder.error is None)
         if pair >= 200 and counts:
             for values, value in zip(taken, times, strict=True):
                 values.append(value)
+    stack.close()
     bare, whole, bare_used, whole_used = map(np.array, taken)
     return {"bare run()": bare, "stack": whole, "stack minus bare, in pairs": whole - bare,
             "the same of the processor's time": whole_used - bare_used}  # fmt: skip
@@ -127,6 +140,7 @@ def main() -> None:
     parser.add_argument("bundle", nargs="?", default="")
     parser.add_argument("--small", action="store_true", help="the small policy in the place of a bundle")
     parser.add_argument("--layers", action="store_true", help="each layer around the small policy by itself")
+    parser.add_argument("--without-telemetry", action="store_true", help="the same stack without its sinks")
     parser.add_argument("--pairs", type=int, default=20_000)
     parser.add_argument("--deadline-ms", type=float)
     options = parser.parse_args()
@@ -135,9 +149,11 @@ def main() -> None:
         if options.layers:
             found = layers(small_bundle(Path(folder)), pose, options.pairs)
         elif options.small:
-            found = differences(small_bundle(Path(folder)), options.pairs, options.deadline_ms, ROBOT, [pose])
+            found = differences(small_bundle(Path(folder)), options.pairs, options.deadline_ms, ROBOT, [pose],
+                                telemetry_on=not options.without_telemetry)  # fmt: skip
         else:
-            found = differences(options.bundle, options.pairs, options.deadline_ms)
+            found = differences(options.bundle, options.pairs, options.deadline_ms,
+                                telemetry_on=not options.without_telemetry)  # fmt: skip
     for name, values in found.items():
         shown = ", ".join(f"p{share:g} {np.percentile(values, share):.1f}" for share in SHARES)
         print(f"{name}: {shown} us (of {len(values)})")

@@ -43,6 +43,8 @@ class AsynchronousController(ChunkQueue):
         check_whole("delay", delay, 0)
         check_whole("memory", memory, 1)
         self._elements = ActionElements(policy.spec.action)
+        self.background = background
+        """Whether inferences run in a thread of their own."""
         self._inference: Inference = BackgroundInference(policy) if background else PlayedInference(policy, delay)
         self._delays: deque[int] = deque(maxlen=memory)
         self._first_delay = delay

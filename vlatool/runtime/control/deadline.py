@@ -48,6 +48,10 @@ class Deadline:
         """Time of the clock at which the control step was to begin; the call of ``infer`` when None or after it."""
         self._clock = clock
         self._worker = Worker("vlatool-inference", clock) if worker is None else worker
+        self.spent_ns: tuple[int, int, int, int] | None = None
+        """Nanoseconds of the last ``infer``: encoding, graphs (or all, where nobody says it or there is no action),
+        decoding, and the way to the thread and back."""
+        self._timed = next((layer for layer in layers_of(policy) if hasattr(layer, "spent_ns")), None)
         self._engine = next((layer for layer in layers_of(policy) if _stops(layer)), None)
         self._reset: tuple[int | None] | None = None
 
@@ -63,15 +67,21 @@ class Deadline:
             DeadlineMissed: when the inference does not end in time, or an earlier one that was stopped still runs.
             DataError, GraphError, UsageError: as the policy's ``infer`` does.
         """
-        now = self._clock()
+        now, begin = self._clock(), time.perf_counter_ns()
         started = now if self.started is None else min(self.started, now)
         inference = _Inference(self.policy, self._engine, observation, noise, self._reset)
         try:
             action: Action = self._worker.call(inference, started + self.deadline_ms / 1e3)
         except TimeoutError as error:
+            self.spent_ns = 0, time.perf_counter_ns() - begin, 0, 0
             raise DeadlineMissed(f"There is no action within {self.deadline_ms:g} ms: {error}.") from None
         self._reset = None
+        self._note(time.perf_counter_ns() - begin)
         return action
+
+    def _note(self, taken: int) -> None:
+        spent = None if self._timed is None else self._timed.spent_ns
+        self.spent_ns = (0, taken, 0, 0) if spent is None else (*spent[:3], taken - sum(spent))
 
     def observe(self, observation: Mapping[str, Any]) -> None:
         """Give the policy the observation of a control step at which it does not infer."""

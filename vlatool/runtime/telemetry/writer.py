@@ -1,0 +1,157 @@
+"""Threads that take records out of a ring and write them, so that a control step never waits for a file."""
+
+from __future__ import annotations
+
+import atexit
+import threading
+import time
+import weakref
+from typing import Any
+
+from vlatool.errors import UsageError
+from vlatool.runtime.arguments import check_positive, check_whole
+from vlatool.runtime.telemetry.record import Sink
+from vlatool.runtime.telemetry.ring import Reader, Ring
+
+SIZE, PERIOD_S, END_S = 4096, 0.1, 2.0
+_OPEN: weakref.WeakSet[Telemetry] = weakref.WeakSet()
+
+
+class Telemetry:
+    """Passes records to sinks, each in a thread of its own, which a control step never waits for.
+
+    ``put`` stores a record in a ring and returns. A sink that blocks loses the oldest records, and they are counted;
+    what it raises is counted, too, and neither reaches the robot or another sink. A thread gives way to others after
+    each record.
+
+    Args:
+        sinks: Functions of a record, such as ``JsonLines`` and ``Prometheus``.
+        size: Number of records that the ring holds.
+        period_s: Time between two looks into the ring, in seconds.
+
+    Raises:
+        UsageError: when a sink cannot be called, or a number is out of its range.
+    """
+
+    def __init__(self, *sinks: Sink, size: int = SIZE, period_s: float = PERIOD_S) -> None:
+        check_whole("size", size, 1, 10**7)
+        check_positive("period_s", period_s, "a number of seconds")
+        for sink in sinks:
+            if not callable(sink):
+                raise UsageError(
+                    f"telemetry is {sink!r:.80}; allowed: a function of a record, or Telemetry(...).",
+                    'pass records.append, or Telemetry(JsonLines("log.jsonl"))',
+                )
+        ring = Ring(size)
+        self.put = ring.put
+        self.outlets = tuple(Outlet(sink, Reader(ring), period_s) for sink in sinks)
+        """What takes the records of each sink."""
+        _OPEN.add(self)
+        weakref.finalize(self, _finish, self.outlets).atexit = False
+
+    @property
+    def drop_count(self) -> int:
+        """Records that were overwritten before a sink took them."""
+        return sum(outlet.reader.dropped for outlet in self.outlets)
+
+    @property
+    def failure_count(self) -> int:
+        """Records that sinks did not take."""
+        return sum(outlet.failed for outlet in self.outlets)
+
+    def flush(self, seconds: float = END_S) -> bool:
+        """Wait until all records that are in the ring now are written; returns whether they are after that time."""
+        end = time.monotonic() + seconds
+        written = [outlet.flush(max(0.0, end - time.monotonic())) for outlet in self.outlets]
+        return all(written)
+
+    def close(self, seconds: float = END_S) -> bool:
+        """Write what is left and end the threads; one that is blocked is left alone after that time."""
+        end = time.monotonic() + seconds
+        _finish(self.outlets)
+        ended = [outlet.join(max(0.0, end - time.monotonic())) for outlet in self.outlets]
+        return all(ended)
+
+
+class Outlet:
+    """The thread of one sink.
+
+    Attributes:
+        failed: Records that the sink did not take.
+        error: The last reason; empty without one.
+    """
+
+    def __init__(self, sink: Sink, reader: Reader, period_s: float) -> None:
+        self.sink, self.reader, self.failed, self.error = sink, reader, 0, ""
+        self._period_s = period_s
+        self._wake, self._idle = threading.Event(), threading.Event()
+        self._ends = False
+        self._thread = threading.Thread(target=self._work, name="vlatool-telemetry", daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        while not self._ends:
+            self._wake.wait(self._period_s)
+            self._wake.clear()
+            self._write()
+            self._idle.set()
+        self._write()
+        self._call("close")
+
+    def _write(self) -> None:
+        """Pass on all records that are there."""
+        while (record := self.reader.take()) is not None:
+            try:
+                self.sink(record)
+            except Exception as error:  # the seam: a full disk is no reason to stop the robot
+                self._note(error)
+            time.sleep(0)  # the control step goes first
+        self._call("flush")
+
+    def _call(self, method: str) -> None:
+        try:
+            getattr(self.sink, method, _nothing)()
+        except Exception as error:  # as above
+            self._note(error)
+
+    def _note(self, error: Exception) -> None:
+        self.failed += 1
+        self.error = f"{type(error).__name__}: {error}"
+
+    def flush(self, seconds: float) -> bool:
+        """Wait until the thread has looked into the ring; see ``Telemetry.flush``."""
+        if not self._thread.is_alive():
+            return True
+        self._idle.clear()
+        self._wake.set()
+        first = self._idle.wait(seconds)  # it may have been in the middle of a look that began before
+        self._idle.clear()
+        self._wake.set()
+        return first and self._idle.wait(seconds)
+
+    def finish(self) -> None:
+        """Let the thread end after what is in the ring."""
+        self._ends = True
+        self._wake.set()
+
+    def join(self, seconds: float) -> bool:
+        """Wait until the thread has ended; returns whether it has."""
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+
+def _nothing() -> Any:
+    return None
+
+
+def _finish(outlets: tuple[Outlet, ...]) -> None:
+    for outlet in outlets:
+        outlet.finish()
+
+
+def _close_all() -> None:
+    for telemetry in list(_OPEN):
+        telemetry.close(END_S)
+
+
+atexit.register(_close_all)
