@@ -22,7 +22,7 @@ from vlatool.remote.deployment import change_on
 SCRIPT = Path(__file__).with_name("robot_stack.py")
 EXACT, ROUNDED, PROMISE = 0.0, 1e-6, 1e-9
 """Largest differences: of counts, of actions in float32, and of what an envelope sends, also from its limits."""
-KINDS = {"actions": ("actions of {} controllers", ROUNDED), "commands": ("commands of {} envelopes", PROMISE),
+KINDS = {"actions": ("actions: {} controllers, modes", ROUNDED), "commands": ("envelopes: {} robots, modes", PROMISE),
          "excess": ("excess over the limits", PROMISE), "deadline": ("graphs without end, stopped", EXACT),
          "updates": ("deploy, trial, rollback", EXACT)}  # fmt: skip
 """First word of an array -> its row, and the largest difference from this host."""
@@ -44,16 +44,17 @@ def stack_rows(
 
         options = ["--steps", "1000", "--bundles", make_all(cache.folder / "bundles" / "stack")]
     found = []
-    for words, name, more in (([sys.executable], "here", {}), (python, "there", path)):
+    emulated = board_python(folder / "python", python, path)
+    for word, name in ((sys.executable, "here"), (str(emulated), "there")):
         file = folder / f"{name}.npz"
-        place = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1", **more}
-        done = subprocess.run([*words, SCRIPT, "-o", file, *options], env=place, check=False, cwd=ROOT)
+        place = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+        done = subprocess.run([word, SCRIPT, "-o", file, *options], env=place, check=False, cwd=ROOT)
         if done.returncode:
             return [Row(where, "layers", None, EXACT, CRASHED, note=f"{name}: left with {done.returncode}")]
         with np.load(file) as arrays:
             found.append({key: arrays[key] for key in arrays.files})
     rows = compared_stacks(where, *found)
-    return rows if parts != "all" else [*rows, through_ssh(where, python, path, cache)]
+    return rows if parts != "all" else [*rows, through_ssh(where, emulated, cache.folder / "bundles" / "stack")]
 
 
 def compared_stacks(where: tuple[str, ...], here: dict[str, Any], there: dict[str, Any]) -> list[Row]:
@@ -76,10 +77,22 @@ def _apart(here: Any, there: Any) -> float:
     return float(np.abs(here - there).max(initial=0.0))
 
 
-def through_ssh(where: tuple[str, ...], python: Sequence[str], path: dict[str, str], cache: Emulators) -> Row:
+def board_python(file: Path, python: Sequence[str], path: dict[str, str]) -> Path:
+    """Write a script that is the board's Python, also for its child processes: Python takes it for itself."""
+    emulator, *words = python
+    variables = " ".join(f"{name}='{value}'" for name, value in path.items())
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"#!/bin/sh\n{variables} exec '{emulator}' -0 '{file}' {' '.join(words)} \"$@\"\n")
+    file.chmod(0o755)
+    return file
+
+
+def through_ssh(where: tuple[str, ...], board: Path, bundles: Path) -> Row:
     """Return the row of a deployment to the board through a real ssh, with a server on this host.
 
-    A session's Python is the board's: a script around the emulator, which Python takes for itself.
+    Args:
+        board: Python that the sessions use.
+        bundles: Folder of the two bundles.
     """
     title = "deploy, status, rollback by ssh"
     missing = [name for name in ("pytest", "psutil", "asyncssh") if importlib.util.find_spec(name) is None]
@@ -88,15 +101,10 @@ def through_ssh(where: tuple[str, ...], python: Sequence[str], path: dict[str, s
     sys.path.insert(0, str(ROOT / "tests/remote"))
     from _ssh_server import serving, target
 
-    bundles, seen = cache.folder / "bundles" / "stack", []
+    seen = []
     conditions = Conditions(runs=2, latency_ms=0, memory_mb=0, first_run_s=600, seconds=0, ticks=0)
     with tempfile.TemporaryDirectory() as name, serving(Path(name)) as server:
         server.session("")
-        board = Path(name, "python-of-the-board")
-        emulator, *words = python
-        variables = " ".join(f"{key}='{value}'" for key, value in path.items())
-        board.write_text(f"#!/bin/sh\n{variables} exec '{emulator}' -0 '{board}' {' '.join(words)} \"$@\"\n")
-        board.chmod(0o755)
         for action in (*(["deploy", each] for each in ("one", "two")), ["status"], ["rollback"]):
             bundle = bundles / action[1] if action[1:] else None
             found = change_on(

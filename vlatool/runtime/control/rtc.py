@@ -14,7 +14,7 @@ from vlatool.errors import SpecError
 from vlatool.runtime.action_elements import STOPPABLE_MODES, minimum_jerk
 from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.control.asynchronous import AsynchronousController
-from vlatool.runtime.interface import Array, Policy
+from vlatool.runtime.interface import HOLD, Array, Policy
 
 LEFT_OVER, DELAY, HORIZON = "prev_chunk_left_over", "inference_delay", "execution_horizon"
 """Inputs of a graph that joins the chunks itself, named as LeRobot names them."""
@@ -74,15 +74,17 @@ class RealTimeController(AsynchronousController):
         super()._forget()
         self._chunk: Array = np.empty((0, 0), np.float32)
         self._moves: list[Array] = []
-        """Actions that were sent since the inference started that runs, or that ran last."""
+        """Actions of chunks that were sent since the inference started that runs, or that ran last."""
 
     def _start(self, observation: Mapping[str, Any]) -> bool:
         self._moves = []
         return super()._start(observation)
 
     def _next(self) -> Array:
-        self._moves.append(super()._next())
-        return self._moves[-1]
+        action = super()._next()
+        if self.origin.source != HOLD:
+            self._moves.append(action)
+        return action
 
     def _due(self) -> bool:
         bridged = self._steps > 0 and len(self._pending) <= self.expected_delay
