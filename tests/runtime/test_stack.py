@@ -495,7 +495,7 @@ def test_the_layers_of_a_stack_say_where_its_time_went(tmp_path: Path, more: dic
 @pytest.mark.parametrize(
     "more",
     [{"deadline_ms": 1000}, {"deadline_ms": 1000, "fallback": NumberedPolicy(spec_of(2, 1, POSITIONS, hz=1))},
-     {"controllers": ["rtc:background=true"]}, {"deadline_ms": 1000, "envelope": Stopping}],
+     {"controllers": ["rtc:background=true"]}, {"deadline_ms": 1000, "envelope": Stopping}, {"telemetry": [].append}],
 )  # fmt: skip
 def test_the_threads_of_a_stack_that_nobody_holds_end_without_close(more: dict[str, Any]):
     before = set(threading.enumerate())

@@ -17,7 +17,7 @@ from vlatool.accuracy.disturbance_drops import with_disturbed, without_effect
 from vlatool.accuracy.episode_choice import with_episode
 from vlatool.accuracy.success_comparison import Outcome, compare_success, repeated_starts, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.bundle.spec import PolicySpec
+from vlatool.bundle.manifest import Manifest
 from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
@@ -166,7 +166,7 @@ class ClosedLoop(Measure):
         layers(self.controller, delayed=self.latency_in_the_loop)
         _refuse_real_time(self.controller)
         if source is not None and not self.control:
-            build_controller(_Unopened(source.manifest.spec), self.controller, int(self.latency_in_the_loop))
+            build_controller(_Unopened(source.manifest), self.controller, int(self.latency_in_the_loop))
         if "strength" in self.options() and not self.disturb:
             raise UsageError("--strength is of disturbances, and none is named.", "add --disturb all")
         jobs = self._jobs(source)
@@ -390,10 +390,10 @@ def _refuse_real_time(controllers: Sequence[str]) -> None:
 
 
 class _Unopened:
-    """A policy of which the spec alone is known, with which controllers check their options."""
+    """A policy of which the manifest alone is known, with which controllers check their options."""
 
-    def __init__(self, spec: PolicySpec) -> None:
-        self.spec = spec
+    def __init__(self, manifest: Manifest) -> None:
+        self.spec, self.program = manifest.spec, manifest.program
 
     def infer(self, observation: Mapping[str, Any], *, noise: Any = None) -> Action:
         raise NotImplementedError

@@ -13,7 +13,7 @@ from _numbered import MOVES, NumberedPolicy, spec_of
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SpecError, UsageError
-from vlatool.runtime.control import build_controller
+from vlatool.runtime.control import build_controller, rtc
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.rtc import RealTimeController
 from vlatool.runtime.interface import Controller
@@ -55,6 +55,54 @@ def test_a_seam_jumps_no_more_than_the_inside_of_chunks(mode: str, delay: int):
     late.error = 0.3
     jumps, seams = played(build_controller(late, [f"late:delay={delay}"]), 400)
     assert change[fresh[1:]].max() < 0.7 * np.abs(np.diff(jumps[:, 0]))[seams[1:]].max()
+
+
+class Homing(NumberedPolicy):
+    """Moves to 0 from where it sees the robot, with an error that changes from chunk to chunk."""
+
+    def infer(self, observation: Mapping[str, Any], *, noise: Any = None) -> Any:
+        action = super().infer(observation, noise=noise)
+        way = -float(observation["x"]) * 0.3 * 0.7 ** np.arange(self.spec.chunk) + 0.02 * (-1) ** len(self.asked)
+        return action._replace(chunk=np.column_stack([way, np.ones(self.spec.chunk)]).astype(np.float32))
+
+
+def distances(mode: str, delay: int, share: float, monkeypatch: pytest.MonkeyPatch) -> np.ndarray[Any, Any]:
+    """Return how far a robot is from where it should be, late in an episode."""
+    monkeypatch.setattr(rtc, "RETURN", share)
+    controller = RealTimeController(Homing(spec_of(8, 4, action=replace(MOVES, mode=mode))), delay=delay)
+    places = [1.0]
+    for step in range(300):
+        places.append(places[-1] + controller.act({"t": step, "x": places[-1]})[0])
+    return np.abs(places[100:])
+
+
+@pytest.mark.parametrize("mode", ["delta", "velocity"])
+@pytest.mark.parametrize("delay", [4, 8])
+def test_what_was_done_otherwise_since_the_observation_is_made_up_for(
+    mode: str, delay: int, monkeypatch: pytest.MonkeyPatch
+):
+    ours, without = (distances(mode, delay, share, monkeypatch) for share in (rtc.RETURN, 0.0))
+    assert ours.max() < 0.75 * without.max()
+
+
+class Stopping(NumberedPolicy):
+    """Moves by steps of 1 in its first chunk, and not at all in the next ones."""
+
+    def infer(self, observation: Mapping[str, Any], *, noise: Any = None) -> Any:
+        action = super().infer(observation, noise=noise)
+        return action._replace(chunk=np.full((self.spec.chunk, 2), float(len(self.asked) == 1), np.float32))
+
+
+def test_a_seam_leads_half_of_the_way_back_without_a_jump(monkeypatch: pytest.MonkeyPatch):
+    played_at = {}
+    for share in (0.0, 1.0, rtc.RETURN):
+        monkeypatch.setattr(rtc, "RETURN", share)
+        controller = RealTimeController(Stopping(spec_of(16, 8)), delay=4, blend=8)
+        played_at[share] = played(controller, 16)[0][:, 0]
+        assert played_at[share][:12].tolist() == [1.0] * 12, "asked again at step 8, and the chunk is there at step 12"
+    none, whole, ours = (actions[12:].sum() for actions in played_at.values())
+    assert ours == pytest.approx((none + whole) / 2)
+    assert np.abs(np.diff(played_at[rtc.RETURN])).max() < 1
 
 
 class Constant(NumberedPolicy):

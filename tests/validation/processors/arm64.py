@@ -1,7 +1,9 @@
 """The runtime on emulated 64-bit ARM: does every bundle load there, and answer what it answers here?
 
+And the layers around a policy (controllers, envelope, deadline, updates, deployment through ssh): the same as here?
+
 Usage: python tests/validation/processors/arm64.py [--sources SOURCE ...] [--cores CORE ...] [--onnxruntime VERSION ...]
-           [--newest] [--observations COUNT] [--jobs COUNT] [-o out/processors]
+           [--newest] [--observations COUNT] [--stack PARTS] [--jobs COUNT] [-o out/processors]
 
 Prints a table of agreement with this host, which computes the same observations from the same bundles. Exits 1 when a
 row is above its limit, when a bundle does not load, and when one loads that ARM computes otherwise. Never a timing:
@@ -24,6 +26,7 @@ from _asked import CRASHED, ROOT, Answer, ask
 from _emulation import RUNTIME, EmulationError, Emulators, Unreachable
 from _planted import plant
 from _rungs import CPUINFO, model
+from _stack_rows import stack_rows
 from _variants import FLOAT, FOR_ARM, SAMPLES, Made, VariantError, make
 from _verdicts import Difference, Row, difference, exit_code, summed_up, table
 
@@ -35,6 +38,7 @@ CORES = ("cortex-a76", "cortex-a72")
 OLDEST = "1.23.2"
 """The oldest ONNX Runtime that vlatool takes, and the newest for Python 3.10."""
 PLANTED = "planted"
+PARTS = ("all", "controllers", "none")
 PREPARATION = Path(__file__).with_name("preparation.py")
 PIXEL = 1e-5
 """Largest difference of a normalised pixel: 600 times less than a step of 1/255 makes."""
@@ -48,6 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cache.folder.mkdir(parents=True, exist_ok=True)
         fetch(cache, given.onnxruntime)
         rows = [row for source in given.sources for row in rows_of(source, given, cache)]
+        if given.stack != "none":
+            board = (given.cores[0], given.onnxruntime[-1])
+            rows += stack_rows(board, *emulated(board, cache), cache, given.stack)
     except Unreachable as error:
         print(f"make arm64: skipped, nothing was tried: {error}")
         return 0
@@ -63,11 +70,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sources", nargs="+", default=SAMPLES, help="what vlatool export takes")
+    parser.add_argument(
+        "--sources", nargs="*", default=SAMPLES, help="what vlatool export takes; none for the stack alone"
+    )
     parser.add_argument("--cores", nargs="+", default=CORES, help="as QEMU calls them")
     parser.add_argument("--onnxruntime", nargs="+", default=(OLDEST, OrtCpuSession.version()), help="versions")
     parser.add_argument("--newest", action="store_true", help="only the version that this host runs")
     parser.add_argument("--observations", type=int, default=8, help="of each recording, spread evenly; 0: all")
+    parser.add_argument("--stack", choices=PARTS, default=PARTS[0], help="what is tried of the layers around a policy")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="boards at the same time")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/processors"), help="cache, bundles and answers")
     given = parser.parse_args(arguments)

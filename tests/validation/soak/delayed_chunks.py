@@ -57,7 +57,7 @@ def allow(environment: Any, steps: int) -> None:
 
 def play(worker: Worker, job: EpisodesJob, controller: str, delay_ms: float) -> dict[str, Any]:
     """Play an episode; return how it ended."""
-    (outcome,) = worker.play(replace(job, latency_ms=delay_ms, controller=(controller,)))
+    (outcome,) = worker.play(replace(job, latency_ms=delay_ms, controller=tuple(controller.split(","))))
     motion = {name: outcome.motion.get(name) for name in MOTION}
     return {"controller": controller, "delay_ms": delay_ms, "task": job.task, "seed": job.seeds[0],
             "success": outcome.success, "steps": outcome.steps, **motion}  # fmt: skip

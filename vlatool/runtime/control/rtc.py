@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -11,10 +12,10 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SpecError
-from vlatool.runtime.action_elements import STOPPABLE_MODES
+from vlatool.runtime.action_elements import STOPPABLE_MODES, minimum_jerk
 from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.control.asynchronous import AsynchronousController
-from vlatool.runtime.interface import Array, Policy
+from vlatool.runtime.interface import HOLD, Array, Policy
 
 LEFT_OVER, DELAY, HORIZON = "prev_chunk_left_over", "inference_delay", "execution_horizon"
 """Inputs of a graph that joins the chunks itself, named as LeRobot names them."""
@@ -23,6 +24,9 @@ MAX_BLEND = 10
 PACED_MODES = ("delta", "velocity", "absolute")
 """Action modes of which it is known how a chunk is executed more slowly."""
 ROUNDING = 1e-6
+RETURN = 0.5
+"""Share of a missed way that a seam makes up for. With 1, two seams would amplify each other where the policy does not
+see where the robot is, since the way back of the first counts as missed at the second."""
 
 
 class RealTimeController(AsynchronousController):
@@ -33,7 +37,9 @@ class RealTimeController(AsynchronousController):
     padded by holding, how many of its actions are expected to be executed during the inference, and how many there
     are; its new chunk is then executed as it is. Otherwise, the first actions of the new chunk are blended with the
     rest of the old one: the share of the new one at the fraction x of the seam is 3 x^2 - 2 x^3, so that the
-    actions change no faster where the seam begins and ends than within it.
+    actions change no faster where the seam begins and ends than within it. Differences and velocities do not say where
+    the robot is to be: they are then changed so that the seam makes up for half of the way (``RETURN``) by which it
+    would otherwise miss where the new chunk wants it.
 
     If an inference takes more than half of the time that a chunk covers, the chunk would be used up before the next
     one is there. Chunks are then executed more slowly, by interpolation, so that they last (``stretch``).
@@ -70,6 +76,18 @@ class RealTimeController(AsynchronousController):
     def _forget(self) -> None:
         super()._forget()
         self._chunk: Array = np.empty((0, 0), np.float32)
+        self._moves: list[Array] = []
+        """Actions of chunks that were sent since the inference started that runs, or that ran last."""
+
+    def _start(self, observation: Mapping[str, Any]) -> bool:
+        self._moves = []
+        return super()._start(observation)
+
+    def _next(self) -> Array:
+        action = super()._next()
+        if self.origin.source != HOLD:
+            self._moves.append(action)
+        return action
 
     def _due(self) -> bool:
         bridged = self._steps > 0 and len(self._pending) <= self.expected_delay
@@ -96,12 +114,41 @@ class RealTimeController(AsynchronousController):
         """
         old, new = last, self._before()
         seam = min(self._seam, len(self._pending))
+        planned = [*self._skipped(), *self._pending[:seam]]
         for index, action in enumerate(self._pending[:seam]):
             if index < len(before):
                 old, new = before[index], action
             fraction = (index + 1) / (seam + 1)
             shifted = self._elements.shift(action, new, old)
             self._pending[index] = self._elements.mix(shifted, action, fraction**2 * (3 - 2 * fraction))
+        if seam and self.policy.spec.action.mode in STOPPABLE_MODES:
+            self._return(planned, seam)
+
+    def _return(self, planned: list[Array], seam: int) -> None:
+        """Change the actions of a seam so that it ends closer to where the new chunk wants the robot to be then.
+
+        Without this, what the old chunk did otherwise since the observation, and what blending adds, would stay. The
+        way back has least jerk.
+
+        Args:
+            planned: Actions of the new chunk from the observation to the end of the seam, each (A,).
+            seam: Number of control steps.
+        """
+        elements = self._elements
+        ways = planned, [*self._moves, *self._pending[:seam]]
+        wanted, expected = (functools.reduce(elements.add, way) for way in ways)
+        missing = elements.difference(expected, wanted)
+        for index in range(seam):
+            share = RETURN * (minimum_jerk((index + 1) / seam) - minimum_jerk(index / seam))
+            self._pending[index] = elements.add(elements.part(missing, share), self._pending[index])
+
+    def _skipped(self) -> list[Array]:
+        """Return the actions of the chunk that are left out of it, of the last one a part."""
+        whole = int(self._executed + ROUNDING)
+        rows, share = list(self._chunk[: whole + 1]), self._executed - whole
+        if len(rows) > whole:
+            rows[whole] = self._elements.part(rows[whole], max(0.0, share))
+        return rows
 
     def _before(self) -> Array:
         """Return what the chunk has for the control step before this one; before its beginning, its first step."""
