@@ -35,6 +35,8 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "metaworld": ("metaworld", "mujoco"),
     "text": ("tokenizers",),
     "sign": ("cryptography",),
+    "remote": ("websockets", "msgpack"),
+    "serve": ("websockets", "msgpack", "grpcio", "pyzmq"),
     "search": ("optuna",),
     "tensorboard": ("tensorboard",),
     "video": ("pillow",),

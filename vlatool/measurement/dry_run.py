@@ -151,7 +151,7 @@ def dry_run(
     observations = observations_for(bundle, OBSERVATIONS)
     inference = Spread.of(_times(plain.infer, observations, steps))
     others = [] if second is None else [Spread.of(_times(second.infer, observations, steps))]
-    answers = _paced(stack, observations, steps, rate)
+    answers = play_paced(stack, observations, steps, rate)
     stack.close()
     return DryRun(
         f"{bundle.manifest.name} {bundle.manifest.version}",
@@ -178,8 +178,8 @@ def _times(call: Any, observations: Sequence[Any], count: int) -> list[float]:
     return times[len(observations) :]
 
 
-def _paced(stack: Stack, observations: Sequence[Any], count: int, rate: float) -> list[float]:
-    """Return the milliseconds of control steps at the rate of the robot in Hz, from the call; the first one apart."""
+def play_paced(stack: Stack, observations: Sequence[Any], count: int, rate: float) -> list[float]:
+    """Play control steps at the robot's rate in Hz; return the milliseconds of each from its call, but the first."""
     times, begin = [], time.monotonic()
     for number in range(count + 1):
         time.sleep(max(0.0, begin + number / rate - time.monotonic()))

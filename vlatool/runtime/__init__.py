@@ -62,6 +62,7 @@ def load(
     deadline_ms: float | None = ...,
     fallback: Any = ...,
     telemetry: Sink | Telemetry | None = ...,
+    record: str | os.PathLike[str] | None = ...,
 ) -> Policy | Stack: ...
 
 
@@ -83,6 +84,7 @@ def load(
     deadline_ms: float | None = None,
     fallback: str | os.PathLike[str] | Fallback | Any = None,
     telemetry: Sink | Telemetry | None = None,
+    record: str | os.PathLike[str] | None = None,
 ) -> Policy | Stack:
     """Load a bundle, verify it, open its graphs and warm them up.
 
@@ -111,6 +113,8 @@ def load(
             says by itself is looked at: its providers, devices and the dtype that it was asked for.
         controllers, envelope, deadline_ms, fallback, telemetry: Layers around the policy (``stack.build_stack``); with
             any of them a ``Stack`` is returned. ``fallback`` may be the directory of a second bundle, too.
+        record: New file in which each control step of the ``Stack`` is recorded, so that ``vlatool replay`` computes it
+            again. Without a ``seed`` one is drawn, and recorded.
 
     Raises:
         BundleError: the directory is missing, incomplete, changed or too new.
@@ -135,18 +139,29 @@ def load(
         from vlatool.runtime.probe import probe as run_once
 
         run_once(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
+    seed = _drawn_seed() if seed is None and record is not None else seed
     traced = bool(engine_proof)
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb, traced=traced)
     policy.engine_reason = reason
     bundle.verify()
     policy.warm_up(max(warmup, traced), golden_tolerance, first_run_s)
     _check_record(policy, engine_proof)
-    layers = {"controllers": controllers, "envelope": envelope, "deadline_ms": deadline_ms, "telemetry": telemetry}
-    if fallback is None and all(layer is None for layer in layers.values()):
+    layers: dict[str, Any] = {
+        "controllers": controllers,
+        "envelope": envelope,
+        "deadline_ms": deadline_ms,
+        "telemetry": telemetry,
+    }
+    if fallback is None and record is None and all(layer is None for layer in layers.values()):
         return policy
+    second = ""
     if isinstance(fallback, str | os.PathLike):
         fallback = load(fallback, threads=threads, seed=seed, accept=accept)
-    return _stack_of(policy, fallback=fallback, **layers)
+        second = fallback.identity if record is not None else ""
+    given: dict[str, Any] = {**layers, "fallback": fallback, "controllers": controllers or ()}
+    if record is None:
+        return _stack_of(policy, given)
+    return _recorded(policy, given, record, threads=threads, seed=seed, second=second)
 
 
 def _chosen(bundle: Bundle) -> tuple[str, str]:
@@ -170,10 +185,29 @@ def _check_record(policy: Policy, proof: str) -> None:
         warnings.warn(f"{record.library}: {problem}", RuntimeWarning, stacklevel=3)
 
 
-def _stack_of(policy: Policy, **layers: Any) -> Stack:
+def _stack_of(policy: Policy, layers: dict[str, Any]) -> Stack:
     """Return the layers around a policy, in a process that is prepared for a deadline."""
     from vlatool.runtime.stack import build_stack, prepare_process
 
     if layers["deadline_ms"] is not None:
         prepare_process()
-    return build_stack(policy, **{**layers, "controllers": layers["controllers"] or ()})
+    return build_stack(policy, **layers)
+
+
+def _recorded(policy: Policy, layers: dict[str, Any], path: Any, **about: Any) -> Stack:
+    """Return the layers around a policy, which are recorded; without a file when they make no sense."""
+    from vlatool.runtime.stack import header_of
+    from vlatool.runtime.telemetry.recorder import Recorder
+
+    recorder = Recorder(path)
+    try:
+        recorder.begin_run(header_of(policy, layers, **about))
+        return _stack_of(policy, {**layers, "recorder": recorder})
+    except BaseException:
+        recorder.close()
+        os.unlink(path)
+        raise
+
+
+def _drawn_seed() -> int:
+    return int.from_bytes(os.urandom(4), "little")
