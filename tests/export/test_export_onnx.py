@@ -221,7 +221,7 @@ def test_an_operator_that_an_older_opset_lacks_is_named(float_bundle, tmp_path: 
 def test_large_weights_go_beside_the_graph(source_bundle, tmp_path: Path, monkeypatch):
     import vlatool.export.onnx
 
-    monkeypatch.setattr(vlatool.export.onnx, "EXTERNAL_DATA_BYTES", 8)
+    monkeypatch.setattr(vlatool.export.onnx, "BESIDE_BYTES", 8)
     made = export(source_bundle, tmp_path / "out")
     assert made.manifest.files["graphs/main.onnx.data"].bytes > 1000
     assert load(made.path, threads=1).golden_error == pytest.approx(0, abs=1e-6)

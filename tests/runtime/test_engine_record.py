@@ -20,6 +20,7 @@ from vlatool.bundle.manifest import Graph
 from vlatool.errors import GraphError, UsageError
 from vlatool.runtime.engine import NodeRun, engine_class
 from vlatool.runtime.engine_record import EngineRecord, graph_record
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import Policy
 
 INT8_PRODUCT = """<ir_version: 10, opset_import: ["" : 20]>
@@ -162,6 +163,16 @@ def test_each_difference_from_what_was_asked_for_is_said(session: Any, promised:
 
 def test_weights_alone_promise_no_precision_of_the_computation() -> None:
     assert record_of(Ran(replace(PRODUCT, precision="float32")), CARD, int4_weights=0.9, float32=0.1).problems == ()
+
+
+def test_an_engine_without_a_trace_runs_and_is_said_not_to_tell(float_bundle: Bundle, monkeypatch: Any) -> None:
+    class Older(OrtCpuSession):
+        def __init__(self, path: Path, threads: int | None = None, compute: str = "", opened: Any = None) -> None:
+            super().__init__(path, threads, compute, opened)
+
+    monkeypatch.setattr("vlatool.runtime.policy.engine_class", lambda _: Older)
+    policy = vlatool.load(float_bundle.path, threads=1, engine_proof="record")
+    assert policy.engine_record().problems == ("graph 'main': the engine tells of no node that it ran.",)
 
 
 def test_what_is_computed_in_bfloat16_is_promised_so() -> None:

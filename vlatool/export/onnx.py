@@ -28,7 +28,6 @@ from vlatool.module.memory import refuse_kept_values
 from vlatool.module.proven_export import WHERE_DIFFERENT, CalledSession, proven_export
 from vlatool.module.sharded_weights import graph_weights, stored_modules, takes_shards, weights_on_demand
 from vlatool.module.to_onnx import (
-    EXTERNAL_DATA_BYTES,
     IMPORTS,
     OPSET,
     weight_bytes,
@@ -50,6 +49,9 @@ if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
 
+BESIDE_BYTES = 256_000_000
+"""Weights above this go into a file beside the graph, which engines map: OpenVINO holds those in a graph twice. A graph
+ends at protobuf's 2 GiB anyway."""
 LOWEST_OPSET = 18
 """Lowest opset of torch's dynamo exporter; graphs are written in an older one afterwards."""
 RANDOM_OBSERVATIONS = 4
@@ -181,7 +183,7 @@ class ExportOnnx(Transform):
         exporters = tuple(EXPORTERS) if self.exporter == "auto" else (self.exporter,)
         exported = proven_export(session, arguments, max(self.opset, LOWEST_OPSET), self.tolerance, exporters)
         (out / "graphs").mkdir(exist_ok=True)
-        beside = beside or weight_bytes(session.module) > EXTERNAL_DATA_BYTES
+        beside = beside or weight_bytes(session.module) > BESIDE_BYTES
         graphs = {name: Graph(f"graphs/{name}.onnx", {"float32": 1.0}, self.opset)}
         changing = changing_feeds(program, name) if self.loop_invariants else None
         cut = None if changing is None else cut_loop_invariants(exported.model, changing)

@@ -156,7 +156,7 @@ def load(
         return policy
     second = ""
     if isinstance(fallback, str | os.PathLike):
-        fallback = load(fallback, threads=threads, seed=seed, accept=accept)
+        fallback = load(fallback, threads=threads, seed=seed, accept=accept, engine_proof=engine_proof)
         second = fallback.identity if record is not None else ""
     given: dict[str, Any] = {**layers, "fallback": fallback, "controllers": controllers or ()}
     if record is None:

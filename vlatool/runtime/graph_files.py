@@ -45,7 +45,7 @@ def open_graph(
         GraphError: when the engine refuses the graph.
     """
     with engine_call(engine, f"opened the graph '{graph.file.rpartition('/')[2].removesuffix('.onnx')}'"):
-        more: dict[str, Any] = {"traced": True} if traced and getattr(engine, "traces", False) else {}
+        more: dict[str, Any] = {"traced": True} if traced and _traces(engine) else {}
         more |= {"shapes": shapes} if getattr(engine, "caches", False) else {}
         return _opened(bundle, graph, functools.partial(engine, **more), threads)
 
@@ -67,6 +67,13 @@ def _opened(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: i
             stack.enter_context(bundle.verified_folder(folder, beside))
         keyed = _cache_key(bundle, engine, [graph.file, *beside])
         return engine(path, threads, graph.compute, own / name, **keyed)
+
+
+def _traces(engine: Callable[..., Any]) -> bool:
+    """Return whether sessions of an engine tell what they ran; a subclass may have an ``__init__`` of before."""
+    import inspect  # a robot without a record does without
+
+    return getattr(engine, "traces", False) and "traced" in inspect.signature(engine).parameters
 
 
 def _cache_key(bundle: Bundle, engine: Callable[..., Any], files: Iterable[str]) -> dict[str, str]:

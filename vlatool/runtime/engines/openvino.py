@@ -20,6 +20,7 @@ from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, NodeRun, Profiled, Stages
+from vlatool.runtime.engines._mapped_weights import drop_mapped_pages
 from vlatool.runtime.engines._openvino_core import openvino_core
 from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, node_runs, precision, products
 from vlatool.runtime.engines._sequences import joins_a_sequence
@@ -112,6 +113,8 @@ class OpenvinoSession(Engine):
             ) from error
         self.path = path
         self._check_execution()
+        if isinstance(content, Path):
+            drop_mapped_pages(content.parent)
         self.precision = str(self._compiled.get_property("INFERENCE_PRECISION_HINT").get_type_name())
         if self.precision != self.hints[compute]:
             raise GraphError(
