@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, TypeGuard, overload
 
 from vlatool.errors import refuse_two_distributions
 from vlatool.runtime.arguments import check_load
@@ -16,12 +16,16 @@ from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
 if TYPE_CHECKING:
+    from vlatool.bundle.spec import PolicySpec
+    from vlatool.runtime.remote_policy import RemotePolicy
     from vlatool.runtime.stack import Fallback, Stack, Wrapper
     from vlatool.runtime.telemetry import Sink, Telemetry
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 AUTO = "auto"
 """Name that stands for the engine that a bundle was made for."""
+REMOTE_PREFIX, KEY_VARIABLE = "remote:", "VLATOOL_SERVE_KEY"
+"""What stands before the URL of a policy of another machine; the environment variable with the key that it asks for."""
 
 
 @overload
@@ -99,7 +103,9 @@ def load(
             bundles of others. Whatever the child does, it is killed after ``first_run_s`` and 60 s for its start. Takes
             as long as loading twice and starting Python.
         controllers, envelope, deadline_ms, fallback, telemetry: Layers around the policy (``stack.build_stack``); with
-            any of them a ``Stack`` is returned. ``fallback`` may be the directory of a second bundle, too.
+            any of them a ``Stack`` is returned. ``fallback`` may be the directory of a second bundle, too, or the URL
+            of a policy that another machine serves (``remote:ws://HOST:PORT``). So may the path: then a ``Stack`` is
+            returned, what is said of loading is for the fallback, and without one the server has to be there now.
 
     Raises:
         BundleError: the directory is missing, incomplete, changed or too new.
@@ -114,6 +120,11 @@ def load(
 
     refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
+    layers = {"controllers": controllers, "envelope": envelope, "deadline_ms": deadline_ms, "telemetry": telemetry}
+    if is_remote(path):
+        return _remote_stack(str(path), fallback, layers, engine=engine, threads=threads, seed=seed, warmup=warmup,
+                             golden_tolerance=golden_tolerance, accept=accept, first_run_s=first_run_s,
+                             memory_mb=memory_mb, probe=probe)  # fmt: skip
     engine = "" if engine == AUTO else engine
     bundle = Bundle.open_lazily(path)
     refuse_findings(bundle, accept)
@@ -125,15 +136,50 @@ def load(
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
     bundle.verify()
     policy.warm_up(warmup, golden_tolerance, first_run_s)
-    layers = {"controllers": controllers, "envelope": envelope, "deadline_ms": deadline_ms, "telemetry": telemetry}
     if fallback is None and all(layer is None for layer in layers.values()):
         return policy
-    if isinstance(fallback, str | os.PathLike):
+    if is_remote(fallback):
+        fallback = open_remote(fallback, policy.spec)
+    elif isinstance(fallback, str | os.PathLike):
         fallback = load(fallback, threads=threads, seed=seed, accept=accept)
     return _stack_of(policy, fallback=fallback, **layers)
 
 
-def _stack_of(policy: Policy, **layers: Any) -> Stack:
+def is_remote(path: Any) -> TypeGuard[str]:
+    """Return whether a policy is named by a URL, ``remote:ws://HOST:PORT``, not by a directory.
+
+    Example:
+        >>> is_remote("remote:ws://10.0.0.5:8000"), is_remote("out/my-policy")
+        (True, False)
+    """
+    return isinstance(path, str) and path.startswith(REMOTE_PREFIX)
+
+
+def open_remote(url: str, spec: PolicySpec | None = None) -> RemotePolicy:
+    """Return the policy that another machine serves, ``remote:ws://HOST:PORT``.
+
+    The key that the server asks for is that of the environment variable ``VLATOOL_SERVE_KEY``.
+
+    Args:
+        spec: Of a policy with the same inputs and actions; with it, the server need not be there yet.
+
+    Raises:
+        ServingError, SpecError, UsageError, MissingExtra: as ``RemotePolicy`` does.
+    """
+    from vlatool.runtime.remote_policy import RemotePolicy
+
+    return RemotePolicy(url.removeprefix(REMOTE_PREFIX), spec, key=os.environ.get(KEY_VARIABLE, ""))
+
+
+def _remote_stack(url: str, fallback: Any, layers: dict[str, Any], **loading: Any) -> Stack:
+    """Return the layers around a policy of another machine, with a local bundle, or none, to fall back to."""
+    if isinstance(fallback, str | os.PathLike):
+        fallback = load(fallback, **loading)
+    second = fallback if hasattr(fallback, "spec") else getattr(fallback, "policy", None)
+    return _stack_of(open_remote(url, getattr(second, "spec", None)), fallback=fallback, **layers)
+
+
+def _stack_of(policy: Policy | RemotePolicy, **layers: Any) -> Stack:
     """Return the layers around a policy, in a process that is prepared for a deadline."""
     from vlatool.runtime.stack import build_stack, prepare_process
 
