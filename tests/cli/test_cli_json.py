@@ -31,6 +31,7 @@ from vlatool.deployment.store import Store
 from vlatool.errors import OutputError
 from vlatool.machine.host import isa
 from vlatool.machine.instruction_sets import saturates
+from vlatool.measurement.recorded_run import record_run
 from vlatool.report import Report, Row, read_report
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/reference/output.schema.json").read_text())
@@ -89,6 +90,8 @@ LINES = {
     "doctor": "",
     "run": "{bundle} --dry-run --steps 20",
     "serve": "{bundle} --port 0 --seconds 0.1",
+    "record": "{bundle} -o {out} --steps 2",
+    "replay": "{recorded} {bundle}",
     "simulate": "{policy} --profile raspberry-pi-5",
     "telemetry": "--seconds 0.1",
     "profiles list": "",
@@ -157,6 +160,7 @@ def places(policy_template, tmp_path_factory) -> SimpleNamespace:
     with pytest.raises(SystemExit) as left:
         main(["prune", "neurons", str(noisy), "-o", str(here / "pruned"), "--ratio", "0.01"])
     assert not left.value.code
+    record_run(here / "bundle", here / "recorded", steps=3)
     made = {
         "deep": deeper(noisy, here / "deep"),
         "flow": write_flow(here / "flow"),
@@ -166,6 +170,7 @@ def places(policy_template, tmp_path_factory) -> SimpleNamespace:
         "tuned": here / "pruned/module/main.safetensors",
         "original": here / "original.py",
         "gate": here / "gate.yaml",
+        "recorded": here / "recorded",
     }
     return SimpleNamespace(policy=noisy, **made, **deployed(here), here=here)
 
@@ -269,6 +274,8 @@ BAD = {
     "inspect": "{nothing}",
     "rebuild": "{nothing} --check",
     "run": "{nothing} --dry-run",
+    "record": "{nothing} -o {out}",
+    "replay": "{nothing} {nothing}",
     "deploy": "{nothing} --store {out}",
     "status": "--store {nothing}",
     "rollback": "--store {nothing}",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import os
+import resource
 import signal
 import threading
 import time
@@ -9,7 +12,8 @@ import time
 import pytest
 
 from vlatool.errors import UsageError
-from vlatool.runtime.worker import Worker
+from vlatool.runtime import worker as workers
+from vlatool.runtime.worker import MOST_HANDLES, Worker
 
 
 class Steps:
@@ -41,6 +45,15 @@ class Steps:
 
     def undo(self) -> None:
         self.calls.append("undo")
+
+
+@pytest.fixture(params=["eventfd", "lock"], autouse=True)
+def way_to_wake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Every test with both ways in which a thread is woken."""
+    if request.param == "lock":
+        monkeypatch.delattr(os, "eventfd")
+    assert type(workers._signal()).__name__ == {"eventfd": "_EventSignal", "lock": "_LockSignal"}[request.param]
+    return str(request.param)
 
 
 def soon(seconds: float = 10.0) -> float:
@@ -192,3 +205,41 @@ def test_a_worker_that_was_closed_is_collected_without_a_word(capfd: pytest.Capt
         worker.close()
     del worker
     assert capfd.readouterr().err == ""
+
+
+def test_a_signal_of_a_call_that_nobody_waited_for_ends_no_later_one():
+    worker, late = Worker("w"), Steps("late")
+    assert worker.call(Steps(0), soon()) == 0
+    for _ in range(3):
+        worker._desk.ended.send()
+    late.done.clear()
+    threading.Timer(0.05, late.done.set).start()
+    assert worker.call(late, soon()) == "late"
+    worker._desk.ended.send()
+    with pytest.raises(TimeoutError, match="stopped"):
+        worker.call(Steps(ends=False), soon(0.02))
+    assert free(worker)
+    assert worker.call(Steps(5), soon()) == 5
+
+
+def test_descriptors_are_given_back_and_a_process_without_low_ones_has_workers_too(way_to_wake: str):
+    gc.collect()
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(20):
+        worker = Worker("w")
+        worker.call(Steps(), soon())
+        worker.close()
+    del worker
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) == before
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard <= MOST_HANDLES + 10:
+        pytest.skip("this process may not have so many descriptors")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, MOST_HANDLES + 100), hard))
+    taken = [os.dup(0) for _ in range(MOST_HANDLES)]
+    try:
+        assert Worker("w").call(Steps(3), soon()) == 3
+    finally:
+        for handle in taken:
+            os.close(handle)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

@@ -263,6 +263,9 @@ def test_a_remote_policy_is_a_rung_and_a_bundle_one_below_a_remote_policy(
     assert below.origin.source == "policy"
     for stack in (first, below):
         stack.close()
+    for path, second in ((bundle, url), (url, bundle)):
+        with pytest.raises(UsageError, match="cannot be recorded"):
+            load(path, fallback=second, threads=1, record=tmp_path / "run")
 
 
 def test_a_remote_rung_answers_where_the_policy_does_not(servers: list[Any]):

@@ -52,6 +52,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "doctor": ("checks",),
     "run": ("dry_run",),
     "serve": ("served",),
+    "record": ("recorded_run",),
+    "replay": ("replayed_run",),
     "simulate": ("simulation",),
     "telemetry": ("telemetry",),
     "profiles list": ("profiles",),
@@ -234,6 +236,14 @@ def _documents_of_machines() -> dict[str, Schema]:
             "What was served; times until an answer in ms where there were answers.",
             bundle=TEXT, addresses=by_name(TEXT), seconds=NUMBER, requests=INTEGER, missed=INTEGER, failed=INTEGER,
             times=by_name(NUMBER), lost_records=INTEGER,
+        ),
+        "recorded_run": document(
+            "A file of recorded control steps.", file=TEXT, bytes=INTEGER, steps=INTEGER, seed=INTEGER, failed=INTEGER
+        ),
+        "replayed_run": document(
+            "Control steps that were computed again; note: why the recording ends before its run.",
+            steps=INTEGER, equal=FLAG, note=TEXT, difference={"anyOf": [{"type": "null"}, record(
+                step=INTEGER, output=TEXT, element=many(INTEGER), recorded=TEXT, replayed=TEXT)]},
         ),
         "simulation": document(
             "Predicted, not measured; latency_ms: value, low, high.",

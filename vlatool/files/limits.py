@@ -41,6 +41,7 @@ LIMITS = {
     "golden_bytes": Limit(256 * MIB, "bytes", "the golden file, unpacked"),
     "golden_steps": Limit(64, "steps", "golden observations in a row"),
     "recording_bytes": Limit(8 * GIB, "bytes", "a recording of observations, unpacked"),
+    "run_frame_bytes": Limit(256 * MIB, "bytes", "one control step of a recorded run"),
     "recorded_steps": Limit(100_000_000, "steps", "a dataset of recorded episodes"),
     "picture_bytes": Limit(256 * MIB, "bytes", "one recorded picture, decoded"),
     "arrays": Limit(4096, "arrays", "arrays in one .npz file"),

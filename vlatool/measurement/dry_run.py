@@ -15,6 +15,8 @@ from vlatool.bundle.spec import PolicySpec
 from vlatool.data import observations_for
 from vlatool.errors import GateFailed
 from vlatool.runtime import is_remote, load, open_remote
+from vlatool.runtime.arguments import RECORD
+from vlatool.runtime.engine_record import EngineRecord
 from vlatool.runtime.interface import POLICY, Policy
 from vlatool.runtime.rungs import PolicyRung
 from vlatool.runtime.stack import Fallback, Stack, rate_factor
@@ -82,6 +84,7 @@ class DryRun:
         inference: Times of ``infer`` of the open bundle alone.
         answer: Times of ``act`` of all layers, called at the rate of the robot.
         missed: Share of the control steps at which the policy had no action in time.
+        engine: What the engine ran of the bundle, on what and in which precision.
         rungs: What answers a control step, in the order in which it is asked, each with the time of an answer.
         cadence: Where the time of the control steps went, all but the first.
     """
@@ -94,12 +97,13 @@ class DryRun:
     inference: Spread
     answer: Spread
     missed: float
+    engine: EngineRecord
     rungs: tuple[RungNote, ...]
     cadence: CadenceReport
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
-        return asdict(self)
+        return {**asdict(self), "engine": self.engine.to_dict()}
 
     def check(self) -> None:
         """Refuse a policy that a robot would hardly ever hear; raises GateFailed."""
@@ -133,7 +137,7 @@ def dry_run(
     Raises:
         UsageError, SpecError, BundleError, GraphError: as ``vlatool.runtime.load`` does.
     """
-    plain = load(path, engine=engine, threads=threads, seed=0)
+    plain = load(path, engine=engine, threads=threads, seed=0, engine_proof=RECORD)
     rate = plain.spec.rate * rate_factor(controllers)
     period_ms = 1000 / rate
     limit_ms = period_ms if deadline_ms is None else deadline_ms
@@ -148,7 +152,7 @@ def dry_run(
     observations = observations_for(bundle, OBSERVATIONS)
     inference = Spread.of(_times(plain.infer, observations, steps))
     others = [] if second is None else [Spread.of(_times(second.infer, observations, steps))]
-    answers = _paced(stack, observations, steps, rate)
+    answers = play_paced(stack, observations, steps, rate)
     stack.close()
     return DryRun(
         f"{bundle.manifest.name} {bundle.manifest.version}",
@@ -159,6 +163,7 @@ def dry_run(
         inference,
         Spread.of(answers),
         cadence.report().misses / steps,
+        plain.engine_record(),
         tuple(_rungs(stack, [inference, *others])),
         cadence.report(),
     )
@@ -179,8 +184,8 @@ def _times(call: Any, observations: Sequence[Any], count: int) -> list[float]:
     return times[len(observations) :]
 
 
-def _paced(stack: Stack, observations: Sequence[Any], count: int, rate: float) -> list[float]:
-    """Return the milliseconds of control steps at the rate of the robot in Hz, from the call; the first one apart."""
+def play_paced(stack: Stack, observations: Sequence[Any], count: int, rate: float) -> list[float]:
+    """Play control steps at the robot's rate in Hz; return the milliseconds of each from its call, but the first."""
     times, begin = [], time.monotonic()
     for number in range(count + 1):
         time.sleep(max(0.0, begin + number / rate - time.monotonic()))

@@ -6,16 +6,18 @@ Needs numpy and one inference engine; never torch, onnx, pydantic, typer, rich o
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, TypeGuard, overload
 
-from vlatool.errors import refuse_two_distributions
-from vlatool.runtime.arguments import check_load
+from vlatool.errors import UsageError, refuse_two_distributions
+from vlatool.runtime.arguments import REQUIRE, WARN, check_load
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
 if TYPE_CHECKING:
+    from vlatool.bundle.bundle import Bundle
     from vlatool.bundle.spec import PolicySpec
     from vlatool.runtime.remote_policy import RemotePolicy
     from vlatool.runtime.stack import Fallback, Stack, Wrapper
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 AUTO = "auto"
-"""Name that stands for the engine that a bundle was made for."""
+"""Name that stands for the engine that a bundle was made for, or another where that cannot be used."""
 REMOTE_PREFIX, KEY_VARIABLE = "remote:", "VLATOOL_SERVE_KEY"
 """What stands before the URL of a policy of another machine; the environment variable with the key that it asks for."""
 
@@ -41,6 +43,7 @@ def load(
     first_run_s: float = ...,
     memory_mb: float | None = ...,
     probe: bool = ...,
+    engine_proof: str = ...,
 ) -> Policy: ...
 
 
@@ -57,11 +60,13 @@ def load(
     first_run_s: float = ...,
     memory_mb: float | None = ...,
     probe: bool = ...,
+    engine_proof: str = ...,
     controllers: Sequence[str] | None = ...,
     envelope: str | Wrapper | None = ...,
     deadline_ms: float | None = ...,
     fallback: Any = ...,
     telemetry: Sink | Telemetry | None = ...,
+    record: str | os.PathLike[str] | None = ...,
 ) -> Policy | Stack: ...
 
 
@@ -77,17 +82,21 @@ def load(
     first_run_s: float = FIRST_RUN_S,
     memory_mb: float | None = None,
     probe: bool = False,
+    engine_proof: str = "",
     controllers: Sequence[str] | None = None,
     envelope: str | Wrapper | None = None,
     deadline_ms: float | None = None,
     fallback: str | os.PathLike[str] | Fallback | Any = None,
     telemetry: Sink | Telemetry | None = None,
+    record: str | os.PathLike[str] | None = None,
 ) -> Policy | Stack:
     """Load a bundle, verify it, open its graphs and warm them up.
 
     Args:
         path: The bundle directory.
-        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty or ``auto``.
+        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty. ``auto`` is
+            that one, too, and where it cannot be used here the first one that can, with a warning;
+            ``Policy.engine_reason`` says why.
         threads: Intra-op threads of the engine; the cores that this process may use when None.
         seed: Seed of the noise that a program draws; fresh entropy when None.
         warmup: Inferences on the golden observation before this returns (the first is the slowest).
@@ -102,10 +111,16 @@ def load(
         probe: Do the first run in a child process, limited in time and memory, before this process opens a graph: for
             bundles of others. Whatever the child does, it is killed after ``first_run_s`` and 60 s for its start. Takes
             as long as loading twice and starting Python.
+        engine_proof: ``record`` has the engine say in the warm-up what it runs of each graph, on what and in which
+            precision (``Policy.engine_record``); ``warn`` also warns where that is not what the bundle promises, and
+            ``require`` refuses it. This takes some milliseconds for a hundred nodes. When empty, only what an engine
+            says by itself is looked at: its providers, devices and the dtype that it was asked for.
         controllers, envelope, deadline_ms, fallback, telemetry: Layers around the policy (``stack.build_stack``); with
             any of them a ``Stack`` is returned. ``fallback`` may be the directory of a second bundle, too, or the URL
             of a policy that another machine serves (``remote:ws://HOST:PORT``). So may the path: then a ``Stack`` is
             returned, what is said of loading is for the fallback, and without one the server has to be there now.
+        record: New file in which each control step of the ``Stack`` is recorded, so that ``vlatool replay`` computes it
+            again. Without a ``seed`` one is drawn, and recorded.
 
     Raises:
         BundleError: the directory is missing, incomplete, changed or too new.
@@ -119,30 +134,47 @@ def load(
     from vlatool.bundle.bundle import Bundle
 
     refuse_two_distributions()
-    check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
-    layers = {"controllers": controllers, "envelope": envelope, "deadline_ms": deadline_ms, "telemetry": telemetry}
+    check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb, engine_proof)
+    layers: dict[str, Any] = {
+        "controllers": controllers,
+        "envelope": envelope,
+        "deadline_ms": deadline_ms,
+        "telemetry": telemetry,
+    }
     if is_remote(path):
-        return _remote_stack(str(path), fallback, layers, engine=engine, threads=threads, seed=seed, warmup=warmup,
+        return _remote_stack(path, fallback, layers, record, engine=engine, threads=threads, seed=seed, warmup=warmup,
                              golden_tolerance=golden_tolerance, accept=accept, first_run_s=first_run_s,
-                             memory_mb=memory_mb, probe=probe)  # fmt: skip
-    engine = "" if engine == AUTO else engine
+                             memory_mb=memory_mb, probe=probe, engine_proof=engine_proof)  # fmt: skip
     bundle = Bundle.open_lazily(path)
     refuse_findings(bundle, accept)
+    reason = ""
+    if engine == AUTO:
+        engine, reason = _chosen(bundle)
     bundle.verify("data/")
     if probe:
         from vlatool.runtime.probe import probe as run_once
 
         run_once(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
-    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
+    seed = _drawn_seed() if seed is None and record is not None else seed
+    traced = bool(engine_proof)
+    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb, traced=traced)
+    policy.engine_reason = reason
     bundle.verify()
-    policy.warm_up(warmup, golden_tolerance, first_run_s)
-    if fallback is None and all(layer is None for layer in layers.values()):
+    policy.warm_up(max(warmup, traced), golden_tolerance, first_run_s)
+    _check_record(policy, engine_proof)
+    if fallback is None and record is None and all(layer is None for layer in layers.values()):
         return policy
+    second = ""
     if is_remote(fallback):
+        _refuse_record(record)
         fallback = open_remote(fallback, policy.spec)
     elif isinstance(fallback, str | os.PathLike):
         fallback = load(fallback, threads=threads, seed=seed, accept=accept)
-    return _stack_of(policy, fallback=fallback, **layers)
+        second = fallback.identity if record is not None else ""
+    given: dict[str, Any] = {**layers, "fallback": fallback, "controllers": controllers or ()}
+    if record is None:
+        return _stack_of(policy, given)
+    return _recorded(policy, given, record, threads=threads, seed=seed, second=second)
 
 
 def is_remote(path: Any) -> TypeGuard[str]:
@@ -171,18 +203,69 @@ def open_remote(url: str, spec: PolicySpec | None = None) -> RemotePolicy:
     return RemotePolicy(url.removeprefix(REMOTE_PREFIX), spec, key=os.environ.get(KEY_VARIABLE, ""))
 
 
-def _remote_stack(url: str, fallback: Any, layers: dict[str, Any], **loading: Any) -> Stack:
+def _remote_stack(url: str, fallback: Any, layers: dict[str, Any], record: Any, **loading: Any) -> Stack:
     """Return the layers around a policy of another machine, with a local bundle, or none, to fall back to."""
+    _refuse_record(record)
     if isinstance(fallback, str | os.PathLike):
         fallback = load(fallback, **loading)
     second = fallback if hasattr(fallback, "spec") else getattr(fallback, "policy", None)
-    return _stack_of(open_remote(url, getattr(second, "spec", None)), fallback=fallback, **layers)
+    given = {**layers, "fallback": fallback, "controllers": layers["controllers"] or ()}
+    return _stack_of(open_remote(url, getattr(second, "spec", None)), given)
 
 
-def _stack_of(policy: Policy | RemotePolicy, **layers: Any) -> Stack:
+def _refuse_record(record: Any) -> None:
+    """Refuse to record a run with a policy that nobody can run again; raises UsageError."""
+    if record is not None:
+        raise UsageError(
+            "A policy on another machine cannot be recorded: nothing computes its actions again.",
+            "leave record out, and let the other machine keep records: vlatool serve --records FILE",
+        )
+
+
+def _chosen(bundle: Bundle) -> tuple[str, str]:
+    """Return the engine that ``auto`` stands for and why; warns where the bundle was made for another."""
+    from vlatool.runtime.engine_choice import choose_engine
+
+    choice = choose_engine(bundle.manifest)
+    if choice.replaces:
+        warnings.warn(f"engine='auto' is {choice.engine}: {choice.reason}", RuntimeWarning, stacklevel=3)
+    return choice.engine, choice.reason
+
+
+def _check_record(policy: Policy, proof: str) -> None:
+    """Warn of an engine that did not run as asked, or refuse it; see ``engine_proof`` of ``load``."""
+    if proof not in (WARN, REQUIRE):
+        return
+    record = policy.engine_record()
+    if proof == REQUIRE:
+        record.check()
+    for problem in record.problems:
+        warnings.warn(f"{record.library}: {problem}", RuntimeWarning, stacklevel=3)
+
+
+def _stack_of(policy: Policy | RemotePolicy, layers: dict[str, Any]) -> Stack:
     """Return the layers around a policy, in a process that is prepared for a deadline."""
     from vlatool.runtime.stack import build_stack, prepare_process
 
     if layers["deadline_ms"] is not None:
         prepare_process()
-    return build_stack(policy, **{**layers, "controllers": layers["controllers"] or ()})
+    return build_stack(policy, **layers)
+
+
+def _recorded(policy: Policy, layers: dict[str, Any], path: Any, **about: Any) -> Stack:
+    """Return the layers around a policy, which are recorded; without a file when they make no sense."""
+    from vlatool.runtime.stack import header_of
+    from vlatool.runtime.telemetry.recorder import Recorder
+
+    recorder = Recorder(path)
+    try:
+        recorder.begin_run(header_of(policy, layers, **about))
+        return _stack_of(policy, {**layers, "recorder": recorder})
+    except BaseException:
+        recorder.close()
+        os.unlink(path)
+        raise
+
+
+def _drawn_seed() -> int:
+    return int.from_bytes(os.urandom(4), "little")

@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy as np
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError
 from vlatool.files.validate import short_repr
+from vlatool.machine.version import VERSION
 from vlatool.runtime.action_elements import rotations_of
 from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.control import build_layer, check_order, layers, options_of
@@ -32,6 +33,9 @@ from vlatool.runtime.policy import BundlePolicy
 from vlatool.runtime.rungs import ChunkRung, Hold, PolicyRung, Rung, Stop, start_pose
 from vlatool.runtime.telemetry.cadence import Stopwatch
 from vlatool.runtime.telemetry.record import Delivery, Sink, TickRecord
+from vlatool.runtime.telemetry.recorder import Recorder, refuse_background
+from vlatool.runtime.telemetry.replay import Replay
+from vlatool.runtime.telemetry.run_file import OF_A_FUNCTION, RunHeader
 from vlatool.runtime.telemetry.writer import Telemetry
 
 __all__ = ["Fallback", "Sink", "Stack", "TickRecord", "Wrapper", "build_stack", "prepare_process"]
@@ -97,6 +101,7 @@ class Stack:
         controller: The outermost layer.
         telemetry: What gets the record of each control step, in a thread of its own (``Telemetry``): a function of it,
             or a ``Telemetry`` with several.
+        recorder: What records each control step, or replays it.
         clock: Returns seconds.
 
     Raises:
@@ -108,10 +113,13 @@ class Stack:
         controller: Controller,
         *,
         telemetry: Sink | Telemetry | None = None,
+        recorder: Recorder | Replay | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.telemetry = telemetry if telemetry is None or isinstance(telemetry, Telemetry) else Telemetry(telemetry)
         """What gets the records; None without telemetry."""
+        self.recorder = recorder
+        """What records the control steps; None where nothing does."""
         self.controller = controller
         self.layers = layers_of(controller)
         self.policy = self.layers[-1]
@@ -173,9 +181,12 @@ class Stack:
         started = called if scheduled is None else scheduled
         for deadline in self.deadlines:
             deadline.started = started
-        if self.telemetry is None:
+        if self.telemetry is None and self.recorder is None:
             return self._act(observation)
-        self._stopwatch.begin()
+        if self.telemetry is not None:
+            self._stopwatch.begin()
+        if self.recorder is not None:
+            self.recorder.begin(observation)
         action, error = None, ""
         try:
             action = self._act(observation)
@@ -184,7 +195,10 @@ class Stack:
             error = f"{type(caught).__name__}: {caught}"
             raise
         finally:
-            self._record(started, called, sensed, action, error)
+            if self.recorder is not None:
+                self.recorder.end(action, error)
+            if self.telemetry is not None:
+                self._record(started, called, sensed, action, error)
 
     def note_delivery(self) -> None:
         """Say that the last action has reached the robot, for telemetry."""
@@ -225,7 +239,10 @@ class Stack:
 
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode of every layer; see ``Controller.reset``."""
-        self.controller.reset(seed)
+        if isinstance(self.recorder, Recorder):
+            self.recorder.call("reset", lambda: self.controller.reset(seed), [seed], {})
+        else:
+            self.controller.reset(seed)
 
     def close(self) -> None:
         """End the threads of the deadlines and of the telemetry, which writes what is left."""
@@ -233,6 +250,8 @@ class Stack:
             deadline.close()
         if self.telemetry is not None:
             self.telemetry.close()
+        if self.recorder is not None:
+            self.recorder.close()
 
 
 def build_stack(
@@ -243,6 +262,7 @@ def build_stack(
     deadline_ms: float | None = None,
     fallback: Fallback | Policy | None = None,
     telemetry: Sink | Telemetry | None = None,
+    recorder: Recorder | Replay | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Stack:
     """Return the layers around a policy.
@@ -255,6 +275,7 @@ def build_stack(
         fallback: What acts without an action in time, beside the rest of the last chunk, a hold and a stop: another
             policy, or a ``Fallback``.
         telemetry: Gets a ``TickRecord`` of each control step, off its path: a function, or ``Telemetry(...)``.
+        recorder: Records each control step, so that a replay computes the same.
         clock: Returns seconds.
 
     Raises:
@@ -274,21 +295,54 @@ def build_stack(
     player, *outer = entries[len(wrappers) :]
     check_order([*wrappers, *[Deadline] * (deadline_ms is not None), player, *[FallbackLadder] * falls_back, *outer])
     inner: Any = policy
+    reader = clock if recorder is None else recorder.follow(clock)
     for entry in wrappers:
         inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry))
-    limited = _limited(inner, None if deadline_ms is None else deadline_ms - own_ms, clock)
-    inner = build_layer(player, limited, spec=policy.spec, options=chosen.get(player))
-    ladder = _ladder(inner, policy.spec, options, deadline_ms, clock) if falls_back else None
+    limited = _limited(inner, None if deadline_ms is None else deadline_ms - own_ms, clock, recorder)
+    inner = build_layer(player, limited, spec=policy.spec, options=chosen.get(player), clock=reader)
+    ladder = _ladder(inner, policy.spec, options, deadline_ms, clock, recorder) if falls_back else None
     inner = ladder or inner
     for entry in outer:
-        inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry))
+        inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry), clock=reader)
     if envelope is not None:
-        inner = _enveloped(inner, policy.spec, envelope, factor)
+        inner = _enveloped(inner, policy.spec, envelope, factor, clock)
         if ladder is not None and hasattr(inner, "stop"):
             for rung in ladder.rungs:
                 if isinstance(rung, Hold):
                     rung.leave_to_envelope()
-    return Stack(inner, telemetry=telemetry, clock=clock)
+    if recorder is not None:
+        _record_layers(recorder, layers_of(inner))
+    return Stack(inner, telemetry=telemetry, recorder=recorder, clock=clock)
+
+
+def header_of(
+    policy: BundlePolicy, given: Mapping[str, Any], *, threads: int | None, seed: int, second: str = ""
+) -> RunHeader:
+    """Return what a recorded run is of.
+
+    Args:
+        given: The arguments of ``build_stack``.
+        threads, seed: With which the policy was opened.
+        second: Identity of the bundle that the fallback was opened from; empty where it was opened elsewhere.
+    """
+    fallback, envelope = given["fallback"], given["envelope"]
+    options = fallback if fallback is None or isinstance(fallback, Fallback) else Fallback(fallback)
+    values = None
+    if options is not None:
+        values = {field.name: getattr(options, field.name) for field in fields(Fallback) if field.name != "policy"}
+        values["start"] = None if options.start is None else np.asarray(options.start).tolist()
+        second = second or ("" if options.policy is None else OF_A_FUNCTION)
+    robot = envelope if isinstance(envelope, str) else "" if envelope is None else OF_A_FUNCTION
+    return RunHeader(policy.identity, policy.engine, threads, seed, tuple(given["controllers"]), robot,
+                     given["deadline_ms"], values, second, VERSION)  # fmt: skip
+
+
+def _record_layers(recorder: Recorder | Replay, inside: Sequence[Any]) -> None:
+    """Let a recorder see what changes the layers from outside."""
+    refuse_background(inside)
+    for layer in inside:
+        if hasattr(layer, "envelope"):
+            recorder.wrap_envelope(layer.envelope)
 
 
 def _named_deadline(spec: PolicySpec, options: Mapping[str, Any]) -> float:
@@ -296,9 +350,11 @@ def _named_deadline(spec: PolicySpec, options: Mapping[str, Any]) -> float:
     return options.get("deadline_ms") or 1000 / spec.rate
 
 
-def _enveloped(controller: Controller, spec: PolicySpec, envelope: str | Wrapper, factor: int) -> Any:
+def _enveloped(
+    controller: Controller, spec: PolicySpec, envelope: str | Wrapper, factor: int, clock: Callable[[], float]
+) -> Any:
     """Return a controller with the envelope of a robot, or a wrapper, around it."""
-    wrapper = robot_envelope(spec, envelope, factor) if isinstance(envelope, str) else envelope
+    wrapper = robot_envelope(spec, envelope, factor, clock) if isinstance(envelope, str) else envelope
     wrapped = wrapper(controller) if callable(wrapper) else None
     if not isinstance(wrapped, Controller) or controller not in layers_of(wrapped):
         raise UsageError(
@@ -327,19 +383,28 @@ def rate_factor(controllers: Sequence[str]) -> int:
     return math.prod(given.get("factor", 1) for given in options_of(controllers).values())
 
 
-def _limited(policy: Policy, deadline_ms: float | None, clock: Callable[[], float]) -> Policy:
-    """Return a policy with the check of its actions, which an open bundle has already, and with its deadline."""
+def _limited(
+    policy: Policy, deadline_ms: float | None, clock: Callable[[], float], recorder: Recorder | Replay | None
+) -> Policy:
+    """Return a policy with the check of its actions, which an open bundle has already, its deadline and its record."""
     checked = policy if isinstance(policy, BundlePolicy) else CheckedPolicy(policy)
-    return checked if deadline_ms is None else Deadline(checked, deadline_ms, clock=clock)
+    limited = checked if deadline_ms is None else Deadline(checked, deadline_ms, clock=clock)
+    return limited if recorder is None else recorder.wrap_policy(limited)
 
 
 def _ladder(
-    player: Any, spec: PolicySpec, options: Fallback, deadline_ms: float | None, clock: Callable[[], float]
+    player: Any,
+    spec: PolicySpec,
+    options: Fallback,
+    deadline_ms: float | None,
+    clock: Callable[[], float],
+    recorder: Recorder | Replay | None,
 ) -> FallbackLadder:
+    reader = clock if recorder is None else recorder.follow(clock)
     rungs: list[Rung] = [ChunkRung(player, options.max_age_ms)] if hasattr(player, "rest") else []
     if options.policy is not None:
         check_same_actions(spec, options.policy.spec)
-        second = ChunkQueue(_limited(options.policy, deadline_ms, clock), clock=clock)
+        second = ChunkQueue(_limited(options.policy, deadline_ms, clock, recorder), clock=reader)
         rungs.append(PolicyRung(second, FALLBACK))
     start = None if options.start is None else start_pose(options.start, spec.action)
     ramp = max(1, round(options.ramp_s * spec.rate))
@@ -347,7 +412,7 @@ def _ladder(
     rungs += [Hold(spec.action, steps, ramp=ramp, neutral=options.neutral),
               Stop(spec.action, ramp=ramp, neutral=options.neutral)]  # fmt: skip
     return FallbackLadder(player, rungs, misses=options.misses, window=options.window, recover=options.recover,
-                          latch=options.latch, start=start, clock=clock)  # fmt: skip
+                          latch=options.latch, start=start, clock=reader)  # fmt: skip
 
 
 def check_deadline(spec: PolicySpec, deadline_ms: float | None, *, waits: bool = True, factor: int = 1) -> None:
@@ -416,7 +481,9 @@ def check_same_actions(first: PolicySpec, second: PolicySpec) -> None:
         )
 
 
-def robot_envelope(spec: PolicySpec, robot: str, factor: int = 1) -> Wrapper:
+def robot_envelope(
+    spec: PolicySpec, robot: str, factor: int = 1, clock: Callable[[], float] = time.monotonic
+) -> Wrapper:
     """Return the wrapper that keeps the actions of a policy within the limits of a robot.
 
     Args:
@@ -431,7 +498,7 @@ def robot_envelope(spec: PolicySpec, robot: str, factor: int = 1) -> Wrapper:
     from vlatool.runtime.envelope import RobotLimits, check_position, envelope_of
 
     limits = RobotLimits.named(robot)
-    envelope = envelope_of(spec, limits, period_s=1 / (spec.rate * factor))
+    envelope = envelope_of(spec, limits, period_s=1 / (spec.rate * factor), clock=clock)
     bounded = any(joint.low is not None for joint in limits.joints)
     position = measured_position(spec) if bounded else None
     if position is not None:

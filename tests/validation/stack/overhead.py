@@ -2,6 +2,7 @@
 
     python tests/validation/stack/overhead.py BUNDLE --pairs 20000
     python tests/validation/stack/overhead.py --small --pairs 20000     # a product of 7 x 7, within a robot's envelope
+    python tests/validation/stack/overhead.py --small --rate 100 --pairs 3000   # as a robot acts: idle in between
     python tests/validation/stack/overhead.py --layers                  # each layer of it in a loop of its own
 
 Deadline, fallback and telemetry are on. Both calls of a pair get the same observation; who goes first alternates. A
@@ -59,12 +60,14 @@ def differences(
     seen: Any = None,
     *,
     telemetry_on: bool = True,
+    rate: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Return microseconds of the bare calls, of the stack's, and stack minus bare of each pair.
 
     Args:
         robot: Whose envelope is around the stack; its clock goes on by a control period with each step.
         seen: Observations; recorded or random ones when None.
+        rate: Pairs in a second; one after the other when 0.
         telemetry_on: Whether lines of JSON, a file for Prometheus and a cadence report are written meanwhile.
     """
     plain = load(path, threads=1, seed=0)
@@ -87,6 +90,8 @@ def differences(
     calls = ((lambda index: session.run(None, feeds[index])), (lambda index: stack.act(observations[index])))
     taken: tuple[list[float], ...] = ([], [], [], [])
     for pair in range(pairs + 200):
+        if rate:
+            time.sleep(1 / rate)
         times, counts = [0.0] * 4, True
         for kind in (0, 1) if pair % 2 else (1, 0):
             used, begin = time.process_time_ns(), time.perf_counter_ns()
@@ -140,6 +145,9 @@ def main() -> None:
     parser.add_argument("bundle", nargs="?", default="")
     parser.add_argument("--small", action="store_true", help="the small policy in the place of a bundle")
     parser.add_argument("--layers", action="store_true", help="each layer around the small policy by itself")
+    parser.add_argument(
+        "--rate", type=float, default=0.0, help="pairs in a second, as a robot acts; a busy loop when 0"
+    )
     parser.add_argument("--without-telemetry", action="store_true", help="the same stack without its sinks")
     parser.add_argument("--pairs", type=int, default=20_000)
     parser.add_argument("--deadline-ms", type=float)
@@ -150,10 +158,10 @@ def main() -> None:
             found = layers(small_bundle(Path(folder)), pose, options.pairs)
         elif options.small:
             found = differences(small_bundle(Path(folder)), options.pairs, options.deadline_ms, ROBOT, [pose],
-                                telemetry_on=not options.without_telemetry)  # fmt: skip
+                                telemetry_on=not options.without_telemetry, rate=options.rate)  # fmt: skip
         else:
             found = differences(options.bundle, options.pairs, options.deadline_ms,
-                                telemetry_on=not options.without_telemetry)  # fmt: skip
+                                telemetry_on=not options.without_telemetry, rate=options.rate)  # fmt: skip
     for name, values in found.items():
         shown = ", ".join(f"p{share:g} {np.percentile(values, share):.1f}" for share in SHARES)
         print(f"{name}: {shown} us (of {len(values)})")

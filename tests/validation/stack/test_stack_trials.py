@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from bad_outputs import graph_outputs, wrong_outputs
+from damaged_files import trials
 from endless import endless
 from ticks import run
 
@@ -34,3 +35,9 @@ def test_no_wrong_output_reaches_the_robot():
     found = graph_outputs(100)
     assert found["wrong"] > 50
     assert found["reached the robot"] == 0
+
+
+def test_no_damaged_record_is_read():
+    for found in trials(200, seed=3).values():
+        assert found["refused"] > 50
+        assert found["unchanged"] < 20

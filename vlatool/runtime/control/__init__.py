@@ -11,7 +11,7 @@ from __future__ import annotations
 import inspect
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import UnionType
 from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
@@ -107,10 +107,17 @@ def options_of(names: Sequence[str]) -> dict[type, dict[str, Any]]:
 
 
 def build_layer(
-    entry: type, inner: Any, delay: int = 0, *, spec: PolicySpec | None = None, options: Mapping[str, Any] | None = None
+    entry: type,
+    inner: Any,
+    delay: int = 0,
+    *,
+    spec: PolicySpec | None = None,
+    options: Mapping[str, Any] | None = None,
+    clock: Callable[[], float] | None = None,
 ) -> Any:
     """Return a layer around another, with what it takes of these; raises PluginError as ``build_controller``."""
-    given = {**({"spec": spec} if spec else {}), **({"delay": delay} if delay else {}), **(options or {})}
+    given = {"spec": spec, "delay": delay, "clock": clock}
+    given = {**{name: value for name, value in given.items() if value}, **(options or {})}
     layer = entry(inner, **{name: value for name, value in given.items() if _takes(entry, name)})
     if not isinstance(layer, Controller if _layer(entry) else Policy):
         raise PluginError(f"{entry.__name__}, an entry of vlatool.{KIND}, lacks methods or properties.",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -32,14 +33,16 @@ class AsynchronousController(ChunkQueue):
         memory: Number of inferences after which a delay is forgotten.
         background: Whether to infer in a thread of its own, as on a robot. Otherwise ``act`` infers at once and
             withholds the chunk for ``delay`` steps, so that the actions depend on nothing but the observations.
+        clock: See ``ChunkQueue``.
 
     Raises:
         UsageError: when an argument is not a whole number in its range.
     """
 
     def __init__(
-        self, policy: Policy, execute: int = 0, *, delay: int = 0, memory: int = 10, background: bool = False
-    ) -> None:
+        self, policy: Policy, execute: int = 0, *, delay: int = 0, memory: int = 10, background: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
         check_whole("delay", delay, 0)
         check_whole("memory", memory, 1)
         self._elements = ActionElements(policy.spec.action)
@@ -48,7 +51,7 @@ class AsynchronousController(ChunkQueue):
         self._inference: Inference = BackgroundInference(policy) if background else PlayedInference(policy, delay)
         self._delays: deque[int] = deque(maxlen=memory)
         self._first_delay = delay
-        super().__init__(policy, execute or 1)
+        super().__init__(policy, execute or 1, clock=clock)
 
     @property
     def expected_delay(self) -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ class RealTimeController(AsynchronousController):
         background: See ``AsynchronousController``.
         blend: Number of actions of a seam; half of a chunk, up to 10, when None.
         stretch: Whether to execute chunks more slowly than the policy's control rate where they would not last.
+        clock: See ``ChunkQueue``.
 
     Raises:
         UsageError: when an argument is not a whole number in its range.
@@ -53,7 +55,7 @@ class RealTimeController(AsynchronousController):
 
     def __init__(
         self, policy: Policy, execute: int = 0, *, delay: int = 0, memory: int = 10, background: bool = False,
-        blend: int | None = None, stretch: bool = True,
+        blend: int | None = None, stretch: bool = True, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         spec = policy.spec
         check_whole("blend", blend, 0, spec.chunk, optional=True)
@@ -62,7 +64,8 @@ class RealTimeController(AsynchronousController):
         blend = min(MAX_BLEND, spec.chunk // 2) if blend is None else blend
         mixable = spec.action.kind != "discrete" and spec.action.mode != "relative"  # those of two states differ
         self._blend = blend if mixable else 0
-        super().__init__(policy, execute or spec.executed_actions, delay=delay, memory=memory, background=background)
+        execute = execute or spec.executed_actions
+        super().__init__(policy, execute, delay=delay, memory=memory, background=background, clock=clock)
 
     def _forget(self) -> None:
         super()._forget()

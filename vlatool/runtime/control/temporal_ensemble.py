@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,9 @@ class TemporalEnsemble(ChunkQueue):
             inferences.
     """
 
-    def __init__(self, policy: Policy, *, coefficient: float = ACT_COEFFICIENT) -> None:
+    def __init__(
+        self, policy: Policy, *, coefficient: float = ACT_COEFFICIENT, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         action, chunk = policy.spec.action, policy.spec.chunk
         least = -LARGEST_EXPONENT / max(1, chunk - 1)
         if isinstance(coefficient, bool) or not least <= coefficient < math.inf:
@@ -44,7 +47,7 @@ class TemporalEnsemble(ChunkQueue):
         self._elements = ActionElements(action)
         weights = np.array([math.exp(-coefficient * index) for index in range(chunk)])
         self._weights, self._sums = weights.astype(np.float32)[:, None], weights.cumsum().astype(np.float32)[:, None]
-        super().__init__(policy)
+        super().__init__(policy, clock=clock)
 
     def _forget(self) -> None:
         super()._forget()

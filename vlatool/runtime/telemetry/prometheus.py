@@ -64,8 +64,13 @@ class Prometheus:
 
     def text(self) -> str:
         """Return all numbers as text."""
+        lines: list[str] = []
         with self.metrics.lock:
-            return "\n".join(exposition(self.metrics, self._health)) + "\n"
+            for line in exposition(self.metrics, self._health):
+                lines.append(line)
+                if line.startswith("#"):
+                    time.sleep(0)  # lets a control step have Python's lock
+        return "\n".join([*lines, ""])
 
     def flush(self) -> None:
         """Replace the file, if it is time; raises OSError where that is not possible."""
