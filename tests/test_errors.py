@@ -24,6 +24,7 @@ EXIT_CODES = {
     "TargetError": 3,
     "InstallationError": 3,
     "DeploymentError": 3,
+    "ServingError": 3,
     "SignatureError": 3,
     "PluginError": 3,
     "MissingExtra": 4,

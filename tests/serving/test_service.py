@@ -138,8 +138,10 @@ def test_a_sink_that_fails_is_counted():
     assert served.failed_records == 1
 
 
-@pytest.mark.parametrize("wrong", [{"deadline_ms": 0}, {"deadline_ms": np.nan}, {"execute": 4}, {"execute": -1},
-                                   {"clients": 0}, {"names": {"x": "t"}}])  # fmt: skip
+@pytest.mark.parametrize("wrong", [
+    {"deadline_ms": 0}, {"deadline_ms": 1e300}, {"deadline_ms": np.nan}, {"execute": 4}, {"execute": -1},
+    {"clients": 0}, {"names": {"x": "t"}},
+])  # fmt: skip
 def test_an_argument_out_of_its_range_is_refused(wrong: dict[str, Any]):
     with pytest.raises(UsageError):
         service(**wrong)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -25,7 +24,10 @@ def run(
         typer.Option("--deadline-ms", help="ms in which a control step is answered; the control period when not given"),
     ] = None,
     fallback: Annotated[
-        Path | None, typer.Option(help="bundle that acts where this one has no action in time", show_default=False)
+        str | None,
+        typer.Option(
+            help="bundle that acts where this one has no action in time, or remote:ws://HOST:PORT", show_default=False
+        ),
     ] = None,
     neutral: Annotated[str, typer.Option(help="label of the discrete action without motion")] = "",
     controller: Annotated[str, typer.Option(help="controller and wrappers, by name, with commas between")] = "",

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import PolicySpec
 from vlatool.data import observations_for
 from vlatool.errors import GateFailed
-from vlatool.runtime import load
+from vlatool.runtime import is_remote, load, open_remote
 from vlatool.runtime.arguments import RECORD
 from vlatool.runtime.engine_record import EngineRecord
-from vlatool.runtime.interface import POLICY
+from vlatool.runtime.interface import POLICY, Policy
 from vlatool.runtime.rungs import PolicyRung
 from vlatool.runtime.stack import Fallback, Stack, rate_factor
 from vlatool.runtime.telemetry.cadence import Cadence, CadenceReport
@@ -120,7 +121,7 @@ def dry_run(
     *,
     robot: str = "",
     deadline_ms: float | None = None,
-    fallback: Path | None = None,
+    fallback: str | None = None,
     neutral: str = "",
     controllers: Sequence[str] = (),
     engine: str = "",
@@ -140,7 +141,7 @@ def dry_run(
     rate = plain.spec.rate * rate_factor(controllers)
     period_ms = 1000 / rate
     limit_ms = period_ms if deadline_ms is None else deadline_ms
-    second = None if fallback is None else load(fallback, threads=threads, seed=0)
+    second = None if fallback is None else _second(fallback, plain.spec, threads)
     cadence = Cadence(steps)
     options = Fallback(second, neutral=neutral)
     stack = load(path, engine=engine, threads=threads, seed=0, controllers=controllers, envelope=robot or None,
@@ -166,6 +167,11 @@ def dry_run(
         tuple(_rungs(stack, [inference, *others])),
         cadence.report(),
     )
+
+
+def _second(named: str, spec: PolicySpec, threads: int | None) -> Policy:
+    """Return the second policy: a bundle, or one that another machine serves."""
+    return open_remote(named, spec) if is_remote(named) else load(named, threads=threads, seed=0)
 
 
 def _times(call: Any, observations: Sequence[Any], count: int) -> list[float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -48,7 +50,8 @@ class Endpoint:
 
     def bind_error(self, error: OSError) -> ServingError:
         """Return the error for an address that cannot be served at."""
-        reason = error.strerror or str(error)
+        number = error.errno or 0
+        reason = os.strerror(number) if number in errno.errorcode else "it is in use, or not allowed"
         return ServingError(
             f"Nothing can be served at {self.access.host} port {self.port}: {reason}.",
             "give another port, or 0 for a free one: --port 0",

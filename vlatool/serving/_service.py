@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, NamedTuple
 
 from vlatool.bundle.spec import PolicySpec
-from vlatool.errors import DeadlineMissed, ServingError
+from vlatool.errors import DeadlineMissed, ServingError, UsageError
 from vlatool.runtime.arguments import check_positive, check_whole
 from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.deadline import Deadline
@@ -21,6 +21,7 @@ from vlatool.serving._chunk_envelope import ChunkEnvelope
 from vlatool.serving._observation_names import ObservationNames
 
 MAX_CLIENTS = 8
+MAX_DEADLINE_MS = 3_600_000.0
 LONGEST_WAIT_S = 60.0
 """How long a request waits for its turn where there is no deadline."""
 
@@ -97,6 +98,8 @@ class Service:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_positive("deadline_ms", deadline_ms, "a number of milliseconds", optional=True)
+        if deadline_ms is not None and deadline_ms > MAX_DEADLINE_MS:
+            raise UsageError(f"deadline_ms is {deadline_ms:g}; allowed: up to an hour.", "pass deadline_ms=60000")
         check_whole("execute", execute, 0, policy.spec.chunk)
         check_whole("clients", clients, 1)
         self.spec: PolicySpec = policy.spec

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -44,6 +45,7 @@ class LerobotServer(Endpoint):
 
     def __init__(self, service: Service, access: Access, port: int, on_kill: Callable[[], None] | None = None) -> None:
         super().__init__(service, access, port, on_kill)
+        os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # it prints on its own what is an error here
         self._grpc = require("grpc", EXTRA)
         self._clients: Clients[_Client] = Clients(service, "lerobot", _Client)
         self._stop = threading.Event()
@@ -62,9 +64,9 @@ class LerobotServer(Endpoint):
         host = f"[{self.access.host}]" if ":" in self.access.host else self.access.host
         try:
             self.port = self._server.add_insecure_port(f"{host}:{self.port}")
-        except RuntimeError as error:
+        except RuntimeError:
             self._server.stop(0)
-            raise self.bind_error(OSError(str(error).splitlines()[0][:200])) from None
+            raise self.bind_error(OSError()) from None
         self._server.start()
         return f"{host}:{self.port}"
 
