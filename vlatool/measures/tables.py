@@ -6,6 +6,7 @@ from vlatool.measures import Pattern
 
 ENGINE, LOG, TELEMETRY = "engine", "log", "telemetry"
 PHASES, MEMORY_PARTS, START_PARTS = "time by phase", "memory by part", "cold start by part"
+DUTY_CYCLE = "latency by the way of calling"
 MISSING_VALUES = "unmeasured"
 """What could not be had, and why."""
 BY_TASK, BY_INSTRUCTION = "success by task", "success by instruction"
