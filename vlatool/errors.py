@@ -15,6 +15,7 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── OutputError              the output: exists already, read-only, disk full
 │   ├── TargetError              the machine to run on: unreachable, or the run ends early
 │   ├── DeploymentError          a store of deployed bundles: unreadable, busy, an older release
+│   ├── ServingError             a server of a policy: cannot start, be reached, or take a request
 │   ├── SignatureError           a signature of a bundle: missing, damaged, of another key
 │   ├── InstallationError        two distributions of vlatool in one environment
 │   └── PluginError              another package that adds something to vlatool
@@ -141,6 +142,10 @@ class TargetError(InputError):
 
 class DeploymentError(InputError):
     """A store of deployed bundles is unreadable or busy, or what is asked of it would undo a newer release."""
+
+
+class ServingError(InputError):
+    """A server of a policy cannot start or be reached, or does not take a request."""
 
 
 class SignatureError(InputError):

@@ -36,7 +36,7 @@ NOUNS = {
     "quantize": "quantization method", "prune": "pruning method", "distill": "distillation method",
     "evaluate": "evaluation", "export": "export target", "sources": "kind of source", "data": "format of recordings",
     "render": "report format", "motion": "metric of motion", "videos": "format of videos",
-    "workers": "launcher of workers", "control": "controller",
+    "workers": "launcher of workers", "control": "controller", "serving": "protocol of vlatool serve",
 }  # fmt: skip
 _PLUGIN_CLASSES: dict[type, str] = {}
 """Loaded class of another package -> ``kind.name``."""

@@ -44,6 +44,7 @@ def test_it_shows_the_layers_and_what_is_left_of_the_control_period(vlatool, spe
                  "inference  p50", "act        p50", "0  policy", "1  chunk", "2  decelerate", "3  stop"):  # fmt: skip
         assert word in out
     assert out.index("FallbackLadder") < out.index("Deadline")
+    assert "main  CPUExecutionProvider: 1 nodes, float32 100.0%" in out
 
 
 def test_a_robot_and_a_second_bundle_add_theirs(vlatool, speeds: Bundle) -> None:
@@ -54,6 +55,9 @@ def test_a_robot_and_a_second_bundle_add_theirs(vlatool, speeds: Bundle) -> None
     assert [note["layer"] for note in found["layers"]][:2] == ["EnvelopeController", "FallbackLadder"]
     assert [rung["source"] for rung in found["rungs"]] == ["policy", "chunk", "fallback", "decelerate", "stop"]
     assert [rung["time"] is None for rung in found["rungs"]] == [False, True, False, True, True]
+    assert found["engine"]["graphs"][0]["shares"] == [
+        {"provider": "CPUExecutionProvider", "nodes": 1, "macs": {"float32": 1.0}}
+    ]
     assert (found["period_ms"], found["deadline_ms"], found["answer"]["samples"]) == (10, 8, 20)
 
 

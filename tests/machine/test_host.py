@@ -225,3 +225,23 @@ def test_graphics_cards_and_their_driver(tmp_path: Path, said: str, driver: str)
     root = tree(tmp_path, {**cards, "proc/driver/nvidia/version": said})
     assert host.gpus(root) == ("NVIDIA A1", "NVIDIA A2")
     assert host.gpu_driver(root) == f"NVIDIA driver {driver}"
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({}, ""),
+        ({"var/lib/nvpmodel/status": "pmode:0002 fmode:quiet\n"}, "nvpmodel 2"),
+        (
+            {
+                "var/lib/nvpmodel/status": "pmode:0002\n",
+                "etc/nvpmodel.conf": "< POWER_MODEL ID=0 NAME=MAXN >\nCPU 1\n< POWER_MODEL ID=2 NAME=MODE_30W >\n",
+                "sys/devices/system/cpu/cpufreq/policy0/scaling_governor": "schedutil\n",
+            },
+            "nvpmodel MODE_30W, governor schedutil",
+        ),
+        ({"sys/firmware/acpi/platform_profile": "low-power\n"}, "platform profile low-power"),
+    ],
+)
+def test_the_power_mode_is_what_the_machine_says(tmp_path: Path, files: dict[str, Any], words: str) -> None:
+    assert host.power_mode(tree(tmp_path, files)) == words

@@ -74,6 +74,7 @@ def test_a_fresh_process_says_how_int8_follows_float32(job: PairJob) -> None:
     assert (found.looked, found.strays, found.unsteady, found.skipped) == (30, 0, 0, 0)
     assert found.golden[0] == pytest.approx(0, abs=1e-5)
     assert found.engines == ("ort_cpu", "ort_cpu")
+    assert [record.problems for record in found.records] == [(), ()]
 
 
 def test_nothing_is_asked_of_a_gate_without_answers_but_the_golden_action(job: PairJob, copied) -> None:

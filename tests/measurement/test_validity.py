@@ -10,6 +10,7 @@ from vlatool.measurement.clock_drift import canary_ms, drift
 from vlatool.measurement.jobs import LatencyJob, Limits
 from vlatool.measurement.results import GraphEngine, PolicyRun
 from vlatool.measurement.validity import findings, validity
+from vlatool.runtime.engine_record import EngineRecord, GraphRecord
 from vlatool.telemetry import Change, Gauge
 
 JOB = LatencyJob(("a",))
@@ -70,6 +71,13 @@ def test_threads_that_share_processors_are_told_and_not_blamed_on_others():
     assert one.remedy == "--threads 2, or fewer"
     assert seen_in(found(), threads=4) == ()
     assert "share 1 processor:" in only(found(), threads=2, limits=Limits(cores=1)).reason
+
+
+def test_an_engine_that_does_not_run_as_asked_is_suspect():
+    graph = GraphRecord("main", {"int8": 1.0}, (), (), ("graph 'main': int8 is promised; it ran float32.",))
+    record = EngineRecord("ort_cpu", "ONNX Runtime", "", "", "", (graph,))
+    one = only(found(policy={"record": record}))
+    assert (one.effect, "as asked: graph 'main': int8 is promised; it ran float32" in one.reason) == ("suspect", True)
 
 
 def test_a_golden_action_that_is_off_is_suspect():

@@ -46,9 +46,11 @@ def test_every_call_is_kept_with_its_time(float_bundle, int8_bundle):
         assert (policy.answers.looked, policy.answers.strays) == (40, 0)
         assert policy.golden_error < 0.25
         assert policy.engines[0].providers == "CPUExecutionProvider"
+        assert [graph.graph for graph in policy.record.graphs] == ["main"]
         phases = {phase.name: phase for phase in policy.phases}
         assert list(phases) == ["encode observation", "main", "decode action and the rest"]
         assert sum(phase.share_percent for phase in phases.values()) == pytest.approx(100, abs=15)
+    assert found.policies[0].record.graphs[0].shares[0].macs == {"float32": 1.0}
     assert len(found.canary_ms) == 21
     assert found.cpu_s > 0
     assert 0 < found.wall_s <= found.ended_s - found.begun_s + 0.1

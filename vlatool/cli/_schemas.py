@@ -51,6 +51,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
     "run": ("dry_run",),
+    "serve": ("served",),
     "record": ("recorded_run",),
     "replay": ("replayed_run",),
     "simulate": ("simulation",),
@@ -230,6 +231,11 @@ def _documents_of_machines() -> dict[str, Schema]:
             inference=SPREAD, answer=SPREAD, missed=NUMBER,
             rungs=many(record(source=TEXT, time={"anyOf": [SPREAD, {"type": "null"}]})),
             cadence=record(parts=many(PART_TIME), misses=INTEGER),
+        ),
+        "served": document(
+            "What was served; times until an answer in ms where there were answers.",
+            bundle=TEXT, addresses=by_name(TEXT), seconds=NUMBER, requests=INTEGER, missed=INTEGER, failed=INTEGER,
+            times=by_name(NUMBER), lost_records=INTEGER,
         ),
         "recorded_run": document(
             "A file of recorded control steps.", file=TEXT, bytes=INTEGER, steps=INTEGER, seed=INTEGER, failed=INTEGER

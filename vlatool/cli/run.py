@@ -71,6 +71,7 @@ def lines(found: DryRun) -> Iterator[str]:
     width = max(len(note.layer) for note in found.layers)
     for note in found.layers:
         yield f"  {note.layer:{width}}  {note.does}"
+    yield from found.engine.lines()
     yield f"control period {found.period_ms:g} ms, deadline {found.deadline_ms:g} ms"
     yield f"  inference  p50 {found.inference.p50:.3f} ms, p99 {found.inference.p99:.3f} ms"
     share = f"{found.missed:.1%} of {found.answer.samples} steps without an action of the policy in time"

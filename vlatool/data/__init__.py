@@ -28,6 +28,7 @@ from vlatool.data._random_observations import save_drawn as save_drawn
 from vlatool.data._reader import MAP_HELP as MAP_HELP
 from vlatool.data._reader import NamedRecording as NamedRecording
 from vlatool.data._reader import Reader as Reader
+from vlatool.data._reader import mapped_names as mapped_names
 from vlatool.data._reader import named_recording as named_recording
 from vlatool.data._reader import read_recording as read_recording
 from vlatool.data._reader import reader_of as reader_of

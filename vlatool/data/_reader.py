@@ -38,10 +38,26 @@ def named_recording(path: Path | None, pairs: Sequence[str]) -> NamedRecording |
     """Return the recording of an option and its ``--map SPEC=RECORDED``; None where no path is given.
 
     Raises:
-        UsageError: for a pair without a name on each side, a name that is mapped twice, and pairs without a path.
+        UsageError: as ``mapped_names`` does, and for pairs without a path.
 
     Example:
         >>> named_recording(Path("a"), ["state=observation.state"]).names
+        {'state': 'observation.state'}
+    """
+    names = mapped_names(pairs)
+    if names and path is None:
+        raise UsageError("--map says how a recording names things, and none is given.", "name the recording, too")
+    return None if path is None else NamedRecording(path, names)
+
+
+def mapped_names(pairs: Sequence[str]) -> dict[str, str]:
+    """Return name in the spec -> other name, of ``--map SPEC=OTHER``.
+
+    Raises:
+        UsageError: for a pair without a name on each side, and a name that is mapped twice.
+
+    Example:
+        >>> mapped_names(["state=observation.state"])
         {'state': 'observation.state'}
     """
     names: dict[str, str] = {}
@@ -52,9 +68,7 @@ def named_recording(path: Path | None, pairs: Sequence[str]) -> NamedRecording |
         if name in names:
             raise UsageError(f"--map names '{name}' twice.", "map each name of the spec once")
         names[name] = recorded
-    if names and path is None:
-        raise UsageError("--map says how a recording names things, and none is given.", "name the recording, too")
-    return None if path is None else NamedRecording(path, names)
+    return names
 
 
 class Reader:

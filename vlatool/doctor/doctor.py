@@ -35,6 +35,8 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "metaworld": ("metaworld", "mujoco"),
     "text": ("tokenizers",),
     "sign": ("cryptography",),
+    "remote": ("websockets", "msgpack"),
+    "serve": ("websockets", "msgpack", "grpcio", "pyzmq"),
     "search": ("optuna",),
     "tensorboard": ("tensorboard",),
     "video": ("pillow",),
@@ -121,10 +123,13 @@ def engines(
         title = f"engine {name if library.package in packages else library.package}"
         packages.add(library.package)
         package = next((name for name in library.distributions() if name in installed), None)
-        if package is not None:
+        if package is not None and library.is_installed():
             yield _engine(title, f"{package} {installed[package]}", library, jetson, ask)
             continue
         advice = f" ({library.advice})" if library.advice else ""
+        if package is not None:
+            yield Check(title, "missing", "this machine lacks the device, or its driver", library.advice)
+            continue
         fix = "" if jetson and advice else f"{library.installation()}{advice}"
         yield Check(title, "missing", "not installed", fix)
 

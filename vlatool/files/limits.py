@@ -55,6 +55,7 @@ LIMITS = {
     "yaml_bytes": Limit(256 * KIB, "bytes", "a YAML file: a recipe, gate, profile or policy.yaml"),
     "yaml_depth": Limit(64, "levels", "nested lists and mappings in a YAML file"),
     "yaml_nodes": Limit(50_000, "nodes", "values of a YAML file, each alias counted as what it stands for"),
+    "message_bytes": Limit(64 * MIB, "bytes", "one message of a client of vlatool serve, or one of its answers"),
     "target_message_bytes": Limit(32 * MIB, "bytes", "one message of the target of a benchmark"),
     "target_bytes": Limit(256 * MIB, "bytes", "all that the target of a benchmark sends"),
     "target_seconds": Limit(6 * 3600, "seconds", "a benchmark on a target, beside the time that was asked for"),

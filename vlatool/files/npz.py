@@ -201,7 +201,7 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Array
         shape, fortran, dtype, _ = _checked_header(stream, entry, name)
         array = np.empty(math.prod(shape), dtype)
         _fill(stream, array, name)
-    return _check_values(array, name).reshape(shape, order="F" if fortran else "C")
+    return check_values(array, name).reshape(shape, order="F" if fortran else "C")
 
 
 def _stays_on_disk(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str, in_memory: int) -> bool:
@@ -217,7 +217,7 @@ def _rows(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str, file: Ope
         shape, _, dtype, start = _checked_header(stream, entry, name)
         while block := stream.read(BLOCK_BYTES):  # the end compares the checksum
             if dtype.kind == "b":
-                _check_values(np.frombuffer(block, np.bool_), name)
+                check_values(np.frombuffer(block, np.bool_), name)
     where, size = f"'{name}' in {file.where}", entry.file_size - start
     if entry.compress_type == zipfile.ZIP_STORED:
         return Rows(PlainSource(file, _data_start(file, entry) + start), shape, dtype, where)
@@ -236,7 +236,7 @@ def _checked_header(
     stream: IO[bytes], entry: zipfile.ZipInfo, name: str
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Return shape, whether it is in Fortran's order, dtype and bytes of the header of an array of numbers or text."""
-    shape, fortran, dtype = _header(stream)
+    shape, fortran, dtype = npy_header(stream)
     if dtype.hasobject:
         raise ValueError("it holds pickled objects, which are refused")
     if dtype.kind not in "biufcSU" or not dtype.itemsize:
@@ -249,7 +249,7 @@ def _checked_header(
     return shape, fortran, dtype, start
 
 
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, whether it is in Fortran's order, and dtype of an array; nothing of the header is evaluated."""
     start = stream.read(8)
     size = {b"\1": 2, b"\2": 4}.get(start[6:7], 0)
@@ -279,7 +279,7 @@ def _fill(stream: IO[bytes], array: Array, name: str) -> None:
         raise ValueError(f"'{name}' has more bytes than its shape")
 
 
-def _check_values(array: Array, name: str) -> Array:
+def check_values(array: Array, name: str) -> Array:
     """Return the array in native byte order; refuse bytes that are not a valid value of their dtype."""
     native = array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
     if native.dtype.kind == "U" and native.size:

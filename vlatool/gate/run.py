@@ -21,7 +21,8 @@ from vlatool.gate.verdict import Outcome, Reason, Verdict, worst
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
 from vlatool.measurement.pairs import PairJob
-from vlatool.measurement.validity import busy, throttling, validity
+from vlatool.measurement.rows import ran_rows
+from vlatool.measurement.validity import busy, engine_findings, throttling, validity
 from vlatool.measures import series, tables
 from vlatool.measures.latency import LATENCY_P50
 from vlatool.report import Finding, Report, Row
@@ -31,6 +32,7 @@ from vlatool.stage.identity import with_identity
 from vlatool.telemetry import Recorder, open_all
 
 KIND = "gate"
+SIDES = ("baseline", "candidate")
 PERIOD_S = 1.0
 """Seconds between two looks at the board."""
 
@@ -64,10 +66,16 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     results, findings = _examined(gate, evidence)
     if Need.TIMES in plan.needs:
         findings += tuple(replace(finding, effect="note") for finding in busy(host))
-    name = candidate.manifest.name
+    name, records = candidate.manifest.name, dict(zip(SIDES, evidence.answers.records, strict=False))
+    for side, record in records.items():
+        findings += tuple(engine_findings(f"the {side}", record))
     row = _row("candidate", candidate, timed, results)
     row = replace(row, details={**row.details, tables.SETTINGS: _measured_with(evidence)})
     baseline_row = _row("baseline", baseline, timed, results)
+    baseline_row, row = (
+        replace(one, details={**one.details, **({tables.RAN: ran_rows(records[side])} if side in records else {})})
+        for side, one in zip(SIDES, (baseline_row, row), strict=True)
+    )
     rows = (with_identity(baseline_row, baseline), with_identity(row, candidate))
     return Report(KIND, f"Gate of {name}", worst(result.verdict.outcome for result in results).value,
                   (*_summary(name, results), f"{inputs.description()}."), rows,

@@ -175,10 +175,35 @@ def gpus(root: Path = ROOT) -> tuple[str, ...]:
     return tuple(match[1] for match in models if match)
 
 
+def intel_devices(kind: str, root: Path = ROOT) -> list[str]:
+    """Return Intel's devices, as the kernel names them; the kind is ``drm/renderD*`` (graphics) or ``accel/accel*``."""
+    files = sorted((root / "sys/class").glob(f"{kind}/device/vendor"))
+    return [path.parts[-3] for path in files if read_text(root, path.relative_to(root).as_posix()) == "0x8086"]
+
+
 def gpu_driver(root: Path = ROOT) -> str | None:
     """Version of NVIDIA's driver in the kernel; None when it is not loaded."""
     match = re.search(r"^NVRM version:.*?\s(\d+\.\d[\d.]*)\s", read_text(root, "proc/driver/nvidia/version") or "")
     return f"NVIDIA driver {match[1]}" if match else None
+
+
+def power_mode(root: Path = ROOT) -> str:
+    """Return how the machine is set to spend power, in words; empty where nothing tells.
+
+    On a Jetson that is the mode of ``nvpmodel``, which its service notes in ``/var/lib/nvpmodel/status``
+    (``pmode:0002``) and ``/etc/nvpmodel.conf`` names; elsewhere the governor of the clocks and the profile of the
+    firmware (``/sys/firmware/acpi/platform_profile``).
+    """
+    parts = []
+    if status := re.search(r"pmode:0*(\d+)", read_text(root, "var/lib/nvpmodel/status") or ""):
+        names = read_text(root, "etc/nvpmodel.conf") or ""
+        name = re.search(rf"<\s*POWER_MODEL\s+ID={status[1]}\s+NAME=(\S+)\s*>", names)
+        parts.append(f"nvpmodel {name[1] if name else status[1]}")
+    if governor := frequency(root)["governor"]:
+        parts.append(f"governor {governor}")
+    if firmware := read_text(root, "sys/firmware/acpi/platform_profile"):
+        parts.append(f"platform profile {firmware}")
+    return ", ".join(parts)
 
 
 def online_cores(root: Path = ROOT) -> int | None:

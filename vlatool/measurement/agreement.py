@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.program import keeps_values
 from vlatool.measurement.child import ask, serve
 from vlatool.measurement.pairs import PairJob
+from vlatool.runtime.engine_record import EngineRecord
 
 Array = NDArray[Any]
 FEWEST = 24
@@ -64,6 +65,7 @@ class Agreement:
         skipped: observations that the baseline cannot answer.
         golden: golden error of baseline and candidate; None without a golden action.
         engines: engines of baseline and candidate.
+        records: what they ran; none where neither was loaded.
     """
 
     followed: tuple[OutputAgreement, ...] = ()
@@ -73,6 +75,7 @@ class Agreement:
     skipped: int = 0
     golden: tuple[float | None, ...] = (None, None)
     engines: tuple[str, ...] = ("", "")
+    records: tuple[EngineRecord, ...] = ()
 
 
 def measure_agreement(job: PairJob, timeout: float | None = None) -> Agreement:
@@ -86,7 +89,7 @@ def run_agreement(job: PairJob) -> Agreement:
     from vlatool.measurement.turns import load_policy, pool_of
 
     baseline = Bundle.open(job.baseline)
-    policies = [load_policy(path, job) for path in (job.baseline, job.candidate)]
+    policies = [load_policy(path, job, traced=True) for path in (job.baseline, job.candidate)]
     pool = pool_of(job, baseline) if job.pairs else []
     calls, skipped = _answers(policies, pool, job)
     if keeps_values(baseline.manifest.program):
@@ -100,7 +103,8 @@ def run_agreement(job: PairJob) -> Agreement:
     followed = [one for alike in by_kind for one in _agreements(policies, alike, usual)]
     return Agreement(tuple(followed), len(calls), strays[1], strays[0], skipped,
                      tuple(policy.golden_error for policy in policies),
-                     tuple(policy.engine for policy in policies))  # fmt: skip
+                     tuple(policy.engine for policy in policies),
+                     tuple(policy.engine_record() for policy in policies))  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import GateFailed
 from vlatool.runtime import load
+from vlatool.runtime.arguments import RECORD
+from vlatool.runtime.engine_record import EngineRecord
 from vlatool.runtime.interface import POLICY
 from vlatool.runtime.rungs import PolicyRung
 from vlatool.runtime.stack import Fallback, Stack, rate_factor
@@ -81,6 +83,7 @@ class DryRun:
         inference: Times of ``infer`` of the open bundle alone.
         answer: Times of ``act`` of all layers, called at the rate of the robot.
         missed: Share of the control steps at which the policy had no action in time.
+        engine: What the engine ran of the bundle, on what and in which precision.
         rungs: What answers a control step, in the order in which it is asked, each with the time of an answer.
         cadence: Where the time of the control steps went, all but the first.
     """
@@ -93,12 +96,13 @@ class DryRun:
     inference: Spread
     answer: Spread
     missed: float
+    engine: EngineRecord
     rungs: tuple[RungNote, ...]
     cadence: CadenceReport
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
-        return asdict(self)
+        return {**asdict(self), "engine": self.engine.to_dict()}
 
     def check(self) -> None:
         """Refuse a policy that a robot would hardly ever hear; raises GateFailed."""
@@ -132,7 +136,7 @@ def dry_run(
     Raises:
         UsageError, SpecError, BundleError, GraphError: as ``vlatool.runtime.load`` does.
     """
-    plain = load(path, engine=engine, threads=threads, seed=0)
+    plain = load(path, engine=engine, threads=threads, seed=0, engine_proof=RECORD)
     rate = plain.spec.rate * rate_factor(controllers)
     period_ms = 1000 / rate
     limit_ms = period_ms if deadline_ms is None else deadline_ms
@@ -158,6 +162,7 @@ def dry_run(
         inference,
         Spread.of(answers),
         cadence.report().misses / steps,
+        plain.engine_record(),
         tuple(_rungs(stack, [inference, *others])),
         cadence.report(),
     )

@@ -9,6 +9,7 @@ from typing import Any
 
 from vlatool.measurement.answers import AnswerCheck, Memory
 from vlatool.measurement.cold_start import ColdStart
+from vlatool.runtime.engine_record import EngineRecord
 from vlatool.telemetry import Summary
 
 
@@ -104,6 +105,7 @@ class PolicyRun:
         at_s: begin of each call, in seconds since the run began.
         engine: engine of the runtime.
         engines: engine of each graph; none in eager torch.
+        record: what the engine ran in the warm-up, on what and in which precision; None in eager torch.
         golden_error: relative difference of the golden action; None without one.
         golden_explained: largest difference that rounding explains.
         reach: dtype -> 10^9 multiply-accumulates in a second of a large matrix product in the same engine
@@ -122,6 +124,7 @@ class PolicyRun:
     at_s: tuple[float, ...]
     engine: str = ""
     engines: tuple[GraphEngine, ...] = ()
+    record: EngineRecord | None = None
     golden_error: float | None = None
     golden_explained: float = 0.0
     reach: Mapping[str, float] = field(default_factory=dict)

@@ -19,6 +19,7 @@ from vlatool.measures import latency, resources, series
 from vlatool.measures import tables as titles
 from vlatool.measures.actions import GOLDEN_ERROR
 from vlatool.report import Measurement
+from vlatool.runtime.engine_record import EngineRecord
 from vlatool.telemetry import DEGREE, THROTTLE, Absent, Summary
 
 ENERGY_S = 10.0
@@ -148,6 +149,8 @@ def tables(measured: Benchmark, policy: PolicyRun, alone: bool) -> dict[str, lis
              "computes in": graph.computes_in, "MACs in": graph.macs_in}
             for graph in policy.engines
         ]  # fmt: skip
+    if policy.record:
+        details[titles.RAN] = ran_rows(policy.record)
     if policy.phases:
         details[titles.PHASES] = [
             {"phase": phase.name, "calls": phase.calls, "p50 ms": phase.p50_ms, "share %": phase.share_percent}
@@ -160,6 +163,18 @@ def tables(measured: Benchmark, policy: PolicyRun, alone: bool) -> dict[str, lis
     if alone and measured.telemetry:
         details |= _telemetry(measured.telemetry)
     return details
+
+
+def ran_rows(record: EngineRecord) -> list[dict[str, Any]]:
+    """Return a row for each graph, provider and precision: nodes of the provider, share of the multiply-accumulates."""
+    where = {"device": record.device, "driver": record.driver, "power mode": record.power_mode}
+    return [
+        {"graph": graph.graph, "provider": share.provider, "nodes": share.nodes, "precision": precision,
+         "MACs %": round(100 * macs, 1), "promised %": round(100 * graph.promised.get(precision, 0.0), 1), **where}
+        for graph in record.graphs
+        for share in graph.shares
+        for precision, macs in (share.macs or {"": 0.0}).items()
+    ]  # fmt: skip
 
 
 def _memory_parts(starts: Sequence[ColdStart]) -> list[dict[str, Any]]:

@@ -32,6 +32,7 @@ from vlatool.measurement.answers import Answers, vary_observation
 from vlatool.measurement.child import serve
 from vlatool.measurement.pairs import FEWEST, PairJob, Pairs, medians
 from vlatool.runtime import Policy, load
+from vlatool.runtime.arguments import RECORD
 from vlatool.runtime.program import draw
 
 WARMUP_MS = 200.0
@@ -204,17 +205,21 @@ class Turns:
         return answers.looked, answers.strays
 
 
-def load_policy(path: str, job: PairJob) -> Policy:
+def load_policy(path: str, job: PairJob, traced: bool = False) -> Policy:
     """Load a bundle as a robot does: every file is hashed, and the golden action is computed.
 
     What a stage found to be wrong was looked at by the gate before.
+
+    Args:
+        traced: Whether the policy is to tell what the engine ran.
 
     Raises:
         VlatoolError: what ``load`` raises, with the bundle's path.
     """
     try:
         known = [finding["name"] for finding in Bundle.open_lazily(path).manifest.findings]
-        return load(path, engine=job.engine, threads=job.threads, seed=job.seed, accept=known)
+        proof = RECORD if traced else ""
+        return load(path, engine=job.engine, threads=job.threads, seed=job.seed, accept=known, engine_proof=proof)
     except VlatoolError as error:
         if path in error.message:
             raise

@@ -14,6 +14,7 @@ from vlatool.measurement.interleaved import MAX_CALLS
 from vlatool.measurement.jobs import LatencyJob
 from vlatool.measurement.results import Benchmark, PolicyRun
 from vlatool.report import Finding
+from vlatool.runtime.engine_record import EngineRecord
 
 SWITCHES_A_SECOND = 50.0
 """Involuntary context switches of a thread that has its processor for itself: a few in a second."""
@@ -88,6 +89,15 @@ def busy(host: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
+def engine_findings(name: str, record: EngineRecord | None) -> Iterator[Finding]:
+    """Tell of an engine that did not run a policy as asked."""
+    for problem in record.problems if record else ():
+        yield suspect(
+            f"the engine did not run {name} as asked: {problem.rstrip('.')}",
+            "use the engine that it was made for, or make a bundle for this engine and processor",
+        )
+
+
 def _golden_findings(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
     for policy in policies:
         error = policy.golden_error
@@ -97,6 +107,7 @@ def _golden_findings(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
                 f"explains {policy.golden_explained:.2g}",
                 "see what its engine and processor compute in: vlatool explain, vlatool doctor",
             )
+        yield from engine_findings(policy.name, policy.record)
         if policy.engines and policy.answers is None:
             yield Finding("note", f"the answers of {policy.name} were not looked at (--no-answers)")
 

@@ -135,7 +135,7 @@ def open_policy(path: str, job: LatencyJob) -> Contestant:
     bundle = Bundle.open(Path(path))
     manifest = bundle.manifest
     if manifest.graphs:
-        policy = Policy.open(bundle, engine=job.engine, threads=job.threads, seed=0)
+        policy = Policy.open(bundle, engine=job.engine, threads=job.threads, seed=0, traced=True)
         policy.warm_up(1, first_run_s=FIRST_RUN_S)
     elif "factory" in manifest.source:
         import torch
@@ -173,6 +173,7 @@ def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | 
         at_s=tuple(round(start - begun, 6) for start in contestant.starts),
         engine=policy.engine,
         engines=tuple(_engines(policy)),
+        record=policy.engine_record() if contestant.bundle.manifest.graphs else None,
         golden_error=policy.golden_error,
         golden_explained=policy.golden_explained,
         reach=_reach(policy, job.threads) if job.reach else {},

@@ -5,6 +5,8 @@ from __future__ import annotations
 from vlatool.measures import Pattern
 
 ENGINE, LOG, TELEMETRY = "engine", "log", "telemetry"
+RAN = "what the engine ran"
+"""Nodes and multiply-accumulates of each graph by provider and precision, as the engine reports them."""
 PHASES, MEMORY_PARTS, START_PARTS = "time by phase", "memory by part", "cold start by part"
 DUTY_CYCLE = "latency by the way of calling"
 MISSING_VALUES = "unmeasured"

@@ -12,7 +12,7 @@ from vlatool.measures.success import SUCCESS
 from vlatool.optimize.judge import Judged
 from vlatool.optimize.ranking import TIE, first_choice, is_faster, p50, ratio
 from vlatool.report import Row
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
+from vlatool.runtime.engine import DEFAULT_ENGINE, is_installed
 
 
 def choose(
@@ -51,7 +51,7 @@ def mark(judged: list[Judged], best: Judged, reason: str, sentences: tuple[str, 
 
 def _times(judged: list[Judged], engine: str) -> tuple[str, dict[str, float]]:
     """Return what ranks the rows, ``measured`` or ``predicted``, and name -> median latency in ms of that origin."""
-    times = {item.row.name: p50(item.row, "predicted") for item in judged} if engine not in engine_names() else {}
+    times = {item.row.name: p50(item.row, "predicted") for item in judged} if not is_installed(engine) else {}
     if times and all(map(math.isfinite, times.values())):
         return "predicted", times
     return "measured", {item.row.name: p50(item.row) for item in judged}

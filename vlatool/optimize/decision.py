@@ -15,7 +15,7 @@ from vlatool.optimize.judge import Judged, judge
 from vlatool.optimize.plan import BASELINE, Plan
 from vlatool.optimize.ranking import is_faster
 from vlatool.report import Row
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
+from vlatool.runtime.engine import DEFAULT_ENGINE, is_installed
 
 Tables = Mapping[str, list[dict[str, Any]]]
 
@@ -75,7 +75,7 @@ def _with_tables(item: Judged, tables: Tables) -> Judged:
 def enough_for(plan: Plan) -> Enough | None:
     """Return what ends the episodes: a candidate that keeps to the limits, where measured latencies decide."""
     board = plan.profile.engine if plan.profile else DEFAULT_ENGINE
-    if plan.recipe.effort.every_candidate or plan.board_set.is_confined or board not in engine_names():
+    if plan.recipe.effort.every_candidate or plan.board_set.is_confined or not is_installed(board):
         return None
 
     def is_good_enough(row: Row, baseline: Row) -> bool:

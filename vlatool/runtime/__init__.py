@@ -6,22 +6,24 @@ Needs numpy and one inference engine; never torch, onnx, pydantic, typer, rich o
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, overload
 
 from vlatool.errors import refuse_two_distributions
-from vlatool.runtime.arguments import check_load
+from vlatool.runtime.arguments import REQUIRE, WARN, check_load
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import Action
 from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
 
 if TYPE_CHECKING:
+    from vlatool.bundle.bundle import Bundle
     from vlatool.runtime.stack import Fallback, Stack, Wrapper
     from vlatool.runtime.telemetry import Sink, Telemetry
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 AUTO = "auto"
-"""Name that stands for the engine that a bundle was made for."""
+"""Name that stands for the engine that a bundle was made for, or another where that cannot be used."""
 
 
 @overload
@@ -37,6 +39,7 @@ def load(
     first_run_s: float = ...,
     memory_mb: float | None = ...,
     probe: bool = ...,
+    engine_proof: str = ...,
 ) -> Policy: ...
 
 
@@ -53,6 +56,7 @@ def load(
     first_run_s: float = ...,
     memory_mb: float | None = ...,
     probe: bool = ...,
+    engine_proof: str = ...,
     controllers: Sequence[str] | None = ...,
     envelope: str | Wrapper | None = ...,
     deadline_ms: float | None = ...,
@@ -74,6 +78,7 @@ def load(
     first_run_s: float = FIRST_RUN_S,
     memory_mb: float | None = None,
     probe: bool = False,
+    engine_proof: str = "",
     controllers: Sequence[str] | None = None,
     envelope: str | Wrapper | None = None,
     deadline_ms: float | None = None,
@@ -85,7 +90,9 @@ def load(
 
     Args:
         path: The bundle directory.
-        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty or ``auto``.
+        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty. ``auto`` is
+            that one, too, and where it cannot be used here the first one that can, with a warning;
+            ``Policy.engine_reason`` says why.
         threads: Intra-op threads of the engine; the cores that this process may use when None.
         seed: Seed of the noise that a program draws; fresh entropy when None.
         warmup: Inferences on the golden observation before this returns (the first is the slowest).
@@ -100,6 +107,10 @@ def load(
         probe: Do the first run in a child process, limited in time and memory, before this process opens a graph: for
             bundles of others. Whatever the child does, it is killed after ``first_run_s`` and 60 s for its start. Takes
             as long as loading twice and starting Python.
+        engine_proof: ``record`` has the engine say in the warm-up what it runs of each graph, on what and in which
+            precision (``Policy.engine_record``); ``warn`` also warns where that is not what the bundle promises, and
+            ``require`` refuses it. This takes some milliseconds for a hundred nodes. When empty, only what an engine
+            says by itself is looked at: its providers, devices and the dtype that it was asked for.
         controllers, envelope, deadline_ms, fallback, telemetry: Layers around the policy (``stack.build_stack``); with
             any of them a ``Stack`` is returned. ``fallback`` may be the directory of a second bundle, too.
         record: New file in which each control step of the ``Stack`` is recorded, so that ``vlatool replay`` computes it
@@ -117,19 +128,24 @@ def load(
     from vlatool.bundle.bundle import Bundle
 
     refuse_two_distributions()
-    check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
-    engine = "" if engine == AUTO else engine
+    check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb, engine_proof)
     bundle = Bundle.open_lazily(path)
     refuse_findings(bundle, accept)
+    reason = ""
+    if engine == AUTO:
+        engine, reason = _chosen(bundle)
     bundle.verify("data/")
     if probe:
         from vlatool.runtime.probe import probe as run_once
 
         run_once(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
     seed = _drawn_seed() if seed is None and record is not None else seed
-    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
+    traced = bool(engine_proof)
+    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb, traced=traced)
+    policy.engine_reason = reason
     bundle.verify()
-    policy.warm_up(warmup, golden_tolerance, first_run_s)
+    policy.warm_up(max(warmup, traced), golden_tolerance, first_run_s)
+    _check_record(policy, engine_proof)
     layers: dict[str, Any] = {
         "controllers": controllers,
         "envelope": envelope,
@@ -146,6 +162,27 @@ def load(
     if record is None:
         return _stack_of(policy, given)
     return _recorded(policy, given, record, threads=threads, seed=seed, second=second)
+
+
+def _chosen(bundle: Bundle) -> tuple[str, str]:
+    """Return the engine that ``auto`` stands for and why; warns where the bundle was made for another."""
+    from vlatool.runtime.engine_choice import choose_engine
+
+    choice = choose_engine(bundle.manifest)
+    if choice.replaces:
+        warnings.warn(f"engine='auto' is {choice.engine}: {choice.reason}", RuntimeWarning, stacklevel=3)
+    return choice.engine, choice.reason
+
+
+def _check_record(policy: Policy, proof: str) -> None:
+    """Warn of an engine that did not run as asked, or refuse it; see ``engine_proof`` of ``load``."""
+    if proof not in (WARN, REQUIRE):
+        return
+    record = policy.engine_record()
+    if proof == REQUIRE:
+        record.check()
+    for problem in record.problems:
+        warnings.warn(f"{record.library}: {problem}", RuntimeWarning, stacklevel=3)
 
 
 def _stack_of(policy: Policy, layers: dict[str, Any]) -> Stack:

@@ -10,6 +10,10 @@ from typing import Any
 from vlatool.errors import UsageError
 
 MOST_THREADS = 1024
+RECORD, WARN, REQUIRE = "record", "warn", "require"
+PROOFS = ("", RECORD, WARN, REQUIRE)
+"""What ``load`` does about what an engine ran: nothing, keep a record, warn where it is not what was asked for, refuse
+that."""
 
 
 def check_path(path: Any, of: str = "bundle") -> None:
@@ -55,7 +59,7 @@ def _refused(name: str, value: Any, allowed: str, optional: bool) -> UsageError:
 
 
 def check_load(
-    path: Any, threads: Any, seed: Any, warmup: Any, tolerance: Any, first_run_s: Any, memory_mb: Any
+    path: Any, threads: Any, seed: Any, warmup: Any, tolerance: Any, first_run_s: Any, memory_mb: Any, proof: Any = ""
 ) -> None:
     """Check all arguments of ``load``; raises UsageError for the first invalid one."""
     check_path(path)
@@ -65,3 +69,8 @@ def check_load(
     check_positive("golden_tolerance", tolerance, "a number", optional=True, zero=True)
     check_positive("first_run_s", first_run_s, "a number of seconds")
     check_positive("memory_mb", memory_mb, "a number of 10^6 bytes", optional=True)
+    if proof not in PROOFS:
+        raise UsageError(
+            f"engine_proof is {proof!r}; allowed: {', '.join(map(repr, PROOFS))}.",
+            "pass engine_proof='warn' to be told where the engine does not run as asked, or 'require' to refuse that",
+        )

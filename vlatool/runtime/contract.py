@@ -119,6 +119,21 @@ def check_sizes(manifest: Manifest, limit_mb: float) -> None:
     _check_total(named, "The program", limit_mb)
 
 
+def input_shapes(manifest: Manifest, graph: str) -> dict[str, tuple[int, ...]]:
+    """Return input of a graph -> its shape, as spec and program say; nothing where one is free, or given by a graph."""
+    known = {tensor.name: _declared(tensor) for tensor in manifest.spec.inputs}
+    for step in manifest.program:
+        known |= sources_of(step)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for step in manifest.program:
+        for name, value in step.feeds.items() if step.graph == graph else ():
+            axes = known[value].axes if value in known else None
+            fixed = tuple(axis for axis in axes or () if axis is not None)
+            if axes is None or len(fixed) < len(axes) or shapes.setdefault(name, fixed) != fixed:
+                return {}
+    return shapes
+
+
 def check_graphs(manifest: Manifest, sessions: Mapping[str, Any], limit_mb: float) -> None:
     """Check what the open graphs declare against the spec, and against each other along the program.
 

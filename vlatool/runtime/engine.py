@@ -59,6 +59,26 @@ class Int8Layout:
     crashes: bool = False
 
 
+@dataclass(frozen=True)
+class NodeRun:
+    """A node as an engine ran it, once.
+
+    Args:
+        name: The engine's name of the node.
+        operator: The engine's type of it.
+        provider: What ran it: an execution provider of ONNX Runtime, a device of OpenVINO.
+        precision: What it computed in: ``INT8`` to ``QUANTIZING`` above, or another dtype; empty where the engine does
+            not tell.
+        macs: Multiply-accumulates; 0 where it multiplies no matrices, None where the engine does not tell.
+    """
+
+    name: str
+    operator: str
+    provider: str
+    precision: str
+    macs: int | None
+
+
 class Profiled(Protocol):
     """A session that notes the time of its nodes."""
 
@@ -96,6 +116,8 @@ class Engine:
     """Options of ``quantize.static_int8`` for a graph that this engine runs."""
     remedy: ClassVar[str] = ""
     """What to do where its int8 products saturate."""
+    traces: ClassVar[bool] = False
+    """Whether a session that is opened with ``traced=True`` has ``node_runs()``: the nodes of its first run."""
 
     @classmethod
     def library(cls) -> Any:
@@ -141,6 +163,21 @@ class Engine:
         """Return what the library runs on, None where it does not tell; raises MissingExtra when it is absent."""
         cls.library()
         return None
+
+    caches: ClassVar[bool] = False
+    """Whether a session takes ``cache``, a key of what it builds from a graph, and ``shapes`` of the graph's inputs."""
+
+    @classmethod
+    def targets(cls) -> tuple[str, ...]:
+        """Return what its nodes are to run on, as ``NodeRun.provider`` names it; empty where it does not tell."""
+        return ()
+
+    @classmethod
+    def hardware(cls) -> tuple[str, str]:
+        """Return the device that it runs on and the driver of that, in words; empty where that is not known."""
+        from vlatool.machine.host import cpu_model  # a record alone needs it
+
+        return cpu_model() or "", ""
 
     @classmethod
     def identity(cls) -> str:

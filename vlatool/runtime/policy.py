@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,11 +16,19 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
 from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.spec import PolicySpec
-from vlatool.errors import BundleError, GraphError, UsageError
+from vlatool.errors import BundleError, GraphError, UsageError, VlatoolError
 from vlatool.files.printable import printable
 from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.arithmetic import int8_trouble, machine
-from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, written_as_declared
+from vlatool.runtime.contract import (
+    Outputs,
+    allowed_mb,
+    check_chunk,
+    check_graphs,
+    check_sizes,
+    input_shapes,
+    written_as_declared,
+)
 from vlatool.runtime.converter import newest_moment
 from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
@@ -39,6 +47,9 @@ from vlatool.runtime.identity import policy_identity
 from vlatool.runtime.interface import Action, Array
 from vlatool.runtime.observation import EncodedObservation, ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
+
+if TYPE_CHECKING:
+    from vlatool.runtime.engine_record import EngineRecord
 
 FLOAT_ROUNDING = 1e-3
 """Relative difference of a float32 golden action that a different order of summation explains; observed: up to 6e-7."""
@@ -73,6 +84,8 @@ class BundlePolicy:
         self._sequence = 0
         self._turn = threading.RLock()  # a signal handler may call while this thread holds it
         self._busy = False
+        self.engine_reason = ""
+        """Why the engine was chosen, as a sentence; empty where it was named, or is the bundle's."""
         self.limit_s: float | None = None
         """Time limit of an inference in seconds, after which it is stopped; no limit when None."""
         self.spent_ns: tuple[int, int, int, int] | None = None
@@ -90,8 +103,13 @@ class BundlePolicy:
         threads: int | None = None,
         seed: int | None = None,
         memory_mb: float | None = None,
+        traced: bool = False,
     ) -> BundlePolicy:
-        """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``."""
+        """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``.
+
+        Args:
+            traced: Whether ``engine_record`` is to tell what ran.
+        """
         manifest = bundle.manifest
         if not manifest.graphs:
             raise no_graph_error(bundle, "run")
@@ -102,7 +120,8 @@ class BundlePolicy:
         session = engine_class(engine)
         check_files(manifest)
         sessions: dict[str, Session] = {
-            name: open_graph(bundle, graph, session, threads) for name, graph in manifest.graphs.items()
+            name: open_graph(bundle, graph, session, threads, traced, input_shapes(manifest, name))
+            for name, graph in manifest.graphs.items()
         }
         check_graphs(manifest, sessions, limit_mb)
         outputs = [tensor.name for tensor in manifest.spec.outputs]
@@ -112,6 +131,17 @@ class BundlePolicy:
     def identity(self) -> str:
         """``sha256:...`` over all that decides how a robot behaves with this policy: for telemetry and logs."""
         return policy_identity(self.bundle)
+
+    def engine_record(self) -> EngineRecord:
+        """Return what the engine ran of each graph, on what and in which precision, against what the bundle promises.
+
+        The policy must be opened for it (``load(..., engine_proof="record")``) and have inferred once: ONNX Runtime
+        notes the nodes of the first run of each graph, and no others.
+        Where nothing has been noted, that is one of its problems.
+        """
+        from vlatool.runtime.engine_record import engine_record
+
+        return engine_record(self.engine, self.bundle.manifest.graphs, self.program.sessions)
 
     def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
         """Return the next action chunk.
@@ -295,8 +325,16 @@ class BundlePolicy:
             DataError: when the golden file cannot be read.
             GraphError: when the difference is larger or not a number, or an inference takes longer.
         """
-        self.replay_golden(inferences, first_run_s)
-        self.check_golden(tolerance)
+        caches = [cache for session in self.program.sessions.values() if (cache := getattr(session, "cache", None))]
+        try:
+            self.replay_golden(inferences, first_run_s)
+            self.check_golden(tolerance)
+        except VlatoolError:
+            for cache in caches:
+                cache.discard()
+            raise
+        for cache in caches if self.golden_error is not None else ():
+            cache.keep()
 
     def replay_golden(self, inferences: int, first_run_s: float = FIRST_RUN_S) -> None:
         """Run the golden observations as ``warm_up`` does, and store how far the actions are from the recorded ones.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 from vlatool.runtime.external_data import SEARCH_BYTES, VARINT, OpenFile, asked_of, fields, messages, parts
@@ -10,8 +11,8 @@ FLOAT8 = (17, 18, 19, 20)
 """``TensorProto.DataType``: E4M3FN, E4M3FNUZ, E5M2, E5M2FNUZ."""
 DATA_TYPE = 2
 """Number of the field ``TensorProto.data_type``."""
-MARKS = tuple(bytes([DATA_TYPE << 3 | VARINT, code]) for code in FLOAT8)
-"""How such a field begins: a message without these bytes holds no float8 tensor."""
+FLOAT16, INT8 = (10,), (2, 3)
+"""``TensorProto.DataType``: FLOAT16; UINT8 and INT8."""
 NODE_INPUT, NODE_TYPE = 1, 4
 """Numbers of the fields ``NodeProto.input`` and ``NodeProto.op_type``."""
 WITH_ZERO_POINT = {
@@ -36,7 +37,19 @@ def has_float8(model: Path | bytes) -> bool:
         >>> has_float8(b"")
         False
     """
-    return asked_of(_holds, model)
+    return holds_type(FLOAT8, model)
+
+
+def holds_type(codes: tuple[int, ...], model: Path | bytes) -> bool:
+    """Return whether a serialized ``ModelProto``, or the file of one, holds a tensor of one of these types anywhere.
+
+    Args:
+        codes: Numbers of ``TensorProto.DataType`` below 128.
+
+    Raises:
+        GraphError, OSError: as ``has_float8``.
+    """
+    return asked_of(functools.partial(_holds, codes), model)
 
 
 def lacks_zero_point(model: Path | bytes) -> bool:
@@ -73,14 +86,14 @@ def _short(model: bytes | OpenFile, start: int, end: int) -> bool:
     return inputs < WITH_ZERO_POINT.get(kind, 0)
 
 
-def _holds(model: bytes | OpenFile) -> bool:
-    tensors = (span for message, *span in messages(model, _may_hold) if message == "TensorProto")
-    return any(_data_type(model, start, end) in FLOAT8 for start, end in tensors)
+def _holds(codes: tuple[int, ...], model: bytes | OpenFile) -> bool:
+    marks = [bytes([DATA_TYPE << 3 | VARINT, code]) for code in codes]  # how such a field begins
 
+    def may_hold(content: bytes | OpenFile, start: int, end: int) -> bool:
+        return end - start > SEARCH_BYTES or any(mark in content[start:end] for mark in marks)
 
-def _may_hold(model: bytes | OpenFile, start: int, end: int) -> bool:
-    """Return whether a message may have such a tensor in it: a large one may."""
-    return end - start > SEARCH_BYTES or any(mark in model[start:end] for mark in MARKS)
+    tensors = (span for message, *span in messages(model, may_hold) if message == "TensorProto")
+    return any(_data_type(model, start, end) in codes for start, end in tensors)
 
 
 def _data_type(model: bytes | OpenFile, start: int, end: int) -> int:

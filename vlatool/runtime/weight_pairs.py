@@ -223,11 +223,11 @@ def _node(model: bytes | OpenFile, start: int, end: int) -> _Node:
     operator, domain, transposed = "", "", False
     for field, at, to, _ in fields(model, start, end):
         if field in (INPUT, OUTPUT):
-            (inputs if field == INPUT else outputs).append(_text(model, at, to))
+            (inputs if field == INPUT else outputs).append(text_at(model, at, to))
         elif field == OPERATOR:
-            operator = _text(model, at, to)
+            operator = text_at(model, at, to)
         elif field == DOMAIN:
-            domain = _text(model, at, to)
+            domain = text_at(model, at, to)
         elif field == ATTRIBUTE:
             transposed = transposed or _transposes(model, at, to)
     own = operator if domain in DOMAINS else f"{domain}.{operator}"
@@ -238,7 +238,7 @@ def _transposes(model: bytes | OpenFile, start: int, end: int) -> bool:
     name, value = "", 0
     for field, at, to, number in fields(model, start, end):
         if field == ATTRIBUTE_NAME:
-            name = _text(model, at, to)
+            name = text_at(model, at, to)
         elif field == INTEGER:
             value = number
     return name == "transB" and bool(value)
@@ -250,24 +250,26 @@ def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, int, _W
     name, dtype, span = "", 0, (0, 0)
     for field, at, to, number in fields(model, start, end):
         if field == DIMS:
-            shape += [number] if number >= 0 else list(_packed(model, at, to))
+            shape += [number] if number >= 0 else list(packed_numbers(model, at, to))
         elif field == DATA_TYPE:
             dtype = number
         elif field == TENSOR_NAME:
-            name = _text(model, at, to)
+            name = text_at(model, at, to)
         elif field == RAW_DATA:
             span = at, to
     return name, dtype, _Weight(tuple(shape), *span) if dtype == INT8 else None
 
 
-def _packed(model: bytes | OpenFile, start: int, end: int) -> Iterator[int]:
+def packed_numbers(model: bytes | OpenFile, start: int, end: int) -> Iterator[int]:
+    """Yield the numbers of a field that holds several; raises GraphError where one is cut off."""
     content, at = model[start:end], 0
     while at < len(content):
         number, at = varint(content, at, 10)
         yield number
 
 
-def _text(model: bytes | OpenFile, start: int, end: int) -> str:
+def text_at(model: bytes | OpenFile, start: int, end: int) -> str:
+    """Return the text of a field; raises GraphError for bytes that are not UTF-8."""
     try:
         return model[start:end].decode("utf-8")
     except UnicodeDecodeError:

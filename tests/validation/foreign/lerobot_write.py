@@ -5,6 +5,7 @@ LEROBOT_PYTHON tests/validation/foreign/lerobot_write.py FOLDER
 
 from __future__ import annotations
 
+import inspect
 import sys
 from pathlib import Path
 
@@ -25,6 +26,14 @@ def picture(random: np.random.Generator, size: tuple[int, int, int], step: int) 
     return np.clip(pixels + random.normal(0, 2, size), 0, 255).astype(np.uint8)
 
 
+def add(dataset: LeRobotDataset, frame: dict[str, np.ndarray], task: str) -> None:
+    """Add a step; releases with version 2.1 of the format (0.3) take the instruction by itself."""
+    if "task" in inspect.signature(dataset.add_frame).parameters:
+        dataset.add_frame(frame, task)
+    else:
+        dataset.add_frame({**frame, "task": task})
+
+
 def write(folder: Path, *, videos: bool) -> None:
     random = np.random.default_rng(0)
     kind = "video" if videos else "image"
@@ -40,7 +49,7 @@ def write(folder: Path, *, videos: bool) -> None:
                      for name, size in SIZES.items()}  # fmt: skip
             frame |= {name: random.normal(size=7).astype(np.float32) for name in ("observation.state", "action")}
             frame["next.done"] = np.array([step == length - 1])
-            dataset.add_frame({**frame, "task": TASKS[episode % 2]})
+            add(dataset, frame, TASKS[episode % 2])
         dataset.save_episode()
     if hasattr(dataset, "finalize"):
         dataset.finalize()

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, MissingExtra, require
 from vlatool.machine.engine_calls import REMEDY
-from vlatool.machine.host import gpu_driver, gpus, versions
+from vlatool.machine.host import board, gpu_driver, gpus, os_name, versions
 from vlatool.runtime import arithmetic
-from vlatool.runtime.engine import Engine, Node, Profiled, computing
+from vlatool.runtime.engine import Engine, Node, NodeRun, Profiled, computing
 from vlatool.runtime.engines._bound_buffers import HOST, BoundBuffers, port_of
 from vlatool.runtime.engines._device_tensors import on_host, run_bound
-from vlatool.runtime.engines._ort_profile import OrtProfiled, precision
+from vlatool.runtime.engines._ort_profile import OrtProfiled, Trace, precision
 from vlatool.runtime.stored_types import has_float8
 
 CPU = "CPUExecutionProvider"
@@ -46,6 +46,8 @@ class OnnxRuntimeSession(Engine):
         threads: Intra-op threads; the cores that this process may use when None.
         compute: One of the dtypes in ``computes``, or empty.
         opened: What is opened instead of ``path``: the content of the file, or another name of it.
+        traced: Whether ONNX Runtime notes the nodes of the first run, for ``node_runs``: in a temporary file, which is
+            removed when they are read, or with the session. Later runs take no longer than those of another session.
 
     Raises:
         GraphError: when ONNX Runtime refuses the file, opens it on other providers, or is to compute in a dtype that
@@ -55,6 +57,7 @@ class OnnxRuntimeSession(Engine):
 
     package = "onnxruntime"
     extra = "ort"
+    traces = True
     providers: ClassVar[Providers] = ()
     """Where a graph runs. A node that none of them runs is an error, unless the processor's provider is the last."""
     memory: ClassVar[str] = HOST
@@ -62,18 +65,27 @@ class OnnxRuntimeSession(Engine):
     observations are copied there, and actions back."""
 
     def __init__(
-        self, path: Path, threads: int | None = None, compute: str = "", opened: Path | bytes | None = None
+        self,
+        path: Path,
+        threads: int | None = None,
+        compute: str = "",
+        opened: Path | bytes | None = None,
+        traced: bool = False,
     ) -> None:
         ort = self.onnxruntime()
+        model = path if opened is None else opened
+        self._trace = Trace(model) if traced else None
+        self._node_runs: list[NodeRun] = []
         if compute not in ("", *self.computes):
             raise GraphError(
                 f"ONNX Runtime on {self._hardware()} does not compute in {compute}.",
                 f"use the engine {computing(compute)}",
             )
         try:
-            self._session = self._open(ort, path if opened is None else opened, threads)
+            folder = self._trace.folder if self._trace else None
+            self._session = self._open(ort, model, threads, folder, self._providers_for(model))
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
-            words, remedy = self._why_refused(ort, path if opened is None else opened, error)
+            words, remedy = self._why_refused(ort, model, error)
             raise GraphError(f"ONNX Runtime {ort.__version__} refuses {path}: {words}", remedy) from error
         self._check_providers(path)
         self.path = path
@@ -170,6 +182,8 @@ class OnnxRuntimeSession(Engine):
             TimeoutError: when ``deadline`` (seconds of ``time.monotonic``; none when None) passes, or after ``stop``.
         """
         try:
+            if self._trace is not None:
+                return self._traced_run(feeds)
             if self.deadline is not None:
                 return self._run_until(self.deadline, feeds)
             return self._call(feeds, self._options)
@@ -209,6 +223,21 @@ class OnnxRuntimeSession(Engine):
         if self._bound is None and (outputs or inputs):
             self._stays = {name: name in outputs for name in self.outputs}
 
+    def node_runs(self) -> list[NodeRun]:
+        """Return the nodes of the first run of a session that is ``traced``, as ONNX Runtime ran them.
+
+        There are none before that run, and where ONNX Runtime could not write them.
+        """
+        return self._node_runs
+
+    def _traced_run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        trace, self._trace = self._trace, None
+        try:
+            return self.run(feeds)
+        finally:
+            if trace is not None:
+                self._node_runs = trace.end(self._session)
+
     def _call(self, feeds: Mapping[str, Any], options: Any = None) -> Mapping[str, Any]:
         if self._stays:
             return run_bound(self._session, feeds, self._stays, self.memory, options)
@@ -237,21 +266,38 @@ class OnnxRuntimeSession(Engine):
             timer.cancel()
 
     @classmethod
-    def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
-        """Open a session, with other options where the first break the graph; the first error is reported."""
-        first, *others = cls._option_sets(ort, model, threads)
+    def _open(
+        cls,
+        ort: Any,
+        model: Path | bytes,
+        threads: int | None,
+        trace: str | None = None,
+        providers: Providers | None = None,
+    ) -> Any:
+        """Open a session, with other options where the first break the graph; the first error is reported.
+
+        Args:
+            trace: Directory in which ONNX Runtime notes each node that it runs; it does not where this is None.
+            providers: Where it is opened; those of the class when None.
+        """
+        providers = cls.providers if providers is None else providers
+        first, *others = (traced_into(trace, options) for options in cls._option_sets(ort, model, threads))
         try:
-            return open_session(ort, model, first, cls.providers)
+            return open_session(ort, model, first, providers)
         except Exception:
             for options in others:
                 with contextlib.suppress(Exception):
-                    return open_session(ort, model, options, cls.providers)
+                    return open_session(ort, model, options, providers)
             raise
 
     @staticmethod
     def _option_sets(ort: Any, model: Path | bytes, threads: int | None) -> list[Any]:
         """Return the options to try, one after the other."""
         return [session_options(ort, threads)]
+
+    def _providers_for(self, model: Path | bytes) -> Providers:
+        """Return the execution providers with the options for this graph."""
+        return self.providers
 
     @classmethod
     def _names(cls) -> list[str]:
@@ -261,6 +307,18 @@ class OnnxRuntimeSession(Engine):
     def _missing(cls, ort: Any) -> list[str]:
         available = ort.get_available_providers()
         return [name for name in cls._names() if name not in available]
+
+    @classmethod
+    def targets(cls) -> tuple[str, ...]:
+        """Return the names of the execution providers."""
+        return tuple(cls._names())
+
+    @classmethod
+    def hardware(cls) -> tuple[str, str]:
+        """Return the processor, or the graphics cards (a Jetson's board) and their driver (a Jetson's release)."""
+        if cls._names() == [CPU]:
+            return super().hardware()
+        return ", ".join(gpus()) or board() or "", gpu_driver() or os_name() or ""
 
     @classmethod
     def _hardware(cls) -> str:
@@ -336,6 +394,13 @@ def session_options(ort: Any, threads: int | None) -> Any:
     options.log_severity_level = 3
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
     options.inter_op_num_threads = 1
+    return options
+
+
+def traced_into(folder: str | None, options: Any) -> Any:
+    """Return options with which a session notes each node that it runs in a file of a folder; as they are for None."""
+    if folder is not None:
+        options.enable_profiling, options.profile_file_prefix = True, str(Path(folder) / "trace")
     return options
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 
 from vlatool.errors import GraphError
 from vlatool.machine.engine_calls import REMEDY
-from vlatool.runtime.engine import BFLOAT16, FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
+from vlatool.runtime.engine import BFLOAT16, FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node, NodeRun
 from vlatool.runtime.engines._openvino_core import openvino_core
+from vlatool.runtime.engines._products import Shape, macs
 
 
 class OpenvinoProfiled:
@@ -68,6 +70,60 @@ def fused_names(compiled: Any, known: Mapping[str, str]) -> dict[str, tuple[str,
         if computing:
             names[node.get_friendly_name()] = (product or computing[0], "Subgraph (MatMul)" if product else "Subgraph")
     return names
+
+
+NOT_RUN = ("Const", "Input", "Output")
+"""Types of a compiled model's nodes that are values."""
+
+
+def products(model: Any) -> dict[str, int]:
+    """Return name -> multiply-accumulates of the matrix products of a model as it was read, where shapes are known."""
+    found = {}
+    for node in model.get_ops():
+        kind = str(node.get_type_name())
+        inputs, outputs = _shapes(node.inputs()), _shapes(node.outputs())
+        count = macs(kind, inputs, outputs, {}, "") if inputs and outputs else None
+        if count:
+            found[node.get_friendly_name()] = count
+    return found
+
+
+def node_runs(compiled: Any, known: Mapping[str, int]) -> list[NodeRun]:
+    """Return the nodes of a compiled model, each as it runs once.
+
+    Args:
+        known: Multiply-accumulates of the products of the model as it was read (``products``). OpenVINO merges those of
+            an attention into a subgraph, and names the last one there (2026.4): those that no node accounts for are
+            shared out among such subgraphs.
+    """
+    devices = ", ".join(compiled.get_property("EXECUTION_DEVICES"))
+    runs: list[NodeRun] = []
+    merged: dict[int, int] = {}
+    for node in compiled.get_runtime_model().get_ops():
+        about = {key: str(value.astype(str)) for key, value in node.get_rt_info().items()}
+        kind, name = about["layerType"], node.get_friendly_name()
+        if kind in NOT_RUN:
+            continue
+        inputs, outputs = _shapes(node.inputs()), _shapes(node.outputs())
+        own = macs(kind, inputs, outputs, {}, name) if inputs and outputs else None
+        if kind == "Subgraph" and (inside := sum(known.get(one, 0) for one in _merged_names(about))):
+            own = merged[len(runs)] = inside
+        computed = precision(("", kind, about.get("primitiveType", "")))  # a product is named after its quantizer
+        runs.append(NodeRun(name, kind, devices, computed, own))
+    missing = sum(known.values()) - sum(run.macs or 0 for run in runs)
+    for index, inside in merged.items():
+        runs[index] = replace(runs[index], macs=inside + max(0, missing) * inside // sum(merged.values()))
+    return runs
+
+
+def _merged_names(about: Mapping[str, str]) -> set[str]:
+    return set(about.get("originalLayersNames", "").split(","))
+
+
+def _shapes(ports: Iterable[Any]) -> list[Shape]:
+    """Return the shapes of some ports; nothing where one is not fixed."""
+    shapes = [port.get_partial_shape() for port in ports]
+    return [] if any(shape.is_dynamic for shape in shapes) else [tuple(shape.to_shape()) for shape in shapes]
 
 
 def _is_quantizer(name: str) -> bool:

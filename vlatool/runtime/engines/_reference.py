@@ -15,7 +15,7 @@ from typing import Any
 
 from vlatool.errors import require
 from vlatool.runtime import arithmetic
-from vlatool.runtime.engines._onnx_runtime import is_true_of, open_session, session_options
+from vlatool.runtime.engines._onnx_runtime import is_true_of, open_session, session_options, traced_into
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
 
@@ -48,9 +48,11 @@ class BranchesSession(OrtCpuSession):
     """
 
     @classmethod
-    def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
+    def _open(
+        cls, ort: Any, model: Path | bytes, threads: int | None, trace: str | None = None, providers: Any = None
+    ) -> Any:
         if arithmetic.ort_product(ort) >= arithmetic.EXACT_SUM:
-            return super()._open(ort, model, threads)
-        options = session_options(ort, threads)
+            return super()._open(ort, model, threads, trace, providers)
+        options = traced_into(trace, session_options(ort, threads))
         options.add_session_config_entry(*arithmetic.UNFUSED_OPTION)
         return open_session(ort, model, options)

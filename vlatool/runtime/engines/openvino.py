@@ -19,9 +19,9 @@ from vlatool.machine.engine_calls import REMEDY
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
-from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Stages
+from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, NodeRun, Profiled, Stages
 from vlatool.runtime.engines._openvino_core import openvino_core
-from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, precision
+from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, node_runs, precision, products
 from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
 
@@ -59,17 +59,23 @@ class OpenvinoSession(Engine):
         threads: Threads; the cores that this process may use when None.
         compute: Dtype of what is not quantized: ``float32`` (also when empty) or ``bfloat16``.
         opened: What is opened instead of ``path``: the content of the file, or another name of it.
+        traced: Whether ``node_runs`` is to count the products that OpenVINO merges with others.
 
     Raises:
         GraphError: when OpenVINO refuses the file or computes in another dtype than asked for.
         MissingExtra: when openvino is not installed.
     """
 
+    device: ClassVar[str] = DEVICE
+    """OpenVINO's name of what computes."""
+    hints: ClassVar[Mapping[str, str]] = HINTS
+    """What OpenVINO is asked to compute in, for each dtype in ``computes``; for none named when empty."""
     title = "OpenVINO"
     package = "openvino"
     extra = "openvino"
+    traces = True
     advice = "fastest on Intel"
-    computes = ("float32", "bfloat16")
+    computes: ClassVar[tuple[str, ...]] = ("float32", "bfloat16")
     confined = True
     layouts: ClassVar[Mapping[str, Int8Layout]] = {
         "openvino": Int8Layout(fuses_convolutions=False, symmetric=True, convolutions=True, crashes=True)
@@ -78,27 +84,38 @@ class OpenvinoSession(Engine):
     remedy = "quantize again with --reduce-range, or with --layout ort for ONNX Runtime, whose products are exact"
 
     def __init__(
-        self, path: Path, threads: int | None = None, compute: str = "", opened: Path | bytes | None = None
+        self,
+        path: Path,
+        threads: int | None = None,
+        compute: str = "",
+        opened: Path | bytes | None = None,
+        traced: bool = False,
     ) -> None:
         openvino = require("openvino", "openvino")
-        settings = settings_for(threads, compute)
+        self._check_device(openvino_core())
+        settings = self.settings(threads, compute)
         content = path if opened is None else opened
         try:
             core = openvino_core()
             model = core.read_model(io.BytesIO(content) if isinstance(content, bytes) else str(content))
+            self._check_model(model)
+            self._products = products(model) if traced else {}
             declared = [[port.get_any_name() for port in ports] for ports in (model.inputs, model.outputs)]
-            self._compiled = compile_for_cpu(core, model, settings)
+            self._compiled = self._compile(core, model, settings)
             self._request = self._compiled.create_infer_request()
+        except GraphError:
+            raise
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
             words = f"OpenVINO {self.version()} refuses {path}: {_last_line(error)}"
             raise GraphError(
                 words, _remedy(error) or _without_float8(content) or REMEDY.format(package="openvino")
             ) from error
         self.path = path
+        self._check_execution()
         self.precision = str(self._compiled.get_property("INFERENCE_PRECISION_HINT").get_type_name())
-        if self.precision != HINTS[compute]:
+        if self.precision != self.hints[compute]:
             raise GraphError(
-                f"OpenVINO computes {path} in {self.precision} on this processor; wanted {HINTS[compute]}.",
+                f"OpenVINO computes {path} in {self.precision} on this {self.device}; wanted {self.hints[compute]}.",
                 "make the bundle for this processor: vlatool optimize",
             )
         ports = self._compiled.inputs, self._compiled.outputs
@@ -179,6 +196,10 @@ class OpenvinoSession(Engine):
             self._check(feeds)
             self._request.start_async(feeds)
 
+    def node_runs(self) -> list[NodeRun]:
+        """Return the nodes of the compiled model, each as it runs once, with the kernels that OpenVINO chose."""
+        return node_runs(self._compiled, self._products)
+
     def stop(self) -> None:
         """End the run in progress between two nodes; it and later ones raise TimeoutError until ``resume``.
 
@@ -234,6 +255,36 @@ class OpenvinoSession(Engine):
                     f"OpenVINO failed in {self.path.name}: '{name}' is {actual}; wanted {expected}.", FEEDS
                 )
 
+    @classmethod
+    def targets(cls) -> tuple[str, ...]:
+        """Return the device."""
+        return (cls.device,)
+
+    @classmethod
+    def settings(cls, threads: int | None, compute: str) -> dict[str, Any]:
+        """Return what a model is compiled with; raises GraphError when the device does not compute in that dtype."""
+        return settings_for(threads, compute)
+
+    @classmethod
+    def _compile(cls, core: Any, model: Any, settings: dict[str, Any]) -> Any:
+        return compile_for_cpu(core, model, settings)
+
+    @classmethod
+    def _check_device(cls, core: Any) -> None:
+        """Refuse a device that OpenVINO does not find; raises MissingExtra."""
+
+    def _check_model(self, model: Any) -> None:
+        """Refuse a model that the device would compute otherwise than it says; raises GraphError."""
+
+    def _check_execution(self) -> None:
+        """Refuse a model that was compiled for another device than asked for; raises GraphError."""
+        devices = [str(name) for name in self._compiled.get_property("EXECUTION_DEVICES")]
+        if [name.partition(".")[0] for name in devices] != [self.device]:
+            raise GraphError(
+                f"OpenVINO compiled {self.path} for {', '.join(devices) or 'nothing'}; wanted {self.device}.",
+                "see which devices OpenVINO finds: vlatool doctor",
+            )
+
     @staticmethod
     def arithmetic() -> str:
         """Return whether integer products are exact on this machine, or saturate. Takes a fraction of a second.
@@ -274,8 +325,8 @@ class OpenvinoSession(Engine):
     @classmethod
     def open_profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
         """Open a graph with OpenVINO's counters of every node on; raises GraphError when OpenVINO refuses it."""
-        settings = {**settings_for(threads, compute), "PERF_COUNT": True}
-        return OpenvinoProfiled(path, lambda core, model: compile_for_cpu(core, model, settings))
+        settings = {**cls.settings(threads, compute), "PERF_COUNT": True}
+        return OpenvinoProfiled(path, lambda core, model: cls._compile(core, model, settings))
 
     @classmethod
     def node_precision(cls, node: Node) -> str:
