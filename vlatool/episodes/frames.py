@@ -26,7 +26,7 @@ class FrameRecorder:
 
     def __init__(self, policy: Policy, encode: ObservationEncoder) -> None:
         self.spec: PolicySpec = policy.spec
-        self._policy, self._observer, self._encode = policy, observer_of(policy), encode
+        self.policy, self._observer, self._encode = policy, observer_of(policy), encode
         self._frames: list[dict[str, Array]] | None = None
         self._begins: list[bool] = []
         self._new = True
@@ -38,7 +38,7 @@ class FrameRecorder:
             self._frames.append({name: np.array(value) for name, value in observation.items()})
             self._begins.append(self._new)
             self._new = False
-        return self._policy.infer(observation, noise=noise)
+        return self.policy.infer(observation, noise=noise)
 
     def observe(self, observation: Mapping[str, Any]) -> None:
         """Give the policy the observation of a control step at which it does not infer."""
@@ -48,7 +48,7 @@ class FrameRecorder:
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode: it begins with the frame that is recorded next."""
         self._new = True
-        self._policy.reset(seed)
+        self.policy.reset(seed)
 
     @contextlib.contextmanager
     def recording(self, folder: Path) -> Iterator[None]:

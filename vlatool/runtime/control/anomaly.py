@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,7 +63,7 @@ class Anomaly:
         """Name of a monitor -> its score at the last step, where it had one."""
         self._clock, self._escalates, self._after, self._lasted = clock, escalate, after, 0
         self._player = next((layer for layer in inside if hasattr(layer, "played")), None)
-        self.monitors = monitors_of(self.spec, getattr(inside[-1], "bundle", None), limits, closed)
+        self.monitors = monitors_of(self.spec, _bundle_of(inside), limits, closed)
         """What looks at each step."""
         self._spread = NoiseSpread.of(inside, spread, self.spec) if spread else None
 
@@ -117,3 +117,8 @@ class Anomaly:
         for monitor in self.monitors:
             monitor.reset()
         self.alarms, self.scores, self._lasted = (), {}, 0
+
+
+def _bundle_of(layers: Sequence[Any]) -> Any:
+    """Return the bundle inside some layers, which has the statistics; None where there is none."""
+    return next((layer.bundle for layer in layers if hasattr(layer, "bundle")), None)
