@@ -9,6 +9,7 @@ import time
 
 import psutil
 import pytest
+from _full import small_or_full
 from _processes import below
 
 from vlatool.measurement.agent import WORKER
@@ -25,7 +26,9 @@ def gone(processes, seconds=10):
     return not psutil.wait_procs(processes, timeout=seconds)[1]
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGKILL, -9), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130), *small_or_full([], [(signal.SIGTERM, 143)])]
+)
 def test_nothing_is_left_when_a_run_is_ended(float_bundle, number, code):
     with subprocess.Popen(command(float_bundle.path, "--duration", 60), stderr=subprocess.PIPE) as run:
         end = time.monotonic() + 60

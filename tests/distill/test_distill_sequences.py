@@ -157,8 +157,8 @@ def test_a_shorter_burn_in_is_enough_for_what_is_forgotten(tmp_path: Path, burn_
 
 
 @pytest.mark.parametrize("options", [
-    {}, {"accumulate": 3}, {"patience": 9}, {"alpha": 0.5}, {"alpha": 0.0, "label_share": 0.4}, {"control": "noise"},
-    {"burn_in": 3},
+    {}, {"accumulate": 3}, {"patience": 9}, {"control": "noise"},
+    *small_or_full([], [{"alpha": 0.5}, {"alpha": 0.0, "label_share": 0.4}, {"burn_in": 3}]),
 ])  # fmt: skip
 def test_a_run_that_is_killed_goes_on_to_the_same_bits(tmp_path: Path, options: dict[str, Any]):
     source, named = pair(tmp_path)

@@ -6,11 +6,13 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
+from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.environment import time_limit, timeout_of
@@ -87,9 +89,10 @@ def alive(folder: Path) -> list[int]:
     return [process.pid for process in left]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize("hang", [SLEEPS, HOLDS], ids=["sleeps", "holds the lock"])
-@pytest.mark.parametrize("call", ["reset()", "step()", "close()"])
+@pytest.mark.parametrize(("call", "hang", "workers"), small_or_full(
+    [("reset()", SLEEPS, 2), ("step()", HOLDS, 1), ("close()", SLEEPS, 1), ("close()", HOLDS, 2)],
+    list(product(("reset()", "step()", "close()"), (SLEEPS, HOLDS), (1, 2))),
+))  # fmt: skip
 def test_a_call_that_never_returns_is_ended(tmp_path: Path, float_bundle: Bundle, call: str, hang: str, workers: int):
     folder, begun = world(tmp_path / "world", call, hang), time.monotonic()
     jobs = [job(folder), job(folder, (18,), "push")]

@@ -34,7 +34,7 @@ def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Bundle]:
     return {name: bundle_of(folder / name, kind) for name, kind in kinds.items()}
 
 
-def evaluated(bundles: dict[str, Bundle], name: str, episodes: int = 60, **options: object) -> Report:
+def evaluated(bundles: dict[str, Bundle], name: str, episodes: int = 24, **options: object) -> Report:
     baseline = bundles["good"]
     stage = ClosedLoop(policy=baseline.path.parent / "policy", baseline=baseline.path, episodes=episodes, **options)
     stage.check(bundles[name], None)
@@ -58,7 +58,7 @@ def test_a_policy_that_trembles_keeps_its_success_and_is_found_by_its_motion(tre
         "spectral_arc_length_ratio",
     ):
         assert row.get(name).low > 1.05, name
-        assert row.get(name).samples == 60
+        assert row.get(name).samples == 24
     assert row.value("task_time_ratio") == row.value("steps_ratio") == 1.0
     assert "most in near" in row.get("jerk_ratio").note, "it trembles as much where there is little to do"
     assert any(
@@ -91,7 +91,7 @@ def test_the_numbers_survive_the_report(trembling: Report):
 
 
 def test_an_eager_policy_is_as_good_and_falls_to_late_observations(bundles: dict[str, Bundle]):
-    report = evaluated(bundles, "eager", 20, disturb=("all",), strength=3.0)
+    report = evaluated(bundles, "eager", 10, disturb=("all",), strength=3.0)
     row = report.rows[-1]
     assert row.value("success_drop") == 0.0
     table = {record["disturbance"]: record for record in row.details["under disturbances"]}
@@ -100,7 +100,7 @@ def test_an_eager_policy_is_as_good_and_falls_to_late_observations(bundles: dict
     assert table["delay"]["baseline"] > 0.9
     assert table["delay"]["drop"] > 0.5
     assert table["push"]["drop"] == 0.0
-    assert row.get("success_disturbed").samples == 60
+    assert row.get("success_disturbed").samples == 30
     assert "under delay" in " ".join(report.summary)
     assert sum(row.raw["disturbed.delay"]) < sum(row.raw["disturbed.delay, baseline"])
 
@@ -274,7 +274,7 @@ def test_it_succeeds_least_only_where_it_loses():
 
 
 def test_several_strengths_are_played_one_after_the_other(bundles: dict[str, Bundle]):
-    report = evaluated(bundles, "eager", 10, disturb=("delay", "push"), strength="2,0,1,1")
+    report = evaluated(bundles, "eager", 6, disturb=("delay", "push"), strength="2,0,1,1")
     row = report.rows[-1]
     table = row.details["under disturbances"]
     assert [(line["disturbance"], line["strength"]) for line in table] == [
@@ -283,9 +283,9 @@ def test_several_strengths_are_played_one_after_the_other(bundles: dict[str, Bun
     undisturbed, *disturbed = (line["success"] for line in table if line["disturbance"] == "delay")
     assert undisturbed == row.value("success"), "strength 0 is no disturbance"
     assert max(disturbed) < undisturbed
-    assert row.get("success_disturbed").samples == 60
+    assert row.get("success_disturbed").samples == 36
     assert "under delay at strength " in " ".join(report.summary)
-    alone = evaluated(bundles, "eager", 10, disturb=("delay",), strength=2.0).rows[-1]
+    alone = evaluated(bundles, "eager", 6, disturb=("delay",), strength=2.0).rows[-1]
     assert alone.raw["disturbed.delay"] == row.raw["disturbed.delay at 2"]
 
 

@@ -60,7 +60,7 @@ def test_all_episodes_are_played_where_the_last_ones_decide():
 
 def test_bundles_are_compared_until_it_is_decided(tmp_path: Path):
     good, eager = bundle_of(tmp_path / "good"), bundle_of(tmp_path / "eager", EAGER)
-    stage = ClosedLoop(policy=good.path.parent / "policy", baseline=good.path, episodes=400, limit=0.2,
+    stage = ClosedLoop(policy=good.path.parent / "policy", baseline=good.path, episodes=400, limit=0.4,
                        disturb=("delay",), strength=3.0)  # fmt: skip
     stage.check(eager, None)
     report = stage.run(eager, Context())
@@ -69,7 +69,7 @@ def test_bundles_are_compared_until_it_is_decided(tmp_path: Path):
     count = len(row.raw["success"])
     assert count < 200
     assert base.raw["seed"] == row.raw["seed"]
-    assert row.get("success_drop").high <= 0.2
+    assert row.get("success_drop").high <= 0.4
     assert f"decided by {count} of at most 400 paired episodes" in report.summary[0]
     assert row.details["under disturbances"][0]["episodes"] == count
 

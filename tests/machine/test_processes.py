@@ -82,7 +82,7 @@ def test_this_vlatool_comes_before_what_is_installed_and_after_python(monkeypatc
 
 WAYS = [(command, started) for command in ("export", "benchmark", "closed-loop", "refit")
         for started in ("script", "module")]  # fmt: skip
-FEW = [("export", "module"), ("benchmark", "script"), ("refit", "script")]
+FEW = [("closed-loop", "module"), ("benchmark", "script"), ("refit", "script")]
 """Both ways of starting, and each kind of child: of the server, of a measurement, of multiprocessing."""
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from _full import small_or_full
 from _recurrent import recorded, recurrent_bundle
 
 from vlatool.bundle.bundle import Bundle
@@ -29,8 +31,10 @@ def actions(bundle: Bundle) -> np.ndarray:
     return np.stack(chunks)
 
 
-@pytest.mark.parametrize("options", [{}, {"count": 0}, {"episodes": False}])
-@pytest.mark.parametrize("kind", ["hidden", "writers"])
+@pytest.mark.parametrize(("kind", "options"), small_or_full(
+    [("hidden", {"count": 0}), ("writers", {}), ("writers", {"episodes": False})],
+    list(product(("hidden", "writers"), ({}, {"count": 0}, {"episodes": False}))),
+))  # fmt: skip
 def test_units_that_read_or_write_what_is_kept_are_not_taken_for_useless(tmp_path: Path, kind: str, options):
     source = recurrent_bundle(tmp_path / kind, kind, **options)
     made = run_transform(Structured(ratio=0.4, multiple=1), source, tmp_path / "out", Context()).bundle

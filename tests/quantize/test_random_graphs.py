@@ -7,6 +7,7 @@ import numpy as np
 import onnx
 import pytest
 from _arithmetic import full_range_or_less
+from _full import small_or_full
 from _graph_trials import METHODS, float_graph, stage_of, trial
 from _random_graphs import RandomGraph
 from onnx import helper
@@ -22,7 +23,10 @@ from vlatool.stage.finish import reference_policy
 from vlatool.stage.run import run_transform
 
 WEIGHTS = ("int4", "int4-qdq", "hqq", "gptq", "gptq-qdq", "awq", "awq-qdq")
-SEEDS = (34, 50)
+KINDS = ("int4-qdq", "gptq", "awq-qdq")
+"""Without calibration data, with products, and with scales; in both layouts."""
+IN_BRANCHES = ("awq-qdq", "dynamic", "float16", "gptq", "int4", "static", "static-openvino-all", "static-qdq")
+SEEDS = small_or_full((34,), (34, 50))
 
 
 class Written(RandomGraph):
@@ -111,20 +115,26 @@ def dead_inputs(g, value):
     return linear(g, g.node("Mul", [value, mask], g.shapes[value]))
 
 
-@pytest.mark.parametrize("word", WEIGHTS)
+READ = [
+    (linear, (1, 32)),
+    (gemm, (1, 32)),
+    (linear, (1, 4, 32)),
+    (turned_values, (1, 4, 32)),
+    (of_constants, (1, 32)),
+    (both_ways, (1, 32)),
+    (twice, (1, 4, 32)),
+    (weight_given, (1, 32)),
+    (chosen, (1, 4, 32)),
+    (dead_inputs, (1, 32)),
+]
+
+
 @pytest.mark.parametrize(
-    ("write", "shape"),
+    ("write", "shape", "word"),
     [
-        (linear, (1, 32)),
-        (gemm, (1, 32)),
-        (linear, (1, 4, 32)),
-        (turned_values, (1, 4, 32)),
-        (of_constants, (1, 32)),
-        (both_ways, (1, 32)),
-        (twice, (1, 4, 32)),
-        (weight_given, (1, 32)),
-        (chosen, (1, 4, 32)),
-        (dead_inputs, (1, 32)),
+        (write, shape, word)
+        for write, shape in READ
+        for word in (WEIGHTS if write is both_ways else small_or_full(KINDS, WEIGHTS))
     ],
 )
 def test_weights_are_quantized_however_they_are_read(write, shape, word, tmp_path):
@@ -134,8 +144,11 @@ def test_weights_are_quantized_however_they_are_read(write, shape, word, tmp_pat
     assert 0 < found.drift < 0.25
 
 
-@pytest.mark.parametrize("word", sorted(METHODS))
-@pytest.mark.parametrize("write", [gemm_twice, gemm_in_branches])
+@pytest.mark.parametrize(
+    ("write", "word"),
+    [(gemm_twice, word) for word in sorted(METHODS)]
+    + [(gemm_in_branches, word) for word in small_or_full(IN_BRANCHES, sorted(METHODS))],
+)
 def test_a_square_weight_is_transposed_once(write, word, tmp_path):
     graph = Written(write, (1, 32))
     found = trial(graph, float_graph(graph, tmp_path / "graph"), word)

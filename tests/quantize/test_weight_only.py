@@ -10,6 +10,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from _full import small_or_full
 from _llama import make, write_llama
 from safetensors.torch import load_file, save_file
 
@@ -173,12 +174,10 @@ def test_int8_is_close_to_float(llama_float, tmp_path, options):
 @pytest.mark.parametrize(
     "options",
     [
-        {},
         {"symmetric": True},
         {"bits": 8},
-        {"bits": 8, "symmetric": True},
-        {"block": 128},
         {"block": 64, "search": False},
+        *small_or_full([], [{}, {"bits": 8, "symmetric": True}, {"block": 128}]),
     ],
     ids=str,
 )

@@ -75,7 +75,8 @@ def test_a_policy_of_the_users_learns_from_another_one(
     """Both typed as folders, with nothing else named or trusted."""
     monkeypatch.setattr("vlatool.stage.run.run_in_child", lambda stage, *rest: stage.run(*rest))
     student, out = write_deep(tmp_path / "narrow"), tmp_path / "out"
-    short = ("--steps", "30", "--batch", "8", "--average", "0", "--learning-rate", "0.01", "--threads", "1")
+    short = ("--steps", "30", "--batch", "8", "--average", "0", "--learning-rate", "0.01", "--threads", "1",
+             "--episodes", "0", "--student-episodes", "0")  # fmt: skip
     with pytest.raises(SystemExit) as caught:
         main(["distill", "policy", str(student), "--teacher", str(folder), "-o", str(out), *short])
     assert caught.value.code == 0, capsys.readouterr().err

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.jobs import run_jobs
@@ -102,7 +103,9 @@ def test_the_run_goes_on_and_what_was_forked_ends_with_it(folder: Path, float_bu
     assert comes(lambda: not lives(pid))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, signal.SIGKILL, *small_or_full([], [signal.SIGINT])], ids=lambda number: number.name
+)
 def test_nothing_is_left_of_a_command_that_is_ended(folder: Path, float_bundle: Bundle, number: signal.Signals):
     (folder / "slow").touch()
     words = ["evaluate", "closed-loop", str(float_bundle.path), "--environment", f"{folder}/world.py:make",

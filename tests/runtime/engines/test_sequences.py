@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import onnx
 import pytest
+from _full import small_or_full
 from onnx import TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
@@ -17,8 +18,12 @@ OPEN = """
 import sys
 from pathlib import Path
 from vlatool.runtime.engines.openvino import OpenvinoSession
-OpenvinoSession(Path(sys.argv[1]), int(sys.argv[2]))
+for path in sys.argv[1:]:
+    for threads in (1, 2):
+        print(path, threads, file=sys.stderr, flush=True)
+        OpenvinoSession(Path(path), threads)
 """
+MODELS = ({}, {"between": "Relu"}, {"products": "MatMul"}, {"turns": 5})
 
 
 def perceptron(path, *, turns=2, residual=True, shape=(1, 16), products="Gemm", between="Gelu"):
@@ -51,11 +56,10 @@ def perceptron(path, *, turns=2, residual=True, shape=(1, 16), products="Gemm", 
     return path
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("options", [{}, {"between": "Relu"}, {"products": "MatMul"}, {"turns": 5}], ids=str)
-def test_residual_products_of_matrices_do_not_end_the_process(options, threads, tmp_path):
-    path = perceptron(tmp_path / "model.onnx", **options)
-    done = subprocess.run([sys.executable, "-c", OPEN, str(path), str(threads)], capture_output=True, check=False)
+@pytest.mark.parametrize("models", small_or_full([MODELS], [(model,) for model in MODELS]), ids=str)
+def test_residual_products_of_matrices_do_not_end_the_process(models, tmp_path):
+    paths = [perceptron(tmp_path / f"{number}.onnx", **options) for number, options in enumerate(models)]
+    done = subprocess.run([sys.executable, "-c", OPEN, *map(str, paths)], capture_output=True, check=False)
     assert done.returncode == 0, done.stderr[-300:]
 
 

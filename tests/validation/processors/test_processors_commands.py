@@ -1,5 +1,9 @@
 """``make arm64`` and ``make ladder``: what they say, and with which status they leave."""
 
+import contextlib
+import io
+
+import _variants
 import arm64
 import ladder
 import numpy as np
@@ -11,6 +15,7 @@ from _rungs import RUNGS
 from _variants import FLOAT, FOR_ARM, FOR_X86, Made, Variant, make, observations
 from arm64 import PLANTED, compared
 
+from vlatool.cli import main
 from vlatool.runtime.arithmetic import EXACT, EXACT_BY_OPTION, SATURATING
 
 ACTIONS = np.arange(1.0, 7.0).reshape(2, 3)
@@ -132,7 +137,15 @@ def test_variants_have_names_and_folders_of_their_own_and_every_rung_has_some():
     assert all(any(rung.engine in variant.engines for variant in FOR_X86) for rung in RUNGS)
 
 
-def test_a_policy_becomes_bundles_and_what_cannot_be_made_is_told(policy_dir, tmp_path):
+def in_this_process(*words: str) -> str:
+    """Run a command line as ``_variants.vlatool`` does, without an interpreter of its own."""
+    with contextlib.redirect_stderr(io.StringIO()) as said, pytest.raises(SystemExit) as left:
+        main([*words, "--force"])
+    return said.getvalue() if left.value.code else ""
+
+
+def test_a_policy_becomes_bundles_and_what_cannot_be_made_is_told(policy_dir, tmp_path, monkeypatch):
+    monkeypatch.setattr(_variants, "vlatool", in_this_process)
     variants = (
         FLOAT,
         Variant("dynamic int8", ("quantize", "dynamic-int8")),
@@ -146,6 +159,11 @@ def test_a_policy_becomes_bundles_and_what_cannot_be_made_is_told(policy_dir, tm
     assert (made.chosen, made.name) == (2, policy_dir.name)
     with np.load(made.observations, allow_pickle=False) as stored:
         assert stored["instruction"].dtype.kind == "U"
+
+
+def test_a_command_that_fails_is_told_in_one_line():
+    assert _variants.vlatool("samples", "make", "--help") == ""
+    assert "--force" in _variants.vlatool("samples", "list")
 
 
 def test_the_newest_is_what_this_host_runs():

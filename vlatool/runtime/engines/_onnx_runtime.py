@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
-import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -19,6 +19,7 @@ from vlatool.machine.host import board, gpu_driver, gpus, os_name, versions
 from vlatool.runtime import arithmetic
 from vlatool.runtime.engine import Engine, Node, NodeRun, Profiled, computing
 from vlatool.runtime.engines._bound_buffers import HOST, BoundBuffers, port_of
+from vlatool.runtime.engines._deadlines import WATCHDOG
 from vlatool.runtime.engines._device_tensors import on_host, run_bound
 from vlatool.runtime.engines._ort_profile import OrtProfiled, Trace, precision
 from vlatool.runtime.stored_types import has_float8
@@ -249,21 +250,16 @@ class OnnxRuntimeSession(Engine):
 
     def _run_until(self, deadline: float, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run, and let another thread tell ONNX Runtime to stop before its next node at the deadline."""
-        left = deadline - time.monotonic()
-        if left <= 0:
+        if deadline <= time.monotonic():
             raise TimeoutError
         options = quiet_run_options()
-        timer = threading.Timer(left, setattr, (options, "terminate", True))
-        timer.daemon = True
-        timer.start()
         try:
-            return self._call(feeds, options)
+            with WATCHDOG.stopping(deadline, functools.partial(setattr, options, "terminate", True)):
+                return self._call(feeds, options)
         except Exception:
             if options.terminate:
                 raise TimeoutError from None
             raise
-        finally:
-            timer.cancel()
 
     @classmethod
     def _open(
