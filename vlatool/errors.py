@@ -8,7 +8,8 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── SourceError              a policy source: factory, weights, ONNX file
 │   ├── DataError                calibration / evaluation data or an observation
 │   ├── GraphError               a graph that an engine refuses, or that computes wrong values
-│   │   └── DeadlineMissed          an inference did not end by its deadline
+│   │   ├── DeadlineMissed          an inference did not end by its deadline
+│   │   └── AnomalyAlarm            what a policy sees or does is unusual
 │   ├── ProfileError             a hardware profile
 │   ├── RecipeError              a recipe or stage options
 │   ├── OutputError              the output: exists already, read-only, disk full
@@ -115,6 +116,12 @@ class DeadlineMissed(GraphError):
     """An inference did not end by its deadline; its result is not used, and the policy is as it was before."""
 
     remedy = "act without it: the last action again, a fallback or a stop; the policy may infer at the next step"
+
+
+class AnomalyAlarm(GraphError):
+    """A monitor finds what a policy sees or does unusual, and was asked to stop the robot for it."""
+
+    remedy = "let the robot stop, and look at what the monitor watches; the policy may act again when the alarm is over"
 
 
 class ProfileError(InputError):

@@ -58,6 +58,18 @@ def test_every_sample_is_kept_and_counted(report):
         assert row.get("latency_p50").unit == "ms"
 
 
+def test_calls_as_a_robot_makes_them_stand_beside_others(float_bundle):
+    stage = Latency(iterations=20, warmup=1, duration=0, cold=False, phase=False, reach=False, duty_cycle=500)
+    stage.check(float_bundle, None)
+    (row,) = stage.run(float_bundle, Context()).rows
+    assert [each["calls"] for each in row.details["latency by the way of calling"]] == [
+        "busy loop", "at the robot's rate", "single shots"]  # fmt: skip
+    assert row.value("duty_ratio") == pytest.approx(row.value("latency_duty_p50") / row.value("latency_busy_p50"))
+    assert row.get("single_ratio").samples == 6
+    with pytest.raises(UsageError, match=r"--duty-cycle is nan"):
+        Latency.model_construct(**{**dict(stage), "duty_cycle": float("nan")}).check(float_bundle, None)
+
+
 def test_percentiles_that_twenty_samples_cannot_bound_are_left_out(report):
     for row in report.rows:
         assert "latency_p50" in names(row)

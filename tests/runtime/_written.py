@@ -35,13 +35,14 @@ def written(
     outputs: tuple[TensorSpec, ...] = (Y,),
     program: tuple[ProgramStep, ...] = (),
     golden: dict[str, Any] | None = None,
+    hz: float = 10.0,
     **spec: Any,
 ) -> Bundle:
     """Seal a bundle of one graph; golden: ``in.x`` and ``out.y``, each with a sample axis."""
     (folder / "graphs").mkdir(parents=True)
     model = onnx.parser.parse_model(f'<ir_version: 10, opset_import: ["" : 20]> {text}')
     onnx.save(model, str(folder / "graphs/main.onnx"))
-    described = PolicySpec(inputs, outputs, 10.0, **spec)
+    described = PolicySpec(inputs, outputs, hz, **spec)
     manifest = Manifest("written", "1", described, program=program or single_graph(described))
     changes: dict[str, Any] = {}
     if golden is not None:

@@ -68,6 +68,10 @@ class Latency(Measure):
     duration: float = Field(10.0, ge=0, le=LONGEST_S, description="seconds that each policy is timed for, at least")
     warmup: int = Field(10, ge=1, description="inferences before the first that counts")
     rate: float = Field(0.0, ge=0, le=10_000, description="pace of a control loop in Hz; back to back when 0")
+    duty_cycle: float = Field(
+        0.0, ge=0, le=10_000,
+        description="also time calls at this rate in Hz, idle in between, beside a busy loop and single shots; 0: not",
+    )  # fmt: skip
     sustained: float = Field(
         0.0, ge=0, le=LONGEST_S, description="run each for this many seconds, and compare the end with the start"
     )
@@ -101,7 +105,7 @@ class Latency(Measure):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Every bundle can be opened, and the options fit each other."""
-        for name in ("duration", "rate", "sustained", "memory_mb"):
+        for name in ("duration", "rate", "duty_cycle", "sustained", "memory_mb"):
             if not math.isfinite(getattr(self, name)):
                 raise UsageError(
                     f"--{name.replace('_', '-')} is {getattr(self, name)}; allowed: a number from 0.",
@@ -194,6 +198,7 @@ class Latency(Measure):
             cold=COLD_STARTS if self.cold else 0,
             check=self.answers,
             limits=Limits(processors(self.pin), self.cores, self.memory_mb),
+            duty_cycle=self.duty_cycle,
             reach=self.reach and not self.memory_mb,  # what a policy may take is not for a product
         )
 
@@ -203,7 +208,7 @@ class Latency(Measure):
             where += f", limited{f' as {self._board}' if self._board else ''}"
         rows = []
         for bundle, policy in zip(bundles, run.policies, strict=True):
-            numbers = measurements(run, policy, reference if others else None, self.rate)
+            numbers = measurements(run, policy, reference if others else None, self.rate, self.duty_cycle)
             numbers += sustained_rows(policy.samples) if self.sustained else []
             if bundle.manifest.graphs:
                 numbers.append(resources.SIZE.measurement(bundle.graph_bytes / 1e6, note="graphs on disk"))

@@ -45,6 +45,7 @@ class LatencyJob:
         cold: fresh processes for the cold start of each.
         check: also look for answers that differ between runs, and for answers from memory.
         limits: limits of every process.
+        duty_cycle: also time calls at this rate in Hz, idle in between, beside a busy loop and single shots; 0 for not.
         reach: also time a large matrix product in what each policy computes in.
     """
 
@@ -60,6 +61,7 @@ class LatencyJob:
     check: bool = True
     limits: Limits = NO_LIMITS
     reach: bool = False
+    duty_cycle: float = 0.0
 
 
 @dataclass(frozen=True)

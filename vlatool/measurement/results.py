@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Any
 
 from vlatool.measurement.answers import AnswerCheck, Memory
@@ -41,6 +42,34 @@ class Phase:
     calls: int
     p50_ms: float
     share_percent: float
+
+
+@dataclass(frozen=True)
+class DutyMode:
+    """Calls of one kind, between which a processor is busy or idle.
+
+    Args:
+        name: kind of the calls.
+        rounds_ms: milliseconds of each call, by round.
+    """
+
+    name: str
+    rounds_ms: tuple[tuple[float, ...], ...]
+
+    @property
+    def calls(self) -> int:
+        """Number of calls."""
+        return sum(map(len, self.rounds_ms))
+
+    @property
+    def p50_ms(self) -> float:
+        """Median of all calls."""
+        return median(value for values in self.rounds_ms for value in values)
+
+    @property
+    def max_ms(self) -> float:
+        """The longest call."""
+        return max(value for values in self.rounds_ms for value in values)
 
 
 @dataclass(frozen=True)
@@ -85,6 +114,7 @@ class PolicyRun:
         memory: None when it was not looked for, or cannot be.
         phases: parts of an inference; none when they were not timed.
         pace: pace of a control loop; None for calls back to back.
+        duty: calls of each kind between which a processor is busy or idle; none when they were not timed.
         cold: cold of each fresh process.
         cold_error: why there is none, where one was asked for and failed.
     """
@@ -102,6 +132,7 @@ class PolicyRun:
     memory: Memory | None = None
     phases: tuple[Phase, ...] = ()
     pace: Pace | None = None
+    duty: tuple[DutyMode, ...] = ()
     cold: tuple[ColdStart, ...] = ()
     cold_error: str = ""
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.measurement.cold_start import PARTS, ColdStart
+from vlatool.measurement.duty_cycle import duty_measurements, duty_table
 from vlatool.measurement.interleaved import latency_measurements, percentile_measurements, speedup_of
 from vlatool.measurement.paced import is_overloaded, paced_measurements
 from vlatool.measurement.results import Benchmark, PolicyRun
@@ -29,7 +30,9 @@ WINDOW = 0.1
 """Share of a sustained run that is its start, and its end."""
 
 
-def measurements(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | None, rate: float) -> list[Measurement]:
+def measurements(
+    measured: Benchmark, policy: PolicyRun, reference: PolicyRun | None, rate: float, duty_rate: float = 0.0
+) -> list[Measurement]:
     """Return the numbers of one policy.
 
     Args:
@@ -37,7 +40,12 @@ def measurements(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | 
         policy: one of its policies.
         reference: policy that its speed is compared with; None when it ran alone.
         rate: ticks in a second; 0 for calls back to back.
+        duty_rate: rate of the calls that a duty cycle compares with others, in Hz.
     """
+    return [*_timed(measured, policy, reference, rate), *duty_measurements(policy.duty, duty_rate)]
+
+
+def _timed(measured: Benchmark, policy: PolicyRun, reference: PolicyRun | None, rate: float) -> list[Measurement]:
     samples, pace = policy.samples, policy.pace
     most = math.inf if not pace else 0.0 if is_overloaded(pace, len(samples)) else pace.effective_sample_size
     seconds = len(samples) / rate if pace else None
@@ -148,6 +156,8 @@ def tables(measured: Benchmark, policy: PolicyRun, alone: bool) -> dict[str, lis
             {"phase": phase.name, "calls": phase.calls, "p50 ms": phase.p50_ms, "share %": phase.share_percent}
             for phase in policy.phases
         ]
+    if policy.duty:
+        details[titles.DUTY_CYCLE] = duty_table(policy.duty)
     if policy.cold:
         details |= {titles.MEMORY_PARTS: _memory_parts(policy.cold), titles.START_PARTS: _start_parts(policy.cold)}
     if alone and measured.telemetry:

@@ -26,11 +26,12 @@ from vlatool.machine.processes import die_with_parent
 from vlatool.measurement import child
 from vlatool.measurement.answers import Memory, expected_answers, measure_caching
 from vlatool.measurement.clock_drift import canary_ms
+from vlatool.measurement.duty_cycle import time_duty_cycle
 from vlatool.measurement.interleaved import BLOCKS, Contestant, OnProgress, run_interleaved, unique_names
 from vlatool.measurement.jobs import LatencyJob, WorkerJob
 from vlatool.measurement.paced import run_paced
 from vlatool.measurement.reach import reach_by_dtype
-from vlatool.measurement.results import Benchmark, GraphEngine, Pace, Phase, PolicyRun
+from vlatool.measurement.results import Benchmark, DutyMode, GraphEngine, Pace, Phase, PolicyRun
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program, Session
 from vlatool.user_code import trust
@@ -160,6 +161,10 @@ def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | 
     if job.phases and contestant.bundle.manifest.graphs:
         tell("timing the phases", None)
         phases = time_phases(policy, contestant.observations, EXTRA_S)
+    duty: Sequence[DutyMode] = ()
+    if job.duty_cycle:
+        tell(f"timing calls at {job.duty_cycle:g} Hz, in a busy loop and alone", None)
+        duty = time_duty_cycle(policy, contestant.observations, job.duty_cycle, job.duration)
     if job.reach and contestant.bundle.manifest.graphs:
         tell("timing a large product", None)
     return PolicyRun(
@@ -176,6 +181,7 @@ def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | 
         memory=memory,
         phases=tuple(phases),
         pace=pace,
+        duty=tuple(duty),
     )
 
 

@@ -43,6 +43,11 @@ LATENCY_START = Family(Quantity("latency_start_{percentile}", "ms", interval=UPP
 LATENCY_SUSTAINED_P50 = Quantity("latency_sustained_p50", "ms", "latency p50 sustained", order=71, interval=UPPER_BOUND)
 LATENCY_SUSTAINED = Family(Quantity("latency_sustained_{percentile}", "ms", interval=UPPER_BOUND))
 SUSTAINED_SLOWDOWN = Quantity("sustained_slowdown", "x", "sustained slow-down", order=72)
+LATENCY_BUSY_P50 = Quantity("latency_busy_p50", "ms", "latency p50 in a busy loop", order=73)
+LATENCY_DUTY_P50 = Quantity("latency_duty_p50", "ms", "latency p50 at the robot's rate", order=74)
+LATENCY_SINGLE_P50 = Quantity("latency_single_p50", "ms", "latency p50 of single shots", order=75)
+DUTY_RATIO = Quantity("duty_ratio", "x", "latency at the robot's rate", order=76, interval=RATIO_QUANTILE)
+SINGLE_RATIO = Quantity("single_ratio", "x", "latency of single shots", order=77, interval=RATIO_QUANTILE)
 COLD_START = Quantity("cold_start", "ms", order=80)
 
 LATENCY_IN_THE_LOOP = Quantity("latency_in_the_loop", "ms")

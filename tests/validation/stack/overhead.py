@@ -43,13 +43,13 @@ SHARES = (10, 50, 99, 99.9)
 ROBOT = "franka-panda"
 
 
-def small_bundle(folder: Path) -> str:
+def small_bundle(folder: Path, hz: float = 10.0) -> str:
     """Write a policy that holds the pose of an arm of seven joints."""
     joints = tuple(joint.name for joint in RobotLimits.named(ROBOT).joints)
     pose = TensorSpec("q", (1, 7), labels=joints)
     action = TensorSpec("y", (1, 7), labels=joints, mode="absolute")
     text = f"g (float[1,7] q) => (float[1,7] y) <float[7,7] w = {{{', '.join(map(str, np.eye(7).ravel()))}}}>"
-    return str(written(folder / "bundle", f"{text} {{ y = MatMul(q, w) }}", (pose,), (action,)).path)
+    return str(written(folder / "bundle", f"{text} {{ y = MatMul(q, w) }}", (pose,), (action,), hz=hz).path)
 
 
 def differences(

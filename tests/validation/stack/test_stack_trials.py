@@ -6,6 +6,8 @@ import pytest
 from bad_outputs import graph_outputs, wrong_outputs
 from damaged_files import trials
 from endless import endless
+from soak import soak
+from telemetry_kills import kills
 from ticks import run
 
 
@@ -35,6 +37,19 @@ def test_no_wrong_output_reaches_the_robot():
     found = graph_outputs(100)
     assert found["wrong"] > 50
     assert found["reached the robot"] == 0
+
+
+def test_nothing_grows_in_a_few_seconds_of_the_whole_stack():
+    found = soak(2.5, 0.25)
+    later = found["seen"][4:]
+    assert found["steps"] > 50
+    assert found["misses"] >= found["steps"] // 50
+    assert (found["dropped"], found["failed"]) == (0, 0)
+    assert (later[:, 3].max(), later[:, 2].max()) <= (later[0, 3] + 1, later[0, 2] + 3), "a client comes and goes"
+
+
+def test_a_killed_process_leaves_a_run_that_can_be_replayed():
+    assert kills(1)["bit-equal"] == 1
 
 
 def test_no_damaged_record_is_read():

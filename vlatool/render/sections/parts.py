@@ -1,4 +1,4 @@
-"""Memory by part, time by phase and cold start by part: every number, and a bar beside it."""
+"""Memory by part, time by phase, cold start by part, latency by the way of calling: numbers with a bar beside each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from vlatool.render.cells import records_table
 from vlatool.render.document import Section
 from vlatool.report import Report
 
-PARTS = {tables.MEMORY_PARTS: "MB", tables.PHASES: "share %", tables.START_PARTS: "ms"}
+PARTS = {
+    tables.MEMORY_PARTS: "MB", tables.PHASES: "share %", tables.START_PARTS: "ms", tables.DUTY_CYCLE: "p50 ms",
+}  # fmt: skip
 """Title of a details table -> the column of which bars are drawn."""
 
 

@@ -38,6 +38,8 @@ class ChunkQueue:
         """Whether the last action was the first of a chunk."""
         self.origin = Origin("")
         """Where the last action came from."""
+        self.played: Action | None = None
+        """The inference whose chunk is played; None before the first, and where the controller mixes several."""
         self._clock = clock
         self._turn = threading.RLock()  # a signal may arrive between acquiring the lock and setting the owner
         self._owner = 0
@@ -79,11 +81,12 @@ class ChunkQueue:
         """Take the actions of a chunk from now on, without the first ``skip``; it arrived at a time of the clock."""
         last = skip + self.execute
         self._pending, self._rest = list(action.chunk[skip:last]), iter(action.chunk[last:])
-        self._played, self._arrived = action, arrived
+        self.played, self._arrived = action, arrived
 
     def _note(self, source: str = "") -> None:
         """Store where the action of this step comes from: the chunk that is played, or ``source`` with its age."""
-        origin = self._played.origin((self._clock() - self._arrived) * 1e3)
+        played = self.played
+        origin = Origin("") if played is None else played.origin((self._clock() - self._arrived) * 1e3)
         self.origin = origin._replace(source=source) if source else origin
 
     def rest(self) -> Array | None:

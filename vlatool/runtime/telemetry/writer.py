@@ -14,8 +14,8 @@ from vlatool.runtime.telemetry.record import Sink
 from vlatool.runtime.telemetry.ring import Reader, Ring
 
 SIZE, PERIOD_S, END_S = 4096, 0.1, 2.0
-REST, MOST_REST_S = 9.0, 0.01
-"""Time that a thread rests after a record by the time that it took; and at most, in seconds, as a sink may block."""
+BURST, REST, MOST_REST_S = 8, 9.0, 0.01
+"""Records after which a thread rests; for how long, by the time that they took; and at most, in s: a sink may block."""
 _OPEN: weakref.WeakSet[Telemetry] = weakref.WeakSet()
 
 
@@ -23,9 +23,9 @@ class Telemetry:
     """Passes records to sinks, each in a thread of its own, which a control step never waits for.
 
     ``put`` stores a record in a ring and returns. A sink that blocks loses the oldest records, and they are counted;
-    what it raises is counted, too, and neither reaches the robot or another sink. After each record a thread rests nine
-    times as long as that took: it takes a tenth of a core at most, and where a control step wants the same core, it
-    waits for one record, not for all.
+    what it raises is counted, too, and neither reaches the robot or another sink. After a few records a thread rests
+    nine times as long as those took: it takes a tenth of a core at most, and where a control step wants the same core,
+    it waits for those few, not for all.
 
     Args:
         sinks: Functions of a record, such as ``JsonLines`` and ``Prometheus``.
@@ -103,14 +103,18 @@ class Outlet:
 
     def _write(self) -> None:
         """Pass on all records that are there."""
+        begin, count = time.perf_counter(), 0
         while (record := self.reader.take()) is not None:
-            begin = time.perf_counter()
             try:
                 self.sink(record)
             except Exception as error:  # the seam: a full disk is no reason to stop the robot
                 self._note(error)
-            if not self._hurries:
-                time.sleep(min(MOST_REST_S, REST * (time.perf_counter() - begin)))
+            count += 1
+            if self._hurries:
+                continue
+            rests = count % BURST == 0
+            time.sleep(min(MOST_REST_S, REST * (time.perf_counter() - begin)) if rests else 0)  # 0: lets others go on
+            begin = time.perf_counter() if rests else begin
         self._call("flush")
 
     def _call(self, method: str) -> None:
