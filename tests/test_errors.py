@@ -18,6 +18,7 @@ EXIT_CODES = {
     "DataError": 3,
     "GraphError": 3,
     "DeadlineMissed": 3,
+    "AnomalyAlarm": 3,
     "ProfileError": 3,
     "RecipeError": 3,
     "OutputError": 3,

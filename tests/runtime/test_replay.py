@@ -21,9 +21,10 @@ from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.control.envelope import EnvelopeController
 from vlatool.runtime.envelope import JointLimits, RobotLimits, envelope_of
 from vlatool.runtime.interface import layers_of
+from vlatool.runtime.replay import replay
 from vlatool.runtime.stack import Fallback, Stack, build_stack
 from vlatool.runtime.telemetry.recorder import Recorder
-from vlatool.runtime.telemetry.replay import ReplayResult, replay
+from vlatool.runtime.telemetry.replay import ReplayResult
 from vlatool.runtime.telemetry.run_file import Frame, FrameKind, RunHeader, RunWriter, read_run
 
 LABELS = ("x", "z")

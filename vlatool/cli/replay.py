@@ -28,7 +28,7 @@ def replay(
 
     Exits with 1 at a difference.
     """
-    from vlatool.runtime.telemetry.replay import replay as compare
+    from vlatool.runtime.replay import replay as compare
 
     found = compare(file, bundle, fallback=fallback)
     answer(as_json, found.to_dict(), lines(found))

@@ -21,8 +21,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from overhead import ROBOT, small_bundle
 
+from vlatool.runtime.replay import replay
 from vlatool.runtime.telemetry.json_lines import read_lines
-from vlatool.runtime.telemetry.replay import replay
 from vlatool.runtime.telemetry.run_file import FrameKind, read_run
 
 CHILD = """

@@ -15,7 +15,7 @@ from vlatool.files.messages import from_json
 from vlatool.runtime.control.deadline import Deadline
 from vlatool.runtime.interface import Action, Array, Policy, layers_of, observer_of
 from vlatool.runtime.telemetry.recorder import CALLS
-from vlatool.runtime.telemetry.run_file import OF_A_FUNCTION, Frame, FrameKind, RunHeader, read_run
+from vlatool.runtime.telemetry.run_file import Frame, FrameKind, RunHeader, read_run
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ class _ReplayedPolicy:
     def _failed(self, observation: Any, noise: Any, values: Mapping[str, Any]) -> NoReturn:
         """Fail as it did."""
         if not self._known:
-            raise GraphError(values["reason"])
+            raise GraphError(values["reason"], "replay the run with the bundle that ran, or the second one")
         try:
             self.policy.infer(observation, noise=noise)
         except Exception as error:
@@ -286,59 +286,3 @@ def _form(array: Array) -> str:
 def _as_late(action: Action, values: Mapping[str, Any]) -> Action:
     """Return an action with the times that were recorded."""
     return action._replace(latency_ms=values["latency_ms"], age_ms=values["age_ms"])
-
-
-def replay(
-    path: str | os.PathLike[str],
-    bundle: str | os.PathLike[str],
-    *,
-    fallback: str | os.PathLike[str] | None = None,
-    envelope: Any = None,
-) -> ReplayResult:
-    """Compute a recorded run again and compare every output and action.
-
-    Args:
-        path: File that ``load(..., record=)`` or ``vlatool record`` has written.
-        bundle: The bundle that ran.
-        fallback: The second bundle that ran; its recorded answers are used when None.
-        envelope: The function that was the envelope, where that was no robot's name.
-
-    Raises:
-        DataError: when the file is damaged, or of another bundle or envelope.
-        VlatoolError: as ``load`` and ``build_stack`` do.
-    """
-    from vlatool.runtime import load
-    from vlatool.runtime.stack import Fallback, build_stack
-
-    trace = Replay(path)
-    about = trace.about
-    if about.envelope == OF_A_FUNCTION and envelope is None:
-        raise DataError(f"{path} was recorded within an envelope that a function put around the controller.",
-                        "call vlatool.runtime.telemetry.replay.replay(..., envelope=FUNCTION)")  # fmt: skip
-    policy = load(bundle, engine=about.engine, threads=about.threads, seed=about.seed)
-    _check_same(trace, "bundle", about.policy, policy.identity)
-    options = None
-    if about.fallback is not None:
-        options = Fallback(_second(trace, about, fallback, policy.spec), **about.fallback)
-    stack = build_stack(policy, controllers=about.controllers, envelope=envelope or about.envelope or None,
-                        deadline_ms=about.deadline_ms, fallback=options, recorder=trace)  # fmt: skip
-    return trace.run(stack)
-
-
-def _second(trace: Replay, about: RunHeader, fallback: Any, spec: Any) -> Any:
-    """Return the second policy, or what stands for it; None where there was none."""
-    from vlatool.runtime import load
-
-    if not about.second:
-        return None
-    if fallback is None or about.second == OF_A_FUNCTION:
-        return RecordedAnswers(spec)
-    second = load(fallback, threads=about.threads, seed=about.seed)
-    _check_same(trace, "fallback", about.second, second.identity)
-    return second
-
-
-def _check_same(trace: Replay, what: str, recorded: str, identity: str) -> None:
-    if recorded != identity:
-        raise DataError(f"{trace.path} was recorded with another {what}: {recorded}, and this is {identity}.",
-                        f"pass the {what} that ran")  # fmt: skip
