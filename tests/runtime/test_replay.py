@@ -238,6 +238,7 @@ def test_a_recording_that_was_cut_is_replayed_as_far_as_it_goes(bundle: Path, tm
 def test_a_file_is_bounded_and_says_what_is_missing(tmp_path: Path):
     recorder = Recorder(tmp_path / "run", max_bytes=20_000)
     recorder.begin_run(RunHeader("", "ort_cpu", 1, 0))
+    assert [frame.kind for frame in read_run(tmp_path / "run")] == [FrameKind.HEADER], "whatever happens from now on"
     for step in range(200):
         recorder.begin({"x": np.full(50, step, np.float32)})
         recorder.end(np.zeros(2, np.float32), "")

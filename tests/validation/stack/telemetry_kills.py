@@ -62,9 +62,14 @@ def killed(bundle: str, folder: Path, seconds: float) -> dict[str, Any]:
     ticks = sum(frame.kind is FrameKind.TICK for frame in read_run(folder / "run"))
     lines = [line["step"] for line in read_lines(folder / "run.jsonl")] if (folder / "run.jsonl").exists() else []
     assert lines == list(range(len(lines)))
-    last = times[max(times)]
-    lost = {"recorded": last - times.get(ticks, last), "lines": last - times.get(len(lines), last)}
+    lost = {"recorded": _lost(times, ticks), "lines": _lost(times, len(lines))}
     return {"steps": max(times), "replayed": replay(folder / "run", bundle), "ticks": ticks, **lost}
+
+
+def _lost(times: dict[int, float], steps: int) -> float:
+    """Return the seconds from the last control step that a file has to the last one that the child told of."""
+    last = times[max(times)]
+    return last - times.get(steps, last if steps else min(times.values()))
 
 
 def kills(count: int, seed: int = 0) -> dict[str, Any]:

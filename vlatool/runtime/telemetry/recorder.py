@@ -50,8 +50,9 @@ class Recorder:
         self._arrays: dict[str, Array] = {}
 
     def begin_run(self, about: RunHeader) -> None:
-        """Write what the run is of, before anything else."""
+        """Write what the run is of, before anything else; return when it is written."""
         self._put(Frame(FrameKind.HEADER, to_json(about), {}))
+        self._outlet.flush()
 
     def follow(self, clock: Callable[[], float]) -> Callable[[], float]:
         """Return a clock that notes what the layers read, which act in the thread of the control step."""
