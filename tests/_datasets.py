@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +34,21 @@ def row_of(pixels: Any) -> int:
     return round((float(np.median(pixels[:, : WIDTH // 2 - 8])) - 20) / 10)
 
 
+@contextlib.contextmanager
+def usual_priority() -> Iterator[None]:
+    """Give this process its priority back: SVT-AV1, run by root, leaves it and its children at SCHED_FIFO 99."""
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
+
+
 def write_video(path: Path, rows: Sequence[int], codec: str = "libx264", gop: int = 4) -> None:
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
+    with usual_priority(), av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=HZ)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         stream.codec_context.gop_size = gop

@@ -1,6 +1,7 @@
 """Datasets in the layout of LeRobot; tests/validation/foreign holds the reader against those that LeRobot wrote."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,12 @@ def test_each_step_is_what_was_recorded(tmp_path: Path, kind: str):
         order = [*range(datasets.COUNT), 18, 3, 2, 7, 12, 12, 0]
         assert [datasets.row_of(frames[row]) for row in order] == order
         assert [datasets.row_of(pixels) for pixels in frames[[1, 16, 4]]] == [1, 16, 4]
+
+
+def test_an_encoder_leaves_the_tests_no_real_time_priority(tmp_path: Path):
+    before = os.sched_getscheduler(0)
+    datasets.write_video(tmp_path / "video.mp4", range(4), "libsvtav1")
+    assert os.sched_getscheduler(0) == before
 
 
 def test_a_recording_for_a_policy(tmp_path: Path):
