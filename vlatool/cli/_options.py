@@ -34,3 +34,14 @@ MapNames = Annotated[
         "also a part or several parts: state=qpos[0:7]+gripper",
     ),
 ]  # fmt: skip
+BundleEngine = Annotated[
+    str, typer.Option("--engine", help="engine; the bundle's when not given", autocompletion=_complete.engines)
+]
+Threads = Annotated[int | None, typer.Option("--threads", min=1, help="threads; all cores when not given")]
+RobotName = Annotated[str, typer.Option("--robot", help="robot whose limits no action leaves; none when not given")]
+StepDeadline = Annotated[
+    float | None,
+    typer.Option("--deadline-ms", help="ms in which a control step is answered; the control period when not given"),
+]
+Neutral = Annotated[str, typer.Option("--neutral", help="label of the discrete action without motion")]
+Controllers = Annotated[str, typer.Option("--controller", help="controller and wrappers, by name, with commas between")]

@@ -7,28 +7,31 @@ from typing import Annotated
 
 import typer
 
-from vlatool.cli import _complete
 from vlatool.cli._document import answer
-from vlatool.cli._options import AsJson, BundlePath
+from vlatool.cli._options import (
+    AsJson,
+    BundleEngine,
+    BundlePath,
+    Controllers,
+    Neutral,
+    RobotName,
+    StepDeadline,
+    Threads,
+)
 
 
 def record(
     bundle: BundlePath,
     output: Annotated[Path, typer.Option("-o", "--output", help="new file", show_default=False)],
-    robot: Annotated[str, typer.Option(help="robot whose limits no action leaves; none when not given")] = "",
-    deadline_ms: Annotated[
-        float | None,
-        typer.Option("--deadline-ms", help="ms in which a control step is answered; the control period when not given"),
-    ] = None,
+    robot: RobotName = "",
+    deadline_ms: StepDeadline = None,
     fallback: Annotated[
         Path | None, typer.Option(help="bundle that acts where this one has no action in time", show_default=False)
     ] = None,
-    neutral: Annotated[str, typer.Option(help="label of the discrete action without motion")] = "",
-    controller: Annotated[str, typer.Option(help="controller and wrappers, by name, with commas between")] = "",
-    engine: Annotated[
-        str, typer.Option(help="engine; the bundle's when not given", autocompletion=_complete.engines)
-    ] = "",
-    threads: Annotated[int | None, typer.Option(min=1, help="threads; all cores when not given")] = None,
+    neutral: Neutral = "",
+    controller: Controllers = "",
+    engine: BundleEngine = "",
+    threads: Threads = None,
     steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="control steps")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="seed of the noise")] = 0,
     as_json: AsJson = False,

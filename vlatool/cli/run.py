@@ -7,9 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vlatool.cli import _complete
 from vlatool.cli._document import answer
-from vlatool.cli._options import AsJson, BundlePath
+from vlatool.cli._options import (
+    AsJson,
+    BundleEngine,
+    BundlePath,
+    Controllers,
+    Neutral,
+    RobotName,
+    StepDeadline,
+    Threads,
+)
 from vlatool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -18,23 +26,18 @@ if TYPE_CHECKING:
 
 def run(
     bundle: BundlePath,
-    robot: Annotated[str, typer.Option(help="robot whose limits no action leaves; none when not given")] = "",
-    deadline_ms: Annotated[
-        float | None,
-        typer.Option("--deadline-ms", help="ms in which a control step is answered; the control period when not given"),
-    ] = None,
+    robot: RobotName = "",
+    deadline_ms: StepDeadline = None,
     fallback: Annotated[
         str | None,
         typer.Option(
             help="bundle that acts where this one has no action in time, or remote:ws://HOST:PORT", show_default=False
         ),
     ] = None,
-    neutral: Annotated[str, typer.Option(help="label of the discrete action without motion")] = "",
-    controller: Annotated[str, typer.Option(help="controller and wrappers, by name, with commas between")] = "",
-    engine: Annotated[
-        str, typer.Option(help="engine; the bundle's when not given", autocompletion=_complete.engines)
-    ] = "",
-    threads: Annotated[int | None, typer.Option(min=1, help="threads; all cores when not given")] = None,
+    neutral: Neutral = "",
+    controller: Controllers = "",
+    engine: BundleEngine = "",
+    threads: Threads = None,
     steps: Annotated[int, typer.Option(min=20, max=100_000, help="control steps that are measured")] = 200,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="show the layers and their times; no robot moves")] = False,
     as_json: AsJson = False,

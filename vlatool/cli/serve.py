@@ -12,18 +12,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vlatool.cli import _complete
 from vlatool.cli._document import answer
-from vlatool.cli._options import AsJson, BundlePath
+from vlatool.cli._options import AsJson, BundleEngine, BundlePath, Threads
 from vlatool.errors import DataError, UsageError
 from vlatool.files.printable import one_line, printable
 
 if TYPE_CHECKING:
     from vlatool.runtime import Policy
-    from vlatool.serving import Access, Endpoint, Service
+    from vlatool.serving import Access, Endpoint, RequestLog, Service
 
 MAX_KEY_BYTES = 4096
 UNKNOWN_RATE_MS = 60_000.0
+ClientNames = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map", metavar="INPUT=NAME", help="name that clients use for an input, where it differs; also a part or "
+        "several parts: state=qpos[0:7]+gripper",
+    ),
+]  # fmt: skip
 
 
 def serve(
@@ -37,15 +43,7 @@ def serve(
     key: Annotated[
         Path | None, typer.Option(help="file with the key that clients have to send", show_default=False)
     ] = None,
-    map: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--map",
-            metavar="INPUT=NAME",
-            help="name that clients use for an input, where it differs; also a "
-            "part or several parts: state=qpos[0:7]+gripper",
-        ),
-    ] = None,
+    map: ClientNames = None,
     robot: Annotated[str, typer.Option(help="robot whose limits no chunk leaves; none when not given")] = "",
     deadline_ms: Annotated[
         float | None,
@@ -65,10 +63,8 @@ def serve(
     seconds: Annotated[
         float | None, typer.Option(min=0, help="end after so many seconds; at a signal when not given")
     ] = None,
-    engine: Annotated[
-        str, typer.Option(help="engine; the bundle's when not given", autocompletion=_complete.engines)
-    ] = "",
-    threads: Annotated[int | None, typer.Option(min=1, help="threads; all cores when not given")] = None,
+    engine: BundleEngine = "",
+    threads: Threads = None,
     seed: Annotated[int | None, typer.Option(min=0, help="seed of the noise; a new one when not given")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -94,11 +90,20 @@ def serve(
         service.close()
         log.close()
     found = {
-        "bundle": str(bundle), "addresses": addresses, "seconds": time.monotonic() - began,
+        "bundle": str(bundle),
+        "addresses": addresses,
+        "seconds": time.monotonic() - began,
+        **_counts(service, log),
+    }
+    answer(as_json, found, _lines(found))
+
+
+def _counts(service: Service, log: RequestLog) -> dict[str, Any]:
+    """Return what became of the requests."""
+    return {
         "requests": service.requests, "missed": service.missed, "failed": service.failed, "times": log.times_ms(),
         "lost_records": log.lost + service.failed_records,
     }  # fmt: skip
-    answer(as_json, found, _lines(found))
 
 
 def _protocols(text: str, port: int | None) -> dict[str, int]:

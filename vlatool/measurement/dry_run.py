@@ -14,10 +14,11 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import observations_for
 from vlatool.errors import GateFailed
-from vlatool.runtime import is_remote, load, open_remote
+from vlatool.runtime import load
 from vlatool.runtime.arguments import RECORD
 from vlatool.runtime.engine_record import EngineRecord
 from vlatool.runtime.interface import POLICY, Policy
+from vlatool.runtime.loading import is_remote, open_remote
 from vlatool.runtime.rungs import PolicyRung
 from vlatool.runtime.stack import Fallback, Stack, rate_factor
 from vlatool.runtime.telemetry.cadence import Cadence, CadenceReport

@@ -6,28 +6,21 @@ Needs numpy and one inference engine; never torch, onnx, pydantic, typer, rich o
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, TypeGuard, overload
+from typing import TYPE_CHECKING, Any, overload
 
-from vlatool.errors import UsageError, refuse_two_distributions
-from vlatool.runtime.arguments import REQUIRE, WARN, check_load
+from vlatool.errors import refuse_two_distributions
+from vlatool.runtime.arguments import check_load
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.interface import Action
-from vlatool.runtime.policy import FIRST_RUN_S, Policy, refuse_findings
+from vlatool.runtime.loading import Layers, Loading, is_remote, open_policy, open_stack
+from vlatool.runtime.policy import FIRST_RUN_S, Policy
 
 if TYPE_CHECKING:
-    from vlatool.bundle.bundle import Bundle
-    from vlatool.bundle.spec import PolicySpec
-    from vlatool.runtime.remote_policy import RemotePolicy
     from vlatool.runtime.stack import Fallback, Stack, Wrapper
     from vlatool.runtime.telemetry import Sink, Telemetry
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
-AUTO = "auto"
-"""Name that stands for the engine that a bundle was made for, or another where that cannot be used."""
-REMOTE_PREFIX, KEY_VARIABLE = "remote:", "VLATOOL_SERVE_KEY"
-"""What stands before the URL of a policy of another machine; the environment variable with the key that it asks for."""
 
 
 @overload
@@ -131,141 +124,12 @@ def load(
         MissingExtra: the engine is not installed.
         InstallationError: vlatool and vlatool-runtime are installed side by side.
     """
-    from vlatool.bundle.bundle import Bundle
-
     refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb, engine_proof)
-    layers: dict[str, Any] = {
-        "controllers": controllers,
-        "envelope": envelope,
-        "deadline_ms": deadline_ms,
-        "telemetry": telemetry,
-    }
-    if is_remote(path):
-        return _remote_stack(path, fallback, layers, record, engine=engine, threads=threads, seed=seed, warmup=warmup,
-                             golden_tolerance=golden_tolerance, accept=accept, first_run_s=first_run_s,
-                             memory_mb=memory_mb, probe=probe, engine_proof=engine_proof)  # fmt: skip
-    bundle = Bundle.open_lazily(path)
-    refuse_findings(bundle, accept)
-    reason = ""
-    if engine == AUTO:
-        engine, reason = _chosen(bundle)
-    bundle.verify("data/")
-    if probe:
-        from vlatool.runtime.probe import probe as run_once
-
-        run_once(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
-    seed = _drawn_seed() if seed is None and record is not None else seed
-    traced = bool(engine_proof)
-    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb, traced=traced)
-    policy.engine_reason = reason
-    bundle.verify()
-    policy.warm_up(max(warmup, traced), golden_tolerance, first_run_s)
-    _check_record(policy, engine_proof)
-    if fallback is None and record is None and all(layer is None for layer in layers.values()):
-        return policy
-    second = ""
-    if is_remote(fallback):
-        _refuse_record(record)
-        fallback = open_remote(fallback, policy.spec)
-    elif isinstance(fallback, str | os.PathLike):
-        fallback = load(fallback, threads=threads, seed=seed, accept=accept, engine_proof=engine_proof)
-        second = fallback.identity if record is not None else ""
-    given: dict[str, Any] = {**layers, "fallback": fallback, "controllers": controllers or ()}
-    if record is None:
-        return _stack_of(policy, given)
-    return _recorded(policy, given, record, threads=threads, seed=seed, second=second)
-
-
-def is_remote(path: Any) -> TypeGuard[str]:
-    """Return whether a policy is named by a URL, ``remote:ws://HOST:PORT``, not by a directory.
-
-    Example:
-        >>> is_remote("remote:ws://10.0.0.5:8000"), is_remote("out/my-policy")
-        (True, False)
-    """
-    return isinstance(path, str) and path.startswith(REMOTE_PREFIX)
-
-
-def open_remote(url: str, spec: PolicySpec | None = None) -> RemotePolicy:
-    """Return the policy that another machine serves, ``remote:ws://HOST:PORT``.
-
-    The key that the server asks for is that of the environment variable ``VLATOOL_SERVE_KEY``.
-
-    Args:
-        spec: Of a policy with the same inputs and actions; with it, the server need not be there yet.
-
-    Raises:
-        ServingError, SpecError, UsageError, MissingExtra: as ``RemotePolicy`` does.
-    """
-    from vlatool.runtime.remote_policy import RemotePolicy
-
-    return RemotePolicy(url.removeprefix(REMOTE_PREFIX), spec, key=os.environ.get(KEY_VARIABLE, ""))
-
-
-def _remote_stack(url: str, fallback: Any, layers: dict[str, Any], record: Any, **loading: Any) -> Stack:
-    """Return the layers around a policy of another machine, with a local bundle, or none, to fall back to."""
-    _refuse_record(record)
-    if isinstance(fallback, str | os.PathLike):
-        fallback = load(fallback, **loading)
-    second = fallback if hasattr(fallback, "spec") else getattr(fallback, "policy", None)
-    given = {**layers, "fallback": fallback, "controllers": layers["controllers"] or ()}
-    return _stack_of(open_remote(url, getattr(second, "spec", None)), given)
-
-
-def _refuse_record(record: Any) -> None:
-    """Refuse to record a run with a policy that nobody can run again; raises UsageError."""
-    if record is not None:
-        raise UsageError(
-            "A policy on another machine cannot be recorded: nothing computes its actions again.",
-            "leave record out, and let the other machine keep records: vlatool serve --records FILE",
-        )
-
-
-def _chosen(bundle: Bundle) -> tuple[str, str]:
-    """Return the engine that ``auto`` stands for and why; warns where the bundle was made for another."""
-    from vlatool.runtime.engine_choice import choose_engine
-
-    choice = choose_engine(bundle.manifest)
-    if choice.replaces:
-        warnings.warn(f"engine='auto' is {choice.engine}: {choice.reason}", RuntimeWarning, stacklevel=3)
-    return choice.engine, choice.reason
-
-
-def _check_record(policy: Policy, proof: str) -> None:
-    """Warn of an engine that did not run as asked, or refuse it; see ``engine_proof`` of ``load``."""
-    if proof not in (WARN, REQUIRE):
-        return
-    record = policy.engine_record()
-    if proof == REQUIRE:
-        record.check()
-    for problem in record.problems:
-        warnings.warn(f"{record.library}: {problem}", RuntimeWarning, stacklevel=3)
-
-
-def _stack_of(policy: Policy | RemotePolicy, layers: dict[str, Any]) -> Stack:
-    """Return the layers around a policy, in a process that is prepared for a deadline."""
-    from vlatool.runtime.stack import build_stack, prepare_process
-
-    if layers["deadline_ms"] is not None:
-        prepare_process()
-    return build_stack(policy, **layers)
-
-
-def _recorded(policy: Policy, layers: dict[str, Any], path: Any, **about: Any) -> Stack:
-    """Return the layers around a policy, which are recorded; without a file when they make no sense."""
-    from vlatool.runtime.stack import header_of
-    from vlatool.runtime.telemetry.recorder import Recorder
-
-    recorder = Recorder(path)
-    try:
-        recorder.begin_run(header_of(policy, layers, **about))
-        return _stack_of(policy, {**layers, "recorder": recorder})
-    except BaseException:
-        recorder.close()
-        os.unlink(path)
-        raise
-
-
-def _drawn_seed() -> int:
-    return int.from_bytes(os.urandom(4), "little")
+    loading = Loading(
+        engine, threads, seed, warmup, golden_tolerance, accept, first_run_s, memory_mb, probe, engine_proof
+    )
+    layers = Layers(controllers, envelope, deadline_ms, fallback, telemetry, record)
+    if is_remote(path) or any(layer is not None for layer in layers):
+        return open_stack(path, loading, layers)
+    return open_policy(path, loading)
