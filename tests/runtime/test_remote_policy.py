@@ -277,3 +277,28 @@ def test_a_remote_rung_answers_where_the_policy_does_not(servers: list[Any]):
     stack = build_stack(Failing(SPEC), fallback=Fallback(second))
     assert stack.act({"t": 3})[0] == pytest.approx(300.001)
     assert stack.origin.source == "fallback"
+
+
+@pytest.mark.parametrize("actions", [
+    np.float64(1.0), np.zeros(0), np.array(["forward"]), [1, 2], None,
+])  # fmt: skip
+def test_an_answer_that_is_no_chunk_is_an_error_of_the_server(servers: list[Any], actions: Any):
+    value = np.asarray(actions) if isinstance(actions, np.float64) else actions
+    foreign = Foreign(lambda connection, _seen: connection.send(pack({"actions": value})))
+    servers.append(foreign)
+    policy = remote(servers, foreign.url, SPEC)
+    with pytest.raises(ServingError, match="answered without actions"):
+        policy.infer({"t": 7})
+
+
+@pytest.mark.parametrize("indices", [[0.0, 1.5, 1.0], [np.nan, 0.0, 0.0], [1e30, 0.0, 0.0]])
+def test_a_label_between_two_labels_is_none_of_them(servers: list[Any], indices: list[float]):
+    spec = PolicySpec(SPEC.inputs, (TensorSpec("a", (1, 3, 2), kind="discrete", labels=("stop", "go")),), 10.0, 3)
+    answers = [np.array(indices), np.array([1.0, 0.0, 1.0])]
+    foreign = Foreign(lambda connection, _seen: connection.send(pack({"actions": answers.pop(0)})))
+    servers.append(foreign)
+    policy = remote(servers, foreign.url, spec)
+    with pytest.raises(ServingError, match="not indices"):
+        policy.infer({"t": 7})
+    policy._not_before = 0.0
+    assert policy.infer({"t": 7}).chunk.tolist() == [1, 0, 1], "whole numbers are indices, whatever their dtype"

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
+import resource
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +28,7 @@ from vlatool.runtime.replay import replay
 from vlatool.runtime.stack import Fallback, Stack, build_stack
 from vlatool.runtime.telemetry.recorder import Recorder
 from vlatool.runtime.telemetry.replay import ReplayResult
-from vlatool.runtime.telemetry.run_file import Frame, FrameKind, RunHeader, RunWriter, read_run
+from vlatool.runtime.telemetry.run_file import MAGIC, Frame, FrameKind, RunHeader, RunWriter, read_run
 
 LABELS = ("x", "z")
 POSE = TensorSpec("x", (1, 2), labels=LABELS)
@@ -285,3 +288,39 @@ def test_layers_look_at_the_clock_of_the_stack(bundle: Path):
     assert stack.origin.age_ms is not None
     assert stack.origin.age_ms >= 1000, "the player's clock is that of the stack"
     assert not [layer for layer in stack.layers if isinstance(layer, Deadline)]
+
+
+@contextlib.contextmanager
+def no_file_above(size: int) -> Iterator[None]:
+    """Let no file of this process grow beyond a size, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_leaves_no_empty_file_and_each_lost_step_is_counted(tmp_path: Path):
+    with no_file_above(4), pytest.raises(DataError, match="cannot be written"):
+        Recorder(tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    before = len(os.listdir("/proc/self/fd"))
+    recorder = Recorder(tmp_path / "run")
+    with no_file_above(4096):
+        for _ in range(20):
+            recorder.begin({"x": np.zeros(500)})
+            recorder.end(None, "")
+        recorder.close()
+    assert recorder.failure_count == 20, "not even the first one fits"
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert list(read_run(tmp_path / "run")) == []
+
+
+def test_a_disk_that_is_full_at_the_end_leaves_no_open_file(tmp_path: Path):
+    before = len(os.listdir("/proc/self/fd"))
+    recorder = Recorder(tmp_path / "run")
+    with no_file_above(len(MAGIC)):
+        recorder.close()
+    assert recorder.failure_count == 1
+    assert len(os.listdir("/proc/self/fd")) == before

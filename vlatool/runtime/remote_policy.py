@@ -25,6 +25,7 @@ SCHEMES = ("ws://", "wss://")
 OWN_NAME = "vlatool"
 FIRST_RETRY_S, MAX_RETRY_S = 0.25, 8.0
 """Time without an attempt after a connection failed: doubled with each failure."""
+MOST_LABELS = 2**31
 
 
 class RemotePolicy:
@@ -180,12 +181,18 @@ class RemotePolicy:
     def _chunk(self, answer: dict[str, Any]) -> Array:
         """Return the actions of an answer: (T, A) float32, or (T,) int64 indices; ``CheckedPolicy`` checks the rest."""
         actions = answer.get("actions")
-        if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "iuf":
+        if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "iuf" or not actions.ndim * actions.size:
             self._give_up()
             raise ServingError(f"{self.url} answered without actions.", "serve a policy with openpi's protocol")
-        dtype = np.int64 if self.spec.action.kind == "discrete" else np.float32
-        chunk: Array = np.array(actions[: self.spec.chunk], dtype)
-        return chunk
+        actions = actions[: self.spec.chunk]
+        if self.spec.action.kind != "discrete":
+            with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused as such
+                return np.array(actions, np.float32)
+        if not np.all((np.abs(actions) < MOST_LABELS) & (actions == np.floor(actions))):
+            self._give_up()
+            raise ServingError(f"{self.url} answered with numbers that are not indices of labels.",
+                               "serve a policy whose actions are the labels of the spec")  # fmt: skip
+        return np.array(actions, np.int64)
 
     def _connection(self) -> Any:
         """Return the connection, or a new one.

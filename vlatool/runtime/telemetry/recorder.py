@@ -147,7 +147,7 @@ class Recorder:
     @property
     def failure_count(self) -> int:
         """Control steps that could not be written, such as on a full disk."""
-        return self._outlet.failure_count
+        return self._outlet.failure_count + self._file.lost
 
     def close(self) -> None:
         """Write what is left and close the file."""
@@ -159,13 +159,16 @@ class _RunSink:
 
     def __init__(self, writer: RunWriter, max_bytes: int) -> None:
         self._writer, self._most = writer, max_bytes - 1000
-        self.taken = self.taken_bytes = self._omitted = 0
+        self.taken = self.taken_bytes = self.lost = self._omitted = 0
         self._full = self._failed = False
         self._synced = time.monotonic()
 
     def __call__(self, frame: Frame) -> None:
         self.taken, self.taken_bytes = self.taken + 1, self.taken_bytes + frame.size
-        if self._full or self._failed:
+        if self._failed:
+            self.lost += 1
+            return
+        if self._full:
             self._omitted += 1
             return
         try:
@@ -183,9 +186,11 @@ class _RunSink:
             self._writer.sync()
 
     def close(self) -> None:
-        if not self._failed:
-            self._writer.append(Frame(FrameKind.END, {"omitted": self._omitted}, {}))
-        self._writer.close()
+        try:
+            if not self._failed:
+                self._writer.append(Frame(FrameKind.END, {"omitted": self._omitted}, {}))
+        finally:
+            self._writer.close()
 
 
 class _NotedPolicy:

@@ -103,16 +103,21 @@ class RunWriter:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        self._crc = 0
+        self.size = 0
+        """Bytes that were written."""
         try:
             self._handle = os.open(path, flags, 0o644)
+            try:
+                self._write(MAGIC)
+            except OSError:
+                os.close(self._handle)
+                os.unlink(path)
+                raise
         except OSError as error:
             raise DataError(
                 f"{path} cannot be written: {error.strerror}.", "name a new file in a directory of yours"
             ) from None
-        self._crc = 0
-        self.size = 0
-        """Bytes that were written."""
-        self._write(MAGIC)
 
     def append(self, frame: Frame, most: float = math.inf) -> bool:
         """Write a frame, unless the file would then be larger than ``most`` bytes; returns whether it was written."""
@@ -135,8 +140,10 @@ class RunWriter:
 
     def close(self) -> None:
         """Flush and close the file."""
-        self.sync()
-        os.close(self._handle)
+        try:
+            self.sync()
+        finally:
+            os.close(self._handle)
 
 
 def _encoded(frame: Frame, crc: int) -> tuple[bytes, int]:
