@@ -6,6 +6,7 @@ Engines report the shapes of what a node reads, but not those of weights that th
 from __future__ import annotations
 
 import math
+from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,9 @@ NODE_NAME = 3
 """Number of ``NodeProto.name``."""
 CONVOLUTIONS = {"ConvTranspose": 1, **{name: index for name, index in WEIGHT_INPUT.items() if "Conv" in name}}
 """Operator -> which input its weight is."""
+FUSED = frozenset(("Relu", "LeakyRelu", "Sigmoid", "Tanh", "Clip", "HardSigmoid", "HardSwish", "Add", "Sum", "Mul",
+                   "BatchNormalization"))  # fmt: skip
+"""Operators that ONNX Runtime computes within the convolution before them, which is then named after their output."""
 Node = tuple[str, str, list[str], list[str]]
 """Name, operator, inputs, outputs."""
 
@@ -42,10 +46,10 @@ class ConvolutionWeights(NamedTuple):
 
 
 def convolution_weights(model: Path | bytes) -> dict[str, ConvolutionWeights]:
-    """Return name of a convolution, and of what it gives -> sizes of its weights.
+    """Return name of a convolution, of what it gives, and of what is computed within it -> sizes of its weights.
 
-    ONNX Runtime names a node that takes its place after either. Convolutions whose weights the graph computes, other
-    than by ``DequantizeLinear``, are left out.
+    ONNX Runtime names a node that takes its place after one of them. Convolutions whose weights the graph computes,
+    other than by ``DequantizeLinear``, are left out, and so is what may be computed within one of several.
 
     Args:
         model: A serialized ``ModelProto``, or the file of one.
@@ -69,8 +73,14 @@ def convolution_weights(model: Path | bytes) -> dict[str, ConvolutionWeights]:
 
     asked_of(read, model)
     stored = {outputs[0]: inputs[0] for _, kind, inputs, outputs in nodes if kind == "DequantizeLinear" and outputs}
+    readers = Counter(value for _, _, inputs, _ in nodes for value in inputs)
     found: dict[str, ConvolutionWeights] = {}
     for name, kind, inputs, outputs in nodes:
+        if kind in FUSED:
+            before = {found[value] for value in inputs if value in found and readers[value] == 1}
+            if len(before) == 1:
+                found |= dict.fromkeys(filter(None, (name, *outputs)), before.pop())
+            continue
         weight = "".join(inputs[CONVOLUTIONS[kind] :][:1]) if kind in CONVOLUTIONS else ""
         shape = shapes.get(stored.get(weight, weight), [])
         if len(shape) > 1:

@@ -25,6 +25,16 @@ GRAPHS: dict[str, tuple[str, dict[str, tuple[int, ...]], int]] = {
     "depthwise": ("(float[1,8,6,6] x) => (y) { y = Conv<group = 8>(x, w) }", {"w": (8, 1, 3, 3)}, 8 * 16 * 9),
     "signal": ("(float[1,4,12] x) => (y) { y = Conv(x, w) }", {"w": (6, 4, 3)}, 6 * 10 * 4 * 3),
     "upwards": ("(float[1,4,5,5] x) => (y) { y = ConvTranspose(x, w) }", {"w": (4, 6, 2, 2)}, 4 * 25 * 6 * 4),
+    **{name: (f"(float[1,3,9,9] x) => (y) {{ c = Conv(x, w)  y = {after} }}", {"w": (8, 3, 2, 2)}, 8 * 8 * 8 * 3 * 4)
+       for name, after in (("activated", "Relu(c)"), ("leaky", "LeakyRelu<alpha = 0.1>(c)"), ("sigmoid", "Sigmoid(c)"),
+                           ("added", "Add(c, c)"))},
+    "scaled": ("(float[1,3,9,9] x) => (y) { c = Conv(x, w)  s = Mul(c, v)  y = Relu(s) }",
+               {"w": (8, 3, 2, 2), "v": (8, 1, 1)}, 8 * 8 * 8 * 3 * 4),
+    "residual": (
+        "(float[1,3,9,9] x) => (y) { c = Conv<pads = [1,1,1,1]>(x, w)  r = Relu(c)"
+        "  d = Conv<pads = [1,1,1,1]>(r, v)  a = Add(d, r)  y = Relu(a) }",
+        {"w": (8, 3, 3, 3), "v": (8, 8, 3, 3)}, 81 * 8 * 9 * (3 + 8),
+    ),
     "none": ("(float[4,4] x) => (y) { y = Softmax(x) }", {}, 0),
 }  # fmt: skip
 
@@ -85,7 +95,16 @@ def test_the_file_says_how_many_weights_a_convolution_has_and_the_longest_name_c
     known = convolution_weights(path)
     assert known == convolution_weights(path.read_bytes()) == {"stem/Conv": (8, 18), "y": (8, 18)}
     shapes = [(1, 6, 6, 8), ()], [(1, 4, 4, 8)]
-    others = {"stem": ConvolutionWeights(8, 1), "stem/Conv2": ConvolutionWeights(8, 2)}
+    others = {
+        "stem": ConvolutionWeights(8, 1),
+        "stem/Conv2": ConvolutionWeights(8, 2),
+        "relu": ConvolutionWeights(8, 3),
+    }
+    assert macs("QLinearConv", *shapes, others, "relu_nchwc") == 8 * 16 * 3
+    for another in ("relu_1_nchwc", "relu2", "stem/Conv_12"):
+        assert macs("QLinearConv", *shapes, {"relu": others["relu"], **known}, another) is None, (
+            "a number names another"
+        )
     assert macs("QLinearConv", *shapes, {**known, **others}, "stem/Conv_token_0") == 8 * 16 * 18
 
 
