@@ -3,10 +3,10 @@
     python tests/validation/serving/clients.py BUNDLE --openpi PYTHON --lerobot PYTHON
     python tests/validation/serving/clients.py --small --openpi PYTHON --lerobot PYTHON    # what serving adds
 
-PYTHON has ``openpi-client`` (which brings NumPy 1), or ``lerobot`` 0.6.1 with grpcio and protobuf 6. Without them their
-clients are left out. Each client gets the actions for the same observations, and they are compared, bit for bit, with
-those of the bundle in this process; the time of its requests is compared with the time of the inference alone. The
-small bundle is one addition, so that almost all of a request's time is what serving adds.
+PYTHON has ``openpi-client`` (which brings NumPy 1) and ``typing_extensions``, or ``lerobot`` 0.6.1 with grpcio and
+protobuf 6. Without them their clients are left out. Each client gets the actions for the same observations, and they
+are compared, bit for bit, with those of the bundle in this process; the time of its requests is compared with the time
+of the inference alone. The small bundle is one addition, so that almost all of a request's time is what serving adds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A robot of openpi: its own client, unchanged (``pip install openpi-client``, in an environment of its own).
+"""A robot of openpi: its own client, unchanged, in an environment with ``openpi-client`` and ``typing_extensions``.
 
     python openpi_robot.py ws://127.0.0.1:8000 OBSERVATIONS.npz ACTIONS.npz [KEY]
 
