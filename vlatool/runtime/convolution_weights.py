@@ -26,8 +26,10 @@ NODE_NAME = 3
 """Number of ``NodeProto.name``."""
 CONVOLUTIONS = {"ConvTranspose": 1, **{name: index for name, index in WEIGHT_INPUT.items() if "Conv" in name}}
 """Operator -> which input its weight is."""
-FUSED = frozenset(("Relu", "LeakyRelu", "Sigmoid", "Tanh", "Clip", "HardSigmoid", "HardSwish", "Add", "Sum", "Mul",
-                   "BatchNormalization"))  # fmt: skip
+FUSED_OPERATORS = frozenset((
+    *("Relu", "LeakyRelu", "Sigmoid", "Tanh", "Clip", "HardSigmoid", "HardSwish"),
+    *("Add", "Sum", "Mul", "BatchNormalization"),
+))  # fmt: skip
 """Operators that ONNX Runtime computes within the convolution before them, which is then named after their output."""
 Node = tuple[str, str, list[str], list[str]]
 """Name, operator, inputs, outputs."""
@@ -76,7 +78,7 @@ def convolution_weights(model: Path | bytes) -> dict[str, ConvolutionWeights]:
     readers = Counter(value for _, _, inputs, _ in nodes for value in inputs)
     found: dict[str, ConvolutionWeights] = {}
     for name, kind, inputs, outputs in nodes:
-        if kind in FUSED:
+        if kind in FUSED_OPERATORS:
             before = {found[value] for value in inputs if value in found and readers[value] == 1}
             if len(before) == 1:
                 found |= dict.fromkeys(filter(None, (name, *outputs)), before.pop())

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from vlatool.runtime.convolution_weights import ConvolutionWeights
 
 Shape = tuple[int, ...]
-NUMBERED = re.compile(r"_?\d")
+NUMBER_SUFFIX = re.compile(r"_?\d")
 """What makes a name that of another node: ``relu`` is not ``relu_1``, while ``relu_nchwc`` takes its place."""
 ROWS = frozenset((
     *("MatMul", "FusedMatMul", "MatMulInteger", "MatMulIntegerToFloat", "DynamicQuantizeMatMul", "QLinearMatMul"),
@@ -92,7 +92,7 @@ def _weights(
     inputs: Sequence[Shape], weights: Mapping[str, ConvolutionWeights], name: str
 ) -> ConvolutionWeights | None:
     """Return the sizes of the weights of a convolution: from the file, else as reported."""
-    if known := [known for known in weights if name.startswith(known) and not NUMBERED.match(name[len(known) :])]:
+    if known := [known for known in weights if name.startswith(known) and not NUMBER_SUFFIX.match(name[len(known) :])]:
         return weights[max(known, key=len)]
     kernel = next((shape for shape in inputs[1:] if len(shape) >= len(inputs[0])), None)
     if kernel is None:
