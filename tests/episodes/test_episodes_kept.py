@@ -19,7 +19,6 @@ from _full import small_or_full
 from tests._reach import GOOD, TREMBLES, bundle_of
 from vlatool.accuracy.success_comparison import Outcome
 from vlatool.bundle.bundle import Bundle
-from vlatool.cli import main
 from vlatool.episodes.jobs import outcomes_of
 from vlatool.episodes.play import STEP_LIMIT, EpisodesJob, Played
 from vlatool.errors import DataError
@@ -282,7 +281,7 @@ def test_what_another_run_uses_stays(tmp_path):
     assert not (tmp_path / "work").exists()
 
 
-def test_a_command_that_is_killed_goes_on_to_the_same_rows(bundles, world, cache, tmp_path, played, capsys):
+def test_a_command_that_is_killed_goes_on_to_the_same_rows(bundles, world, cache, played):
     code = (world / "environment.py").read_text()
     paused = f'if os.environ.get("PAUSED") and seed == {EVALUATION_SEEDS + 15}: __import__("time").sleep(600)'
     pause = f"import os\n{code}".replace("        random = np", f"        {paused}\n        random = np")
@@ -292,19 +291,19 @@ def test_a_command_that_is_killed_goes_on_to_the_same_rows(bundles, world, cache
     words = ["evaluate", "closed-loop", str(bundles["good"].path), "--environment", f"{world}/environment.py:make",
              "--tasks", "near", "--tasks", "far", "--episodes", str(COUNT), "--workers", "1", "--json",
              "--raw"]  # fmt: skip
+    command = [sys.executable, "-m", "vlatool", *words]
     killed = subprocess.Popen(
-        [sys.executable, "-m", "vlatool", *words], env={**os.environ, "PAUSED": "1"}, start_new_session=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        command, env={**os.environ, "PAUSED": "1"}, start_new_session=True, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    while len(kept := list(cache.glob("streams/*/answer-*.json"))) < 2 and killed.poll() is None:
-        time.sleep(0.005)  # until there is a second one, the first may not be written to its end
+    while not (kept := list(cache.glob("streams/*/answer-*.json"))) and killed.poll() is None:
+        time.sleep(0.005)
     os.killpg(killed.pid, signal.SIGKILL)
     killed.communicate()
-    assert 1 < len(kept) < COUNT / 2
-    capsys.readouterr()
-    with pytest.raises(SystemExit):
-        main(words)
-    again = Report.from_json(capsys.readouterr().out)
-    assert again.rows == whole.rows
+    assert 0 < len(kept) < COUNT / 2
+    # another process, not this one: tests that ran here may have added to the packages that can be imported
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    again = Report.from_json(done.stdout)
+    assert again.rows == whole.rows, done.stderr
     assert "interrupted run" in str(again.warnings)
     assert list((cache / "streams").iterdir()) == []
