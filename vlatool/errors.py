@@ -16,6 +16,7 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── TargetError              the machine to run on: unreachable, or the run ends early
 │   ├── DeploymentError          a store of deployed bundles: unreadable, busy, an older release
 │   ├── ServingError             a server of a policy: cannot start, be reached, or take a request
+│   ├── BusError                 a bus of a robot: cannot be reached, another type, a malformed message
 │   ├── SignatureError           a signature of a bundle: missing, damaged, of another key
 │   ├── InstallationError        two distributions of vlatool in one environment
 │   └── PluginError              another package that adds something to vlatool
@@ -146,6 +147,10 @@ class DeploymentError(InputError):
 
 class ServingError(InputError):
     """A server of a policy cannot start or be reached, or does not take a request."""
+
+
+class BusError(InputError):
+    """A bus of a robot cannot be reached, carries another type, or sends a malformed message."""
 
 
 class SignatureError(InputError):

@@ -37,6 +37,7 @@ NOUNS = {
     "evaluate": "evaluation", "export": "export target", "sources": "kind of source", "data": "format of recordings",
     "render": "report format", "motion": "metric of motion", "videos": "format of videos",
     "workers": "launcher of workers", "control": "controller", "serving": "protocol of vlatool serve",
+    "controllers": "robot controller", "buses": "bus", "worlds": "simulated robot",
 }  # fmt: skip
 _PLUGIN_CLASSES: dict[type, str] = {}
 """Loaded class of another package -> ``kind.name``."""

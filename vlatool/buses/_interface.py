@@ -1,0 +1,116 @@
+"""What a bus is: publish, subscribe, services, and a list of what is there.
+
+A bus carries messages of ``vlatool.messages`` under ROS 2 names: topics such as ``/cmd_vel``, types such as
+``geometry_msgs/msg/Twist``. Handlers are called in a thread of the bus, one at a time for each subscription, and must
+return soon; the run of a controller (``vlatool.nodes``) puts what they get into its inbox.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+
+from vlatool.messages import Message
+from vlatool.messages.builtin_interfaces import Time
+from vlatool.registry import load
+
+M = TypeVar("M", bound=Message)
+
+
+@dataclass(frozen=True)
+class QoS:
+    """Quality of service, in ROS 2's terms.
+
+    Args:
+        reliable: Reliable, else best effort. ROS 1 is always reliable.
+        depth: How many messages wait at most.
+        latched: Transient local, else volatile: a subscriber that comes later gets the last message.
+    """
+
+    reliable: bool = False
+    depth: int = 1
+    latched: bool = False
+
+
+class Reception(NamedTuple):
+    """A message that came.
+
+    Args:
+        message: The message; its arrays may be read-only views of what the transport received.
+        received_s: When it came, by ``time.monotonic``, in seconds; in a simulation, by the simulated clock.
+    """
+
+    message: Message
+    received_s: float
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """A topic on a bus.
+
+    Args:
+        topic: Name, such as ``/cmd_vel``.
+        types: ROS 2 names of the types that its publishers and subscribers state; several are a fault.
+        publishers: Names of the nodes that publish it, or of their addresses where a bus knows no more.
+        subscribers: Names of those that subscribe to it.
+    """
+
+    topic: str
+    types: tuple[str, ...] = ()
+    publishers: tuple[str, ...] = ()
+    subscribers: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class Bus(Protocol):
+    """A connection of one node to a bus; the class in ``vlatool/buses/NAME.py`` is built as ``NAME(address, node)``."""
+
+    def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
+        """Call ``handler`` with each message of a topic.
+
+        Raises:
+            BusError: when the topic carries another type.
+        """
+
+    def publisher(self, topic: str, message: type[M], qos: QoS) -> Callable[[M], None]:
+        """Announce a topic and return what sends a message on it; it never blocks."""
+
+    def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
+        """Answer a service."""
+
+    def call(self, service: str, request: Message, response: type[M], timeout_s: float) -> M:
+        """Call a service and return its answer.
+
+        Raises:
+            BusError: when nobody answers in time.
+        """
+
+    def topics(self) -> list[TopicInfo]:
+        """Return what is on the bus now, this node's own included, sorted by name."""
+
+    def stamp(self) -> Time:
+        """Return the moment by the clock that stamps this bus's messages."""
+
+    def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
+        """Wait until each topic has a peer: a publisher, or a subscriber; return those without."""
+
+    def close(self) -> None:
+        """Leave the bus; what is sent has left this process. Closing twice does nothing."""
+
+
+def open_bus(name: str, node: str) -> Bus:
+    """Open a bus by what a user types: ``zenoh``, or with an address behind a colon: ``zenoh:tcp/127.0.0.1:7447``.
+
+    Args:
+        name: Bus, with an address where it needs one: master (ros1), router (zenoh), domain (dds, ros2), file (bag).
+        node: Name of this node, such as ``vlatool_vln``.
+
+    Raises:
+        UsageError: for an unknown bus or an impossible address.
+        MissingExtra: when its library is absent.
+        BusError: when it cannot be reached.
+    """
+    kind, _, address = name.partition(":")
+    bus: Bus = load("buses", kind)(address, node)
+    return bus

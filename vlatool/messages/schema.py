@@ -1,0 +1,114 @@
+"""What a message is: a frozen dataclass whose annotations are types of the ROS interface language.
+
+Each field is annotated with one of the aliases below, with another message class, or with ``tuple[M, ...]`` of them.
+The order of the fields is that of the ROS 2 definition. Every field has a default, as in ROS: zero, false or empty.
+Encodings (CDR, ROS 1), RIHS01 hashes and texts of definitions are derived from these classes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """A primitive of the ROS interface language, by its name there, such as ``float64`` or ``string``."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Elements:
+    """A sequence or an array of primitives, held as a one-dimensional NumPy array or, of strings, as a tuple.
+
+    Args:
+        name: The primitive.
+        length: Length of a fixed-size array; None for a sequence without a bound.
+    """
+
+    name: str
+    length: int | None = None
+
+
+boolean = Annotated[bool, Primitive("bool")]
+uint8 = Annotated[int, Primitive("uint8")]
+int8 = Annotated[int, Primitive("int8")]
+byte = Annotated[int, Primitive("byte")]
+uint16 = Annotated[int, Primitive("uint16")]
+int16 = Annotated[int, Primitive("int16")]
+uint32 = Annotated[int, Primitive("uint32")]
+int32 = Annotated[int, Primitive("int32")]
+uint64 = Annotated[int, Primitive("uint64")]
+int64 = Annotated[int, Primitive("int64")]
+float32 = Annotated[float, Primitive("float32")]
+float64 = Annotated[float, Primitive("float64")]
+string = Annotated[str, Primitive("string")]
+uint8_sequence = Annotated[NDArray[np.uint8], Elements("uint8")]
+uint32_sequence = Annotated[NDArray[np.uint32], Elements("uint32")]
+int32_sequence = Annotated[NDArray[np.int32], Elements("int32")]
+float32_sequence = Annotated[NDArray[np.float32], Elements("float32")]
+float64_sequence = Annotated[NDArray[np.float64], Elements("float64")]
+string_sequence = Annotated[tuple[str, ...], Elements("string")]
+float64_9 = Annotated[NDArray[np.float64], Elements("float64", 9)]
+float64_12 = Annotated[NDArray[np.float64], Elements("float64", 12)]
+float64_36 = Annotated[NDArray[np.float64], Elements("float64", 36)]
+uint8_16 = Annotated[NDArray[np.uint8], Elements("uint8", 16)]
+
+
+def zeros(dtype: str, length: int = 0) -> Any:
+    """Return the default of a field that is an array: ``length`` zeros of a dtype."""
+    return field(default_factory=lambda: np.zeros(length, dtype))
+
+
+class Message:
+    """Base of all messages; a subclass names its ROS 2 type: ``class Twist(Message, name="geometry_msgs/msg/Twist")``.
+
+    Two messages are compared by ``same``, since their arrays have no single truth value.
+    """
+
+    TYPE: ClassVar[str] = ""
+    """Name of the ROS 2 type, such as ``geometry_msgs/msg/Twist``."""
+
+    def __init_subclass__(cls, name: str = "", **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if name:
+            cls.TYPE = name
+            _TYPES[name] = cls
+
+
+_TYPES: dict[str, type[Message]] = {}
+
+
+def find_type(name: str) -> type[Message]:
+    """Return the class of a type by its ROS 2 name, or by its ROS 1 name (``geometry_msgs/Twist``).
+
+    Raises:
+        UsageError: for an unknown type.
+    """
+    package, _, rest = name.partition("/")
+    full = name if "/" in rest else f"{package}/msg/{rest}"
+    if full not in _TYPES:
+        raise UsageError.unknown(f"Unknown type of message '{name}'", full, sorted(_TYPES))
+    return _TYPES[full]
+
+
+def same(one: Any, other: Any) -> bool:
+    """Return whether two messages, or values of fields, are equal bit for bit; NaN equals NaN."""
+    if isinstance(one, Message):
+        return type(one) is type(other) and all(
+            same(getattr(one, entry.name), getattr(other, entry.name))
+            for entry in dataclasses.fields(one)  # type: ignore[arg-type]  # every subclass is a dataclass
+        )
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        left, right = np.asarray(one), np.asarray(other)
+        return left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes()
+    if isinstance(one, tuple):
+        return isinstance(other, tuple) and len(one) == len(other) and all(map(same, one, other))
+    return bool(one == other) or (one != one and other != other)
