@@ -1,60 +1,73 @@
-"""Controllers in a simulated world: one chain, one clock, the same bytes for the same seed."""
+"""Controllers in a world: one clock, chains, events, the same bytes for the same seed."""
 
 from __future__ import annotations
 
 import pytest
-from _point_robot import GoTo, Limiter, PointWorld
 
-from vlatool.messages import Message, cdr
-from vlatool.messages.std_msgs import Bool
-from vlatool.nodes.in_world import WorldRun, WorldStep, place
+from tests._point_robot import GoTo, Limiter, PointWorld
+from vlatool.errors import UsageError
+from vlatool.messages.geometry_msgs import Twist
+from vlatool.messages.std_msgs import Bool, String
+from vlatool.nodes.in_world import Event, Node, Simulation, play
 
-
-def heard(seed: int) -> list[tuple[str, bytes]]:
-    found: list[tuple[str, bytes]] = []
-
-    def hear(topic: str, message: Message) -> None:
-        found.append((topic, bytes(cdr.encode(message))))
-
-    WorldRun(PointWorld(), [place(GoTo())], seed=seed, heard=hear).run(2.0)
-    return found
+CHAIN = {"obeys": {"/cmd_vel": "/safe_cmd_vel"}}
 
 
-def test_a_controller_drives_the_robot_to_its_goal() -> None:
-    world = PointWorld()
-    count = WorldRun(world, [place(GoTo(goal=0.7))]).run(6.0)
-    assert world.truth()["x"] == pytest.approx(0.7, abs=0.01)
-    assert count == 6 * 20
+def test_drives_to_its_goal():
+    run = play(PointWorld(noise=0.0), [GoTo()], seconds=10)
+    assert run.truths[-1][1] == pytest.approx({"x": 1.0, "y": 0.5}, abs=0.02)
+    assert len(run.steps[0]) == 100
+    assert [report.snapshot.time_s for report in run.steps[0]] == [number / 10 for number in range(100)]
+    assert run.steps[0][0].command.status == "going"  # odometry came with the reset
+    assert run.steps[0][5].snapshot.stamp.seconds == pytest.approx(0.5)
 
 
-def test_the_same_seed_gives_the_same_bytes() -> None:
-    assert heard(3) == heard(3) != heard(4)
+def test_same_seed_same_bytes():
+    runs = [play(PointWorld(), [GoTo(), Limiter()], seconds=5, seed=seed, **CHAIN) for seed in (7, 7, 8)]
+    assert runs[0].checksum == runs[1].checksum != runs[2].checksum
+    assert runs[0].truths == runs[1].truths
 
 
-def test_what_one_writes_another_reads_in_the_same_moment() -> None:
-    world = PointWorld()
-    fastest = 0.0
-
-    def watch(steps: list[WorldStep]) -> bool:
-        nonlocal fastest
-        fastest = max(fastest, abs(world.truth()["v"]))
-        return False
-
-    chain = [place(GoTo(), {"velocity": "/cmd_vel_wanted"}), place(Limiter())]
-    WorldRun(world, chain).run(8.0, until=watch)
-    assert fastest == 0.2
-    assert world.truth()["x"] == pytest.approx(1.0, abs=0.01)
+def test_chain_moves_at_half_the_speed():
+    alone, chain = (
+        play(PointWorld(noise=0.0), nodes, seconds=1, **options)
+        for nodes, options in (([GoTo()], {}), ([GoTo(), Limiter()], CHAIN))
+    )
+    assert chain.truths[-1][1]["x"] == pytest.approx(alone.truths[-1][1]["x"] / 2, rel=0.1)
+    assert [len(steps) for steps in chain.steps] == [10, 20]
+    first = chain.steps[1][0].snapshot.message("cmd_in", Twist)
+    assert first is chain.steps[0][0].command.messages["cmd"][0]
 
 
-def test_an_end_is_seen_after_the_step() -> None:
-    run = WorldRun(PointWorld(), [place(GoTo())])
-    run.run(10.0, until=lambda steps: steps[0].snapshot.time_s >= 1.0)
-    assert run.time_s == pytest.approx(1.0)
+def test_delay_of_a_computation():
+    prompt, late = (play(PointWorld(noise=0.0), [Node(GoTo(), {}, delay)], seconds=2) for delay in (0.0, 0.15))
+    moved = [next(time for time, truth in run.truths if truth["x"] > 1e-6) for run in (prompt, late)]
+    assert moved[1] >= moved[0] + 0.1
 
 
-def test_a_service_is_called_by_its_name_on_the_bus() -> None:
-    run = WorldRun(PointWorld(), [place(GoTo(), {"hold": "/arm/hold"})])
-    assert run.ask("/hold", Bool()) is None
-    number = run.ask("/arm/hold", Bool())
-    assert number is not None
-    assert list(run.step()[0].command.responses) == [number]
+def test_ends_when_the_world_says_so():
+    run = play(PointWorld(noise=0.0), [GoTo()], seconds=100, until=lambda truth: truth["x"] > 0.9)
+    assert run.seconds < 10
+
+
+def test_events_and_services():
+    events = [Event(1.0, "/halt", Bool(True), call=True), Event(0.35, "/instruction", String("go"))]
+    simulation = Simulation(PointWorld(), [GoTo()], events=events)
+    run = simulation.play(2)
+    statuses = [report.command.status for report in run.steps[0]]
+    assert statuses == ["going"] * 10 + ["halted"] * 10
+    assert run.steps[0][4].snapshot.readings["instruction"][0].received_s == 0.35
+    assert run.steps[0][-1].command.notes == {}
+
+
+def test_rest_reaches_the_world():
+    world = PointWorld(noise=0.0)
+    play(world, [GoTo(goal_x=50)], seconds=1)
+    before = world.truth()
+    world.advance(0.3)
+    assert world.truth() == before
+
+
+def test_two_types_on_a_topic_are_refused():
+    with pytest.raises(UsageError, match="/odom carries nav_msgs/msg/Odometry; the controller's 'cmd' is geometry"):
+        Simulation(PointWorld(), [Node(GoTo(), {"cmd": "/odom"})])

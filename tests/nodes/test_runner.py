@@ -1,111 +1,207 @@
-"""A controller on a bus: its schedule, its services, and how it ends."""
+"""The run of a controller on a bus: schedule, rest at every end, services, conflicts, counts."""
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 
 import pytest
-from _point_robot import GoTo, MemoryBus
 
+from tests._point_robot import Exchange, Failing, GoTo, MemoryBus, collect
 from vlatool.buses import QoS
-from vlatool.errors import BusError, UsageError
-from vlatool.messages import same
-from vlatool.messages.geometry_msgs import Twist
+from vlatool.controllers import Command
+from vlatool.errors import BusError, DataError, UsageError
+from vlatool.messages.geometry_msgs import Twist, Vector3
 from vlatool.messages.nav_msgs import Odometry
 from vlatool.messages.std_msgs import Bool, String
-from vlatool.nodes.runner import Runner, RunSummary
-from vlatool.nodes.topics import map_topics
+from vlatool.nodes.runner import Runner
 
 
-def runner(controller: GoTo, bus: MemoryBus) -> Runner:
-    return Runner(controller, bus, map_topics(controller, {}))
+@pytest.fixture
+def exchange():
+    return Exchange()
 
 
-def test_it_steps_at_its_rate_and_ends_at_rest() -> None:
-    bus, controller = MemoryBus(), GoTo(rate_hz=100.0)
-    run = runner(controller, bus)
-    bus.publisher("/odom", Odometry, QoS())(Odometry())
-    summary = run.run(0.3)
-    assert summary.steps + summary.missed == 30
-    assert summary.messages == {"odometry": 1, "note": 0}
-    assert summary.statuses["driving"] == summary.steps
-    *driven, last = bus.sent["/cmd_vel"]
-    assert len(driven) == summary.steps
-    assert same(last, Twist())
+@pytest.fixture
+def others(exchange):
+    return MemoryBus(exchange, "others")
 
 
-def test_steps_that_no_time_is_left_for_are_missed_not_caught_up() -> None:
-    bus = MemoryBus()
-    summary = runner(GoTo(rate_hz=100.0, slow_s=0.025), bus).run(0.3)
-    assert summary.steps + summary.missed >= 30
-    assert summary.missed >= summary.steps, "each step takes the time of two and a half"
+def runner_of(exchange, controller, **options) -> Runner:
+    return Runner(controller, MemoryBus(exchange, "vlatool_test"), **options)
 
 
-def test_a_step_that_raises_leaves_the_robot_at_rest() -> None:
-    bus = MemoryBus()
-    bus.publisher("/odom", Odometry, QoS())
-    run = runner(GoTo(fail_at=2), bus)
-    bus.publisher("/odom", Odometry, QoS())(Odometry())
-    with pytest.raises(ValueError, match="planted"):
-        run.run(5)
-    assert same(bus.sent["/cmd_vel"][-1], Twist())
+def test_steps_at_its_rate_and_rests(exchange, others):
+    sent = collect(others, "/cmd_vel", Twist)
+    others.publisher("/odom", Odometry, QoS())(Odometry())
+    seen = []
+    runner = runner_of(exchange, GoTo(rate_hz=100), observers=[seen.append])
+    summary = runner.run(0.2)
+    assert summary.steps + summary.skipped == 20
+    assert [report.number for report in seen] == list(range(summary.steps))
+    assert len(sent) == summary.steps + 1
+    assert sent[-1].linear.x == 0
+    assert summary.status == "waiting for /odom"  # the message came before the controller
 
 
-def test_a_service_is_answered_by_the_next_step() -> None:
-    bus = MemoryBus()
-    run = runner(GoTo(), bus)
-    ended: list[RunSummary] = []
-    thread = threading.Thread(target=lambda: ended.append(run.run()))
-    thread.start()
-    answer = bus.call("/hold", Bool(), String, 1.0)
-    run.stop()
-    thread.join(10)
-    assert not thread.is_alive()
-    assert answer.data.startswith("step ")
-    assert ended[0].steps >= 1
+def test_schedule_does_not_drift_and_late_steps_are_left_out(exchange):
+    seen = []
+
+    def slow(report):
+        seen.append(report)
+        if report.number == 2:
+            time.sleep(0.055)
+
+    runner_of(exchange, GoTo(rate_hz=100), observers=[slow]).run(0.2)
+    began = seen[0].snapshot.time_s - seen[0].late_s
+    ticks = [(report.snapshot.time_s - report.late_s - began) * 100 for report in seen]
+    assert ticks == pytest.approx([round(tick) for tick in ticks], abs=1e-6)
+    assert seen[3].skipped >= 5
+    assert round(ticks[-1]) == sum(1 + report.skipped for report in seen) - 1
 
 
-def test_a_call_that_no_step_answers_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlatool.nodes.runner.ANSWER_S", 0.01)
-    bus = MemoryBus()
-    runner(GoTo(), bus)
-    with pytest.raises(BusError, match="hold was not answered in 0.01 s"):
-        bus.call("/hold", Bool(), String, 1.0)
+def test_newest_messages_are_kept(exchange, others):
+    send = others.publisher("/instruction", String, QoS())
+    seen = []
+    runner = runner_of(exchange, GoTo(rate_hz=50), observers=[seen.append])
+    for number in range(5):
+        send(String(str(number)))
+    summary = runner.run(0.05)
+    readings = seen[0].snapshot.readings["instruction"]
+    assert [(reading.message.data, reading.sequence) for reading in readings] == [("2", 2), ("3", 3), ("4", 4)]
+    assert seen[1].snapshot.readings["instruction"] == ()
+    assert seen[1].snapshot.newest["instruction"].message.data == "4"
+    assert summary.overwritten == {"odom": 0, "instruction": 2}
 
 
-def test_ending_takes_no_whole_period() -> None:
-    bus = MemoryBus()
-    run = runner(GoTo(rate_hz=0.01), bus)
-    thread = threading.Thread(target=run.run)
-    thread.start()
-    time.sleep(0.05)
-    run.stop()
-    thread.join(20)
-    assert not thread.is_alive()
-
-
-def test_another_type_under_the_topic_is_refused() -> None:
-    bus = MemoryBus()
-    bus.publisher("/odom", Twist, QoS())
-    with pytest.raises(BusError, match="/odom carries geometry_msgs/msg/Twist"):
-        runner(GoTo(), bus)
+@pytest.mark.parametrize("error", [RuntimeError("a fault"), DataError("bad data"), KeyboardInterrupt()])
+def test_step_that_raises_ends_in_rest(exchange, others, error):
+    sent = collect(others, "/cmd_vel", Twist)
+    with pytest.raises(type(error)):
+        runner_of(exchange, Failing(at=2, error=error)).run(5)
+    assert [message.linear.x for message in sent] == [1, 1, 0]
 
 
 @pytest.mark.parametrize(
-    ("wanted", "says"),
+    ("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
+)
+def test_signals_end_in_rest(exchange, others, number, raised):
+    sent = collect(others, "/cmd_vel", Twist)
+    handler = signal.getsignal(signal.SIGTERM)
+    timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
+    timer.start()
+    with pytest.raises(raised) as left:
+        runner_of(exchange, Failing(at=-1)).run(10)
+    assert getattr(left.value, "code", 143) == 143
+    assert sent[-1].linear.x == 0
+    assert all(message.linear.x == 1 for message in sent[:-1])
+    assert signal.getsignal(signal.SIGTERM) is handler
+    timer.join()
+
+
+def test_stop_from_another_thread(exchange, others):
+    sent = collect(others, "/cmd_vel", Twist)
+    runner = runner_of(exchange, Failing(at=-1))
+    threading.Timer(0.03, runner.stop).start()
+    runner.run()
+    assert sent[-1].linear.x == 0
+
+
+def test_rest_reaches_what_still_takes_it(exchange, others):
+    class Two(GoTo):
+        def rest(self):
+            return Command({"cmd": (Twist(),), "status": (String("at rest"),)})
+
+    words = collect(others, "/status", String)
+    runner = runner_of(exchange, Two())
+
+    def gone(message):
+        raise BusError("The bus is gone.")
+
+    runner._senders["cmd"] = gone
+    with pytest.raises(BusError, match="gone"):
+        runner.run(1)
+    assert [word.data for word in words] == ["at rest"]
+
+
+def test_services_are_answered_by_a_step(exchange, others):
+    runner = runner_of(exchange, GoTo(rate_hz=100))
+    thread = threading.Thread(target=runner.run, args=(5,))
+    thread.start()
+    assert others.call("/halt", Bool(True), Bool, 1).data
+    runner.stop()
+    thread.join()
+    assert runner.summary.status == "halted"
+    with pytest.raises(BusError, match="the controller has ended"):
+        others.call("/halt", Bool(True), Bool, 1)
+
+
+def test_call_that_no_step_answers(exchange):
+    runner = runner_of(exchange, GoTo())
+    with pytest.raises(BusError, match="no step answered within 0.01 s"):
+        runner._stepper.calls.ask("halt", Bool(True), 0.01)
+    assert runner._stepper.calls.take() == ()
+
+
+def test_too_many_calls_are_refused(exchange):
+    calls = runner_of(exchange, GoTo())._stepper.calls
+    for _ in range(64):
+        calls.add("halt", Bool(True))
+    with pytest.raises(BusError, match="64 calls already wait"):
+        calls.add("halt", Bool(True))
+
+
+def test_another_publisher_is_refused(exchange, others):
+    others.publisher("/cmd_vel", Twist, QoS())
+    with pytest.raises(BusError, match="/cmd_vel has the publisher others already"):
+        runner_of(exchange, GoTo())
+    runner_of(exchange, GoTo(), topics={"cmd": "/other/cmd_vel"})
+    runner_of(exchange, GoTo(), alone=False)
+
+
+def test_another_type_is_refused(exchange, others):
+    others.publisher("/odom", Twist, QoS())
+    with pytest.raises(BusError, match="/odom carries geometry_msgs/msg/Twist; the controller's 'odom' is nav_msgs"):
+        runner_of(exchange, GoTo())
+
+
+def test_topics_are_mapped_by_name_or_topic(exchange):
+    runner = runner_of(exchange, GoTo(), topics={"odom": "/a/odom", "/halt": "/b/halt"})
+    assert runner.topics == {"odom": "/a/odom", "instruction": "/instruction", "cmd": "/cmd_vel", "status": "/status",
+                             "halt": "/b/halt"}  # fmt: skip
+    assert runner.missing(0) == ("/a/odom",)
+
+
+@pytest.mark.parametrize(
+    ("topics", "words"),
     [
-        ({"odometri": "/odom"}, "odometry"),
-        ({"odometry": "/wheel odom"}, "/wheel_odom"),
-        ({"odometry": ""}, "cannot be the name"),
-        ({"odometry": "/a//b"}, "cannot be the name"),
+        ({"odo": "/odom"}, "no topic 'odo' to map; did you mean 'odom'"),
+        ({"odom": "odom"}, "'odom' is mapped to 'odom', which is not the name of a topic"),
+        ({"odom": "/a b"}, "not the name of a topic"),
     ],
 )
-def test_an_impossible_map_is_refused(wanted: dict[str, str], says: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        map_topics(GoTo(), wanted)
-    assert says in str(caught.value)
+def test_impossible_maps(exchange, topics, words):
+    with pytest.raises(UsageError, match=words):
+        runner_of(exchange, GoTo(), topics=topics)
 
 
-def test_a_topic_without_a_slash_is_of_the_root() -> None:
-    assert map_topics(GoTo(), {"odometry": "wheel/odom"})["odometry"] == "/wheel/odom"
+@pytest.mark.parametrize("rate", [0, -1, float("nan"), float("inf"), "10", True])
+def test_impossible_rates(exchange, rate):
+    with pytest.raises(UsageError, match="rate"):
+        runner_of(exchange, GoTo(rate_hz=rate))
+
+
+@pytest.mark.parametrize(
+    ("sends", "words"),
+    [
+        ({"arm": (Twist(),)}, "sends on the output 'arm', which it does not have"),
+        ({"cmd": (Vector3(),)}, "sends geometry_msgs/msg/Vector3 on 'cmd', which carries geometry_msgs/msg/Twist"),
+    ],
+)
+def test_wrong_commands(exchange, others, sends, words):
+    sent = collect(others, "/cmd_vel", Twist)
+    with pytest.raises(BusError, match=words):
+        runner_of(exchange, Failing(sends=sends)).run(1)
+    assert [message.linear.x for message in sent] == [0]

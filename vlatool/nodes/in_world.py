@@ -161,6 +161,13 @@ class Simulation:
                 break
         return self.run
 
+    def rest(self) -> None:
+        """Send the rest of each controller, as at the end of a run."""
+        for node, topics in zip(self.nodes, self.topics, strict=True):
+            for name, messages in node.controller.rest().messages.items():
+                for message in messages:
+                    self._deliver(topics[name], message, self.run.seconds)
+
     def _time_of(self, index: int) -> float:
         return self._due[index] / self.nodes[index].controller.rate_hz
 
@@ -211,14 +218,23 @@ class Simulation:
 
 
 def play(
-    world: World, nodes: Sequence[Node | RobotController[Any]], *, seconds: float, seed: int = 0, **options: Any
+    world: World,
+    nodes: Sequence[Node | RobotController[Any]],
+    *,
+    seconds: float,
+    seed: int = 0,
+    until: Callable[[Truth], bool] | None = None,
+    **options: Any,
 ) -> WorldRun:
-    """Play one episode of controllers in a world; see ``Simulation`` for the options.
+    """Play one episode of controllers in a world, and send each controller's rest at its end.
 
-    Returns:
-        What happened; each controller's rest is sent at the end, and the world obeys it.
+    Args:
+        seconds: Longest simulated time.
+        seed: Seed of the world.
+        until: Ends the episode when it returns true for what the world says of itself.
+        options: Further arguments of ``Simulation``.
     """
-    simulation = Simulation(world, nodes, seed=seed, **{k: v for k, v in options.items() if k != "until"})
-    run = simulation.play(seconds, options.get("until"))
+    simulation = Simulation(world, nodes, seed=seed, **options)
+    run = simulation.play(seconds, until)
     simulation.rest()
     return run
