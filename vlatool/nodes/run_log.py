@@ -48,6 +48,10 @@ class Background:
         self._thread = threading.Thread(target=self._work, name="vlatool-observers", daemon=True)
         self._thread.start()
 
+    def observe(self, *observers: Callable[[StepReport], None]) -> None:
+        """Add observers, before the first report."""
+        self._observers.extend(observers)
+
     def __call__(self, report: StepReport) -> None:
         """Take a report; never waits."""
         try:

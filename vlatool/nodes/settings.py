@@ -20,7 +20,8 @@ from vlatool.files.json import read_json
 MAX_BYTES = 1_000_000
 """Largest file of settings."""
 WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Mapping: "an object"}
-ARGUMENT = re.compile(r"^(\w+): (.*)$")
+ARGUMENT = re.compile(r"^(\w+(?:, \w+)*): (.*)$")
+"""A line of a docstring that begins the words on an argument, or on several with commas between."""
 
 
 @dataclass(frozen=True)
@@ -82,15 +83,17 @@ def _kind(annotation: Any, where: str) -> tuple[type, bool, bool]:
 def _arguments(text: str) -> dict[str, str]:
     """Return what the section Args of a docstring says of each argument, as one line."""
     found: dict[str, str] = {}
-    name = ""
+    names: list[str] = []
     for line in text.partition("Args:\n")[2].splitlines():
         if line.strip() and not line.startswith("    "):
             break
         match = ARGUMENT.match(line[4:])
         if match:
-            name, found[match[1]] = match[1], match[2]
-        elif line.strip() and name:
-            found[name] += f" {line.strip()}"
+            names = match[1].split(", ")
+        elif not line.strip() or not names:
+            continue
+        for name in names:
+            found[name] = match[2] if match else f"{found[name]} {line.strip()}"
     return {name: words.rstrip(".")[:1].lower() + words.rstrip(".")[1:] for name, words in found.items()}
 
 
