@@ -107,19 +107,16 @@ OF_POLICIES = ("bundle", "robot", "instruction", "deadline_ms", "neutral", "engi
 def controller_function(name: str, controller: type) -> Callable[..., None]:
     """Return a function whose signature has the controller's settings and the common flags."""
     from vlatool.nodes.launch import needs_policy
-    from vlatool.nodes.settings import settings_of
 
-    own = {setting.name: setting for setting in settings_of(controller)}
-    flags = {key: _flag(setting) for key, setting in own.items() if _has_flag(setting)}
+    flags = flags_of(controller, COMMON)
     takes_policy = needs_policy(controller)
     common = {key: flag for key, flag in COMMON.items()
               if (takes_policy or key not in OF_POLICIES) and (name == "policy" or key != "print_map")}  # fmt: skip
 
     def command(**arguments: Any) -> None:
         context: typer.Context = arguments.pop("context")
-        typed = {key: arguments.pop(key) for key in flags}
-        values = {key: value for key, value in typed.items() if _is_given(context, key)}
-        _run(name, {key: _parsed(own[key], value) for key, value in values.items()}, arguments)
+        typed = values_of(controller, context, {key: arguments.pop(key) for key in flags})
+        _run(name, typed, arguments)
 
     typed = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
     shared = [inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
@@ -135,9 +132,20 @@ def summary_of(entry: type) -> str:
     return (inspect.getdoc(entry) or "").partition("\nArgs:")[0].strip()
 
 
-def _has_flag(setting: Setting) -> bool:
-    """Return whether a flag can set it: not an object, and not under the name of a common flag."""
-    return setting.type is not Mapping and setting.name not in COMMON
+def flags_of(entry: type, common: Mapping[str, Any]) -> dict[str, inspect.Parameter]:
+    """Return the flags of a controller or a world, by setting: not those of objects, nor under a name in ``common``."""
+    from vlatool.nodes.settings import settings_of
+
+    return {setting.name: _flag(setting) for setting in settings_of(entry)
+            if setting.type is not Mapping and setting.name not in common}  # fmt: skip
+
+
+def values_of(entry: type, context: typer.Context, typed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings whose flags were given, as JSON has them."""
+    from vlatool.nodes.settings import settings_of
+
+    known = {setting.name: setting for setting in settings_of(entry)}
+    return {key: _parsed(known[key], value) for key, value in typed.items() if _is_given(context, key)}
 
 
 def _flag(setting: Setting) -> inspect.Parameter:
