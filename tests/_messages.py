@@ -148,8 +148,10 @@ def without_absent(message: Message) -> Message:
             value = getattr(message, member.attribute)
             many = isinstance(value, tuple) and member.message is not None
             values[member.attribute] = (
-                tuple(map(without_absent, value)) if many else without_absent(value) if isinstance(value, Message) else value
+                tuple(map(without_absent, value))
+                if many
+                else without_absent(value)
+                if isinstance(value, Message)
+                else value
             )
     return type(message)(**values)
-
-

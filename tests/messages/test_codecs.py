@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from _full import small_or_full
 from _messages import Drawer, as_rosbags, in_ros1, ros1_store, ros2_store, without_absent
 
-from vlatool.errors import BusError
 from vlatool.messages import Message, all_types, cdr, ros1, same
-from vlatool.messages.geometry_msgs import Twist, Vector3
-from vlatool.messages.sensor_msgs import Image, LaserScan, PointCloud2, PointField
-from vlatool.messages.std_msgs import Header
 
 JAZZY, NOETIC = ros2_store(), ros1_store()
 DRAWS = small_or_full(200, 10_000)
