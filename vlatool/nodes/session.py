@@ -119,8 +119,7 @@ def run_on_bus(
     node = node_of(plan)
     trace = Trace()
     with contextlib.ExitStack() as stack:
-        if hasattr(policy := getattr(controller, "policy", None), "close"):
-            stack.callback(policy.close)
+        stack.callback(_close_policy, controller)
         bus = open_bus(plan.bus, node)
         stack.callback(bus.close)
         background = Background()
@@ -158,9 +157,8 @@ def dry_run(plan: RunPlan) -> dict[str, Any]:
         refuse_output(path)
     controller = open_controller(plan.controller, plan.settings, plan.policy)
     topics = topics_of(controller, plan.topics)
-    if hasattr(policy := getattr(controller, "policy", None), "close"):
-        policy.close()
     check_controller(controller)
+    _close_policy(controller)
 
     def entry(each: Any, kind: type[Message]) -> dict[str, str]:
         return {"name": each.name, "topic": topics[each.name], "type": kind.TYPE}
@@ -174,6 +172,12 @@ def dry_run(plan: RunPlan) -> dict[str, Any]:
         "services": [entry(each, each.request) for each in controller.services],
         "settings": to_plain(controller),
     }
+
+
+def _close_policy(controller: Any) -> None:
+    policy: Any = getattr(controller, "policy", None)
+    if hasattr(policy, "close"):
+        policy.close()
 
 
 def node_of(plan: RunPlan) -> str:

@@ -169,5 +169,5 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 def to_plain(entry: Any) -> dict[str, Any]:
     """Return the settings of a controller or a world as JSON has them."""
-    values = {setting.name: getattr(entry, setting.name) for setting in settings_of(type(entry))}
+    values = {setting.name: getattr(entry, setting.name) for setting in settings_of(entry.__class__)}
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
