@@ -17,7 +17,7 @@ from vlatool.controllers._motions import BACKWARD, FORWARD, STOP, WAIT, Speeds, 
 from vlatool.controllers._sensor_arrays import colours_of, depth_of
 from vlatool.controllers._settings import check_range, check_rate
 from vlatool.controllers._vln_state import ARRIVED, FAILED, IDLE, PAUSED, RUNNING, VlnState
-from vlatool.errors import UsageError, VlatoolError
+from vlatool.errors import DeadlineMissed, UsageError, VlatoolError
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.nav_msgs import Odometry
 from vlatool.messages.sensor_msgs import Image
@@ -206,6 +206,8 @@ class Vln:
         try:
             index = choose(self.policy, observation(self._observed, frames, state.actions, state.instruction))
             kind = self._motions[index]
+        except DeadlineMissed:
+            return self._stand(state._replace(detail="the policy is late"))
         except (VlatoolError, IndexError) as error:
             detail = error.message if isinstance(error, VlatoolError) else "the policy chose an action without a label"
             return self._stand(state._replace(phase=FAILED, detail=detail))
