@@ -73,7 +73,7 @@ def read_map(path: Path) -> dict[str, Any]:
 def proposed_text(bundle: Path) -> str:
     """Return a proposed map for a bundle, as YAML."""
     from vlatool.bundle.bundle import Bundle
-    from vlatool.controllers._policy_map import propose
+    from vlatool.controllers._policy_proposal import propose
 
     yaml: Any = require("yaml", "build")
     text: str = yaml.safe_dump(propose(Bundle.open(bundle).manifest.spec), sort_keys=False, default_flow_style=None)

@@ -40,7 +40,8 @@ class RunPlan:
         record: New file for the log of the run; None for none.
         report: New HTML file; None for none.
         shared: Whether others may publish the controller's outputs, too.
-        instruction: Text that is published to the controller's input of the name ``instruction`` before its first step.
+        instruction: Text that is published to the controller's input of the name ``instruction``, or to the only one of
+            texts, before its first step.
     """
 
     controller: str
@@ -142,9 +143,11 @@ def run_on_bus(
 
 def _instruct(bus: Bus, controller: Any, topics: Mapping[str, str], text: str) -> None:
     """Publish a text to the input ``instruction``; raises UsageError where the controller has none."""
-    if not any(entry.name == "instruction" and entry.message is String for entry in controller.inputs):
+    texts = [entry.name for entry in controller.inputs if entry.message is String]
+    if "instruction" not in texts and len(texts) != 1:
         raise UsageError("The controller takes no instruction.", "leave --instruction out")
-    bus.publisher(topics["instruction"], String, QoS(reliable=True, latched=True))(String(text))
+    name = "instruction" if "instruction" in texts else texts[0]
+    bus.publisher(topics[name], String, QoS(reliable=True, latched=True))(String(text))
 
 
 def dry_run(plan: RunPlan) -> dict[str, Any]:
