@@ -84,7 +84,9 @@ def test_any_policy_runs_is_reported_and_replayed(vlatool, bundle, bus, joints, 
     found = json.loads(out)
     assert (found["equal"], found["note"], found["steps"] > 15) == (True, "", True)
     (tmp_path / "other.json").write_text('{"settle_s": 0.2}')
-    code, out, err = vlatool("replay", tmp_path / "log", "policy", "--bundle", bundle, "--settings", tmp_path / "other.json")
+    code, out, err = vlatool(
+        "replay", tmp_path / "log", "policy", "--bundle", bundle, "--settings", tmp_path / "other.json"
+    )
     assert code == 1
     assert re.search(r"steps differ, the first is \d+, 'action'", out)
     assert "are not computed again as they were" in err
@@ -116,7 +118,9 @@ def test_dry_run_of_a_controller(vlatool):
 
 def test_flags_count_before_the_file(vlatool, tmp_path):
     (tmp_path / "settings.json").write_text('{"rate": 15, "x_threshold": 0.2}')
-    code, out, _ = vlatool("run", "roi-tracker", "--settings", tmp_path / "settings.json", "--rate", 25, "--dry-run", "--json")
+    code, out, _ = vlatool(
+        "run", "roi-tracker", "--settings", tmp_path / "settings.json", "--rate", 25, "--dry-run", "--json"
+    )
     found = json.loads(out)
     assert (code, found["rate_hz"], found["settings"]["x_threshold"]) == (0, 25, 0.2)
 

@@ -21,7 +21,9 @@ class Feed:
     def __init__(self) -> None:
         self.newest: dict[str, Reading] = {}
 
-    def snapshot(self, time_s: float, stamp_s: float | None = None, requests: Any = (), **messages: Message) -> Snapshot:
+    def snapshot(
+        self, time_s: float, stamp_s: float | None = None, requests: Any = (), **messages: Message
+    ) -> Snapshot:
         for name, message in messages.items():
             count = self.newest[name].sequence + 1 if name in self.newest else 0
             self.newest[name] = Reading(message, time_s, count)

@@ -180,7 +180,7 @@ def test_same_snapshot_same_command():
     before = feed.state
     feed(state=joints([4, 5, 6], at=0.1))
     again = [controller.step(feed.snapshot, before)[0] for _ in range(2)]
-    assert again[0] .status == again[1].status == "acting policy"
+    assert again[0].status == again[1].status == "acting policy"
     assert all((asked["state"] == policy.asked[1]["state"]).all() for asked in policy.asked[2:])
 
 
@@ -211,7 +211,7 @@ def test_policy_that_fails_stops_the_robot():
     feed = Feed(controller_of(Plays(spec_of((CAMERA,), SPEEDS), DeadlineMissed("There is no action within 5 ms."))))
     command = feed(image=picture())
     assert command.status == "stopped: There is no action within 5 ms."
-    assert command.messages["action"][0] .linear.x == 0
+    assert command.messages["action"][0].linear.x == 0
 
 
 def test_rest_of_each_output():
@@ -248,7 +248,10 @@ def edited(path, value):
         (edited("inputs/image/topic", "camera"), "has the topic 'camera'; it begins with a slash"),
         (edited("inputs/image/topic", 5), "has the topic 5"),
         (edited("inputs/image/tpic", "/a"), "has 'tpic'; did you mean 'topic'"),
-        (edited("inputs/image/type", "std_msgs/msg/String"), "has the type 'std_msgs/msg/String'; allowed: sensor_msgs"),
+        (
+            edited("inputs/image/type", "std_msgs/msg/String"),
+            "has the type 'std_msgs/msg/String'; allowed: sensor_msgs",
+        ),
         (edited("inputs/image/type", "acme/msg/X"), "Unknown type of message 'acme/msg/X'"),
         (edited("inputs/image/stale_s", 0), "stale_s is 0; it must be above 0"),
         (edited("inputs/image/stale_s", "x"), "stale_s is 'x'; it must be a number"),

@@ -29,7 +29,9 @@ def first_difference(table: tuple[Rule, ...], steps: int, seed: int) -> str:
     state = monitor.start()
     for count in range(steps):
         time, event = events.next()
-        calls = [Request("emergency", SetBoolRequest(data), number) for number, data in enumerate(event.get("calls", []))]
+        calls = [
+            Request("emergency", SetBoolRequest(data), number) for number, data in enumerate(event.get("calls", []))
+        ]
         command, state = monitor.step(feed.snapshot(time, requests=calls, **to_messages(event)), state)
         level, linear, angular, answers = reference.step(time, event)
         found = (int(state.status.level), *speeds(command, "safe_cmd_vel"))
@@ -75,7 +77,13 @@ def test_a_failure_of_the_monitor_is_an_emergency_and_stays_one():
 
 
 def test_an_obstacle_stops_the_robot_at_the_step_at_which_it_is_seen_and_by_direction_of_travel():
-    for linear, side, stops in ((0.2, 180, True), (-0.2, 180, False), (-0.2, 0, True), (0.2, 0, False), (0.0, 180, False)):
+    for linear, side, stops in (
+        (0.2, 180, True),
+        (-0.2, 180, False),
+        (-0.2, 0, True),
+        (0.2, 0, False),
+        (0.0, 180, False),
+    ):
         feed, monitor = Feed(), SafetyMonitor()
         messages = ready(feed, 0.0, cmd_vel=velocity(linear))
         messages["scan"].ranges[side] = 0.3

@@ -27,7 +27,7 @@ def plan(monkeypatch, request):
     load = registry.load
     monkeypatch.setattr(registry, "load", lambda kind, name: GoTo if name == "go-to" else load(kind, name))
     return RunPlan("go-to", {"rate_hz": 50, "goal_x": 0.05, "goal_y": 0}, bus=f"sim:{request.node.name}", seconds=0.6,
-                   wait_s=0.3)  # fmt: skip
+                   wait_s=0.3, settle_s=0.0)  # fmt: skip
 
 
 @pytest.fixture
@@ -48,7 +48,12 @@ def test_run_moves_the_robot_and_its_log_is_replayed(plan, world, tmp_path):
     result = run_on_bus(plan, on_end=lambda *what: ended.append(what))
     assert world.truth()["x"] == pytest.approx(0.05, abs=0.04)
     found = result.to_dict()
-    assert (found["controller"], found["node"], found["lost_records"], found["failure"]) == ("go-to", "vlatool_go_to", 0, "")
+    assert (found["controller"], found["node"], found["lost_records"], found["failure"]) == (
+        "go-to",
+        "vlatool_go_to",
+        0,
+        "",
+    )
     assert found["steps"] + found["skipped"] >= 25
     assert ended[0][0] is result
     assert ended[0][1].steps == found["steps"]

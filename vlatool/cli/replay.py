@@ -36,6 +36,7 @@ def replay(
     fallback: Annotated[
         Path | None, typer.Option(help="the second bundle that ran; its recorded answers when not given")
     ] = None,
+    node: Annotated[str, typer.Option(help="node of the controller, where a bag has several of its kind")] = "",
     as_json: AsJson = False,
 ) -> None:
     """Compute a recorded run again, and say whether all outputs, actions or commands are bit-equal, or which is not.
@@ -46,7 +47,7 @@ def replay(
     Exits with 1 at a difference.
     """
     if is_controller(what):
-        _replay_controller(file, what, bundle, settings, as_json)
+        _replay_controller(file, what, node, bundle, settings, as_json)
         return
     if bundle is not None or settings is not None:
         raise UsageError(f"--bundle and --settings are for a robot controller, and {what} is a bundle.",
@@ -67,15 +68,17 @@ def is_controller(what: str) -> bool:
     return what.replace("-", "_") in registry.names("controllers") and not Path(what).exists()
 
 
-def _replay_controller(file: Path, name: str, bundle: Path | None, settings: Path | None, as_json: bool) -> None:
-    """Compute the run of a robot controller again."""
+def _replay_controller(
+    file: Path, name: str, node: str, bundle: Path | None, settings: Path | None, as_json: bool
+) -> None:
+    """Compute the run of a robot controller again; its node is named where a bag has several."""
     from vlatool.nodes.launch import PolicyOptions, open_controller
     from vlatool.nodes.recordings import open_recording
     from vlatool.nodes.replay import lines as replay_lines
     from vlatool.nodes.replay import replay as compare
     from vlatool.nodes.settings import read_settings
 
-    recording = open_recording(file, name)
+    recording = open_recording(file, name, node)
     chosen = {**recording.about.settings, **({} if settings is None else read_settings(settings))}
     options = PolicyOptions(bundle, recording.about.robot, deadline_ms=0)
     found = compare(open_controller(name, chosen, options), recording.items(), recording.topics)

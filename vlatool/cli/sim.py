@@ -14,6 +14,7 @@ from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._controllers import flags_of, summary_of, values_of
 from vlatool.cli._document import answer
+from vlatool.cli._signals import stopped_by_signals
 from vlatool.cli._stages import build_command, failing_command
 from vlatool.errors import PluginError, UsageError
 from vlatool.files.printable import printable
@@ -100,7 +101,8 @@ def _simulate(
         sensors, commands = (", ".join(channel.topic for channel in each) for each in (robot.sensors, robot.commands))
         typer.echo(printable(f"{name} reports {sensors} and obeys {commands}"), err=True)
         try:
-            simulated.run(seconds)
+            with stopped_by_signals(simulated.stop):
+                simulated.run(seconds)
         finally:
             found = {"robot": name, **vars(simulated.summary), "truth": dict(robot.truth())}
             simulated.summary.seconds = robot.time_s

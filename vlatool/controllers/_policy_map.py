@@ -109,7 +109,9 @@ def read_inputs(values: Mapping[str, Any], spec: PolicySpec) -> tuple[InputMap, 
     names = [tensor.name for tensor in spec.inputs]
     for name in entries:
         if name not in names:
-            raise UsageError.unknown(f"The map has the input '{name}', which the policy does not take", str(name), names)
+            raise UsageError.unknown(
+                f"The map has the input '{name}', which the policy does not take", str(name), names
+            )
     missing = [tensor.name for tensor in spec.inputs if tensor.name not in entries]
     if missing:
         raise UsageError(f"The map does not say which topic is the input {', '.join(map(repr, missing))}.", PRINT)

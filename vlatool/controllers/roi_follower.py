@@ -116,11 +116,11 @@ class RoiFollower:
         depth, problem = depth_of(snapshot.message("depth", Image))
         distance = self.distance(depth, region) if depth is not None else None
         offset = offset_of(region, camera.width)
-        state = Motion(
-            self.linear(distance, state.linear), self.rotation(offset), snapshot.time_s, target
-        )
+        state = Motion(self.linear(distance, state.linear), self.rotation(offset), snapshot.time_s, target)
         notes = {"offset": offset} if distance is None else {"offset": offset, "distance_m": distance}
-        return self._command(state, "following" if distance is not None else f"turning: {problem or 'no depth'}", notes), state
+        return self._command(
+            state, "following" if distance is not None else f"turning: {problem or 'no depth'}", notes
+        ), state
 
     def distance(self, depth: NDArray[Any], roi: RegionOfInterest) -> float | None:
         """Return the mean depth of the middle of a region, in metres; None where nothing of it is known."""

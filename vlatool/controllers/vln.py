@@ -92,7 +92,9 @@ class Vln:
     @cached_property
     def _observed(self) -> Observed:
         if self.policy is None:
-            raise UsageError("vln has no policy; allowed: one that vlatool.load returned.", "name a bundle: --bundle DIR")
+            raise UsageError(
+                "vln has no policy; allowed: one that vlatool.load returned.", "name a bundle: --bundle DIR"
+            )
         return observed_by(self.policy.spec)
 
     @cached_property

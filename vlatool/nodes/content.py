@@ -37,6 +37,11 @@ def to_text(message: Message) -> str:
     return f"{message.TYPE}={content.hex()}" if len(content) <= MAX_TEXT else f"{message.TYPE}#{digest(message)}"
 
 
+def digest_of(text: str) -> str:
+    """Return the digest of a message that ``to_text`` wrote out."""
+    return digest(from_text(text)) if "=" in text else text.partition("#")[2]
+
+
 def from_text(text: str) -> Message:
     """Return the message that ``to_text`` wrote out.
 

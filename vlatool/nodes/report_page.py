@@ -49,7 +49,9 @@ def _summary(found: Mapping[str, Any], points: Sequence[TracePoint]) -> Iterator
     yield f"It ended with the status: {found['status'] or 'none'}."
     words = Counter((point.status.split() or ["no status"])[0] for point in points)
     if points:
-        yield "Statuses: " + ", ".join(f"{word} {count / len(points):.0%}" for word, count in words.most_common(8)) + "."
+        yield (
+            "Statuses: " + ", ".join(f"{word} {count / len(points):.0%}" for word, count in words.most_common(8)) + "."
+        )
     if found["skipped"]:
         yield f"{amount(found['skipped'], 'step')} left out, because the one before took too long."
     if any(found["overwritten"].values()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -24,6 +25,11 @@ from vlatool.nodes.stepper import check_controller, topics_of
 from vlatool.nodes.trace import Trace
 
 
+SETTLE_S = 0.5
+"""Recorders look for new topics ten times a second (``ros2 bag record``, ``vlatool record``); the first step of a
+controller waits for them, so that a recording begins with it."""
+
+
 @dataclass(frozen=True)
 class RunPlan:
     """What is to run.
@@ -42,6 +48,7 @@ class RunPlan:
         shared: Whether others may publish the controller's outputs, too.
         instruction: Text that is published to the controller's input of the name ``instruction``, or to the only one of
             texts, before its first step.
+        settle_s: Time from the announcement of the node's topics to its first step, in seconds.
     """
 
     controller: str
@@ -56,6 +63,7 @@ class RunPlan:
     report: Path | None = None
     shared: bool = False
     instruction: str = ""
+    settle_s: float = SETTLE_S
 
 
 @dataclass(frozen=True)
@@ -129,8 +137,10 @@ def run_on_bus(
         log = None if plan.record is None else RunLog(plan.record, about)
         background.observe(StepPublisher(bus, about), trace, *([] if log is None else [log]))
         on_start(about)
-        if plan.instruction:
-            _instruct(bus, controller, runner.topics, plan.instruction)
+        say = _instructor(bus, controller, runner.topics) if plan.instruction else None
+        time.sleep(plan.settle_s)
+        if say is not None:
+            say(String(plan.instruction))
         if missing := runner.missing(plan.wait_s):
             warnings.warn(f"nobody publishes {', '.join(missing)} yet; the controller waits for it", stacklevel=2)
         try:
@@ -141,13 +151,13 @@ def run_on_bus(
     return result
 
 
-def _instruct(bus: Bus, controller: Any, topics: Mapping[str, str], text: str) -> None:
-    """Publish a text to the input ``instruction``; raises UsageError where the controller has none."""
+def _instructor(bus: Bus, controller: Any, topics: Mapping[str, str]) -> Callable[[String], None]:
+    """Return what publishes to the controller's instruction; raises UsageError where it has none."""
     texts = [entry.name for entry in controller.inputs if entry.message is String]
     if "instruction" not in texts and len(texts) != 1:
         raise UsageError("The controller takes no instruction.", "leave --instruction out")
     name = "instruction" if "instruction" in texts else texts[0]
-    bus.publisher(topics[name], String, QoS(reliable=True, latched=True))(String(text))
+    return bus.publisher(topics[name], String, QoS(reliable=True, latched=True))
 
 
 def dry_run(plan: RunPlan) -> dict[str, Any]:

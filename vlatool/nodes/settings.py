@@ -77,7 +77,9 @@ def _kind(annotation: Any, where: str) -> tuple[type, bool, bool]:
         return annotation, False, False
     if origin is not None and inspect.isclass(origin) and issubclass(origin, Mapping):
         return Mapping, False, False
-    raise TypeError(f"{where} is {annotation}; a setting is a float, int, bool, str, a tuple of one of these, or a dict")
+    raise TypeError(
+        f"{where} is {annotation}; a setting is a float, int, bool, str, a tuple of one of these, or a dict"
+    )
 
 
 def _arguments(text: str) -> dict[str, str]:

@@ -56,7 +56,9 @@ class WorldNode:
         self._stop = threading.Event()
         self._commands: queue.Queue[tuple[str, Message]] = queue.Queue(MAX_COMMANDS)
         world.reset(seed)
-        self._senders = {channel.topic: bus.publisher(channel.topic, channel.message, QoS()) for channel in world.sensors}
+        self._senders = {
+            channel.topic: bus.publisher(channel.topic, channel.message, QoS()) for channel in world.sensors
+        }
         for channel in world.commands:
             bus.subscribe(channel.topic, channel.message, self._taker(channel.topic), QoS(reliable=True, depth=10))
 

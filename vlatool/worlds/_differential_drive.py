@@ -54,7 +54,11 @@ class DifferentialDrive:
         way = self.linear * seconds * (1.0 + self._bias[0] + noise[0])
         turn = self.angular * seconds * (1.0 + self._bias[1] + noise[1])
         middle = yaw + turn / 2.0
-        self.odometry = (x + way * math.cos(middle), y + way * math.sin(middle), math.remainder(yaw + turn, 2 * math.pi))
+        self.odometry = (
+            x + way * math.cos(middle),
+            y + way * math.sin(middle),
+            math.remainder(yaw + turn, 2 * math.pi),
+        )
 
 
 def _cut(value: float, limit: float) -> float:

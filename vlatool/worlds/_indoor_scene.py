@@ -59,7 +59,11 @@ def draw_scene(size_m: float, counts: dict[str, int], random: np.random.Generato
         if place is not None:
             scene.pits.append(Pit(place[0] - 0.3, place[1] - 0.3, place[0] + 0.3, place[1] + 0.3))
         del index
-    kinds = (("pillar", "pillars", scene.pillars), ("mover", "movers", scene.movers), ("person", "people", scene.movers))
+    kinds = (
+        ("pillar", "pillars", scene.pillars),
+        ("mover", "movers", scene.movers),
+        ("person", "people", scene.movers),
+    )
     for kind, key, group in kinds:
         for index in range(counts[key]):
             radius = {"pillar": random.uniform(0.06, 0.25), "mover": 0.15, "person": 0.2}[kind]

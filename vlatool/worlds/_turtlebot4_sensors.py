@@ -210,6 +210,8 @@ def region_of(
     lower = rows / 2.0 + focal * CAMERA_HEIGHT_M / (ahead + radius)
     x, y = max(0, round(left)), max(0, round(upper))
     width, height = min(columns, round(right)) - x, min(rows, round(lower)) - y
-    return RegionOfInterest(x_offset=x, y_offset=y, width=width, height=height) if min(width, height) > 2 else (
-        RegionOfInterest()
+    return (
+        RegionOfInterest(x_offset=x, y_offset=y, width=width, height=height)
+        if min(width, height) > 2
+        else (RegionOfInterest())
     )

@@ -149,7 +149,12 @@ def collision_episode(name: str, seed: int, hostile: bool, policy: Any, seconds:
             emergencies += 1
             node.requests.append(Request("emergency", SetBoolRequest(False), tick))
     truth = world.truth()
-    return {"collisions": truth["collisions"], "falls": int(truth["fell"]), "metres": driven, "emergencies": emergencies}
+    return {
+        "collisions": truth["collisions"],
+        "falls": int(truth["fell"]),
+        "metres": driven,
+        "emergencies": emergencies,
+    }
 
 
 class Lead:
