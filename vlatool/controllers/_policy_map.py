@@ -147,7 +147,7 @@ KEYS = {
 def _input(tensor: TensorSpec, entry: Any) -> InputMap:
     kind, where = kind_of(tensor), f"The map of the input '{tensor.name}'"
     _check_keys(entry, KEYS[kind], where)
-    shared = {"stale_s": _number(entry.get("stale_s", 0.5), f"{where}: stale_s"), "noisy": bool(entry.get("noisy"))}
+    shared: dict[str, Any] = {"stale_s": _number(entry.get("stale_s", 0.5), f"{where}: stale_s"), "noisy": bool(entry.get("noisy"))}
     if kind == ACTIONS:
         if entry.get("source") != "actions":
             raise UsageError(f"{where} is {entry!r:.60}; it holds past actions.", "write source: actions")

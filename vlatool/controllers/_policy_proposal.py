@@ -54,9 +54,9 @@ def _input(tensor: TensorSpec, cameras: Sequence[str]) -> dict[str, Any]:
 
 def _output(action: TensorSpec) -> dict[str, Any]:
     if action.kind == "discrete":
-        labels = {label: next((move for word, move in MOTIONS.items() if word in label.lower()), {})
-                  for label in action.labels}  # fmt: skip
-        return {"topic": "/cmd_vel", "type": Twist.TYPE, "labels": {name: dict(move) for name, move in labels.items()}}
+        moves = {label: next((move for word, move in MOTIONS.items() if word in label.lower()), {})
+                 for label in action.labels}  # fmt: skip
+        return {"topic": "/cmd_vel", "type": Twist.TYPE, "labels": {name: dict(move) for name, move in moves.items()}}
     labels = action.labels or tuple(map(str, range(action.robot_width)))
     paths = [_path(label) for label in labels]
     if action.mode == "velocity" and all(paths) and len(set(paths)) == len(paths):

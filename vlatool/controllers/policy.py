@@ -169,7 +169,8 @@ class Policy:
     def _act(self, observation: Mapping[str, Any]) -> Array:
         if hasattr(self.policy, "act"):
             return np.asarray(self.policy.act(observation))
-        return np.asarray(self.policy.infer(observation).chunk)[0]
+        chunk: Array = np.asarray(self.policy.infer(observation).chunk)
+        return np.asarray(chunk[0])
 
     def _stop(self, snapshot: Snapshot, why: str) -> Command:
         try:
