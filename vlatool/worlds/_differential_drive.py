@@ -49,7 +49,7 @@ class DifferentialDrive:
         linear, angular = (0.0, 0.0) if now_s - self._commanded_s >= self.silence_s else self._target
         self.linear += _cut(linear - self.linear, self.linear_rate * seconds)
         self.angular += _cut(angular - self.angular, self.angular_rate * seconds)
-        noise = self.random.normal(0.0, self.slip, 2) if self.slip else (0.0, 0.0)
+        noise = [float(value) for value in self.random.normal(0.0, self.slip, 2)]
         x, y, yaw = self.odometry
         way = self.linear * seconds * (1.0 + self._bias[0] + noise[0])
         turn = self.angular * seconds * (1.0 + self._bias[1] + noise[1])
