@@ -10,12 +10,13 @@ import pytest
 
 from tests._point_robot import GoTo, PointWorld
 from vlatool.errors import OutputError
+from vlatool.nodes import trace as trace_module
 from vlatool.nodes.in_world import play
 from vlatool.nodes.report_page import page, write_page
 from vlatool.nodes.runner import RunSummary
 from vlatool.nodes.session import RunResult
 from vlatool.nodes.step_record import ControllerRecord
-from vlatool.nodes.trace import MAX_POINTS, Trace, phases
+from vlatool.nodes.trace import Trace, phases
 
 ABOUT = ControllerRecord("go-to", {"goal_x": 1.0}, {"odom": "/odom"}, "vlatool_go_to", version="1")
 
@@ -63,10 +64,11 @@ def test_phases_join_steps_with_the_same_word(run):
     assert [word for _, _, word in phases(trace.points, "level")] == ["normal"]
 
 
-def test_long_runs_are_thinned(run):
-    _, trace = run
+def test_long_runs_are_thinned(monkeypatch):
+    monkeypatch.setattr(trace_module, "MAX_POINTS", 200)
     report = play(PointWorld(), [GoTo()], seconds=0.1).steps[0][0]
     long = Trace()
-    for _ in range(2 * MAX_POINTS + 10):
+    for _ in range(410):
         long(report)
-    assert MAX_POINTS / 2 < len(long.points) <= MAX_POINTS + 1
+    assert 100 < len(long.points) <= 201
+    assert long.steps == 410

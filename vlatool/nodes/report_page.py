@@ -16,7 +16,8 @@ from vlatool.nodes.trace import Trace, TracePoint, phases
 from vlatool.render.charts.run import bands, over_time, path_from_above
 from vlatool.render.charts.svg import Canvas
 
-WIDE, NARROW = 996, 366
+WIDTHS = (996, 366)
+"""Pixels of a drawing on a wide page and on a narrow one."""
 STYLE = Path(__file__).parent.parent / "render/formats/page.css"
 MAX_LINES = 6
 """Notes and inputs of which a line is drawn, each in a panel of its own kind."""
@@ -69,13 +70,13 @@ def _sections(points: Sequence[TracePoint]) -> Iterator[str]:
     if path:
         marks = list(_changes(points))
         yield _section("Path from above", "The ring is the start, the dot the end; circles are changes of the status.",
-                       [path_from_above(path, marks, width) for width in (WIDE, NARROW)])  # fmt: skip
+                       [path_from_above(path, marks, width) for width in WIDTHS])  # fmt: skip
     rows = {"status": list(phases(list(points)))}
     rows |= {key: list(phases(list(points), key)) for key in _state_notes(points)}
     yield _section("Statuses and levels", "What held when; the first word of a status.",
-                   [bands(rows, points[-1].time_s, width) for width in (WIDE, NARROW)])  # fmt: skip
+                   [bands(rows, points[-1].time_s, width) for width in WIDTHS])  # fmt: skip
     panels = _panels(points)
-    yield _section("Latencies and speeds", "Of each step.", [over_time(panels, width) for width in (WIDE, NARROW)])
+    yield _section("Latencies and speeds", "Of each step.", [over_time(panels, width) for width in WIDTHS])
 
 
 def _changes(points: Sequence[TracePoint]) -> Iterator[tuple[float, float, str]]:

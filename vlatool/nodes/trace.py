@@ -79,9 +79,9 @@ def _position(snapshot: Snapshot) -> tuple[float, float] | None:
         message = reading.message
         pose = message.pose.pose if isinstance(message, Odometry) else getattr(message, "pose", None)
         if isinstance(message, Odometry | PoseStamped) and pose is not None:
-            place = pose.position
-            if math.isfinite(place.x) and math.isfinite(place.y):
-                return place.x, place.y
+            x, y = pose.position.x, pose.position.y
+            if math.isfinite(x) and math.isfinite(y):
+                return x, y
     return None
 
 

@@ -112,11 +112,11 @@ class WorldNode:
             self.summary.commands += 1
         self.world.advance(TICK_S)
         for topic, message in self.world.reports():
-            self._senders[topic](stamped(message, epoch_s))
+            self._senders[topic](restamp(message, epoch_s))
             self.summary.reports += 1
 
 
-def stamped(message: Any, epoch_s: float) -> Any:
+def restamp(message: Any, epoch_s: float) -> Any:
     """Return a message whose stamp, in simulated seconds, is that many seconds later: by the clock of the bus."""
     header = getattr(message, "header", None)
     if header is None:
