@@ -23,7 +23,7 @@ from vlatool.nodes.runner import Runner, RunSummary
 from vlatool.nodes.settings import to_plain
 from vlatool.nodes.step_record import ControllerRecord
 from vlatool.nodes.stepper import check_controller, topics_of
-from vlatool.nodes.trace import Trace
+from vlatool.nodes.trace import Trace, watch_levels
 
 SETTLE_S = 0.5
 """Recorders look for new topics ten times a second (``ros2 bag record``, ``vlatool record``); the first step of a
@@ -135,6 +135,8 @@ def run_on_bus(
         runner = Runner(controller, bus, topics=plan.topics, observers=[background], alone=not plan.shared)
         about = record_of(plan.controller, controller, node, runner.topics, plan.policy)
         log = None if plan.record is None else RunLog(plan.record, about)
+        if plan.report is not None:
+            watch_levels(bus, trace)
         background.observe(StepPublisher(bus, about), trace, *([] if log is None else [log]))
         on_start(about)
         say = _instructor(bus, controller, runner.topics, required=bool(plan.instruction))
