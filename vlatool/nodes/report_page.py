@@ -125,7 +125,9 @@ def _panels(points: Sequence[TracePoint]) -> dict[str, dict[str, list[tuple[floa
             "late": line((point.time_s, point.late_ms) for point in points),
         }
     }
-    inputs = list(dict.fromkeys(name for point in points for name in point.ages_ms))[:MAX_LINES]
+    half_ms = points[-1].time_s * 500
+    inputs = list(dict.fromkeys(name for point in points for name in point.ages_ms if point.ages_ms[name] <= half_ms))
+    inputs = [name for name in inputs if points[-1].ages_ms.get(name, 0.0) <= half_ms][:MAX_LINES]
     if inputs:
         panels["age of the newest message, ms"] = {
             name: line((point.time_s, point.ages_ms.get(name)) for point in points) for name in inputs
