@@ -2,10 +2,10 @@
 
     python tests/validation/soak/messages_fuzz.py --mutants 1000000
 
-Random messages of every type in CDR of both byte orders and in ROS 1's encoding are cut, extended and changed in bits,
-bytes and lengths (2^31 and others) as in ``tests/_malformed.py``. What is accepted is encoded and decoded again and must
-be the same message. The process may take 512 MB more than at its start; more is a MemoryError, which counts as a crash.
-Prints how many were accepted and refused, and the memory; exit code 1 after a crash.
+Random messages of every type, in CDR of both byte orders and in ROS 1's encoding, are cut, extended and changed in
+bits, bytes and lengths (2^31 and others) as in ``tests/_malformed.py``. What is accepted is encoded and decoded again,
+and must be the same message. The process may take 512 MB more than at its start; more is a MemoryError, which counts as
+a crash. Prints how many were accepted and refused, and the memory; exit code 1 after a crash.
 """
 
 from __future__ import annotations
