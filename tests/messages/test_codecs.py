@@ -12,6 +12,7 @@ from _messages import Drawer, as_rosbags, in_ros1, ros1_store, ros2_store, witho
 
 from vlatool.errors import BusError
 from vlatool.messages import Message, all_types, cdr, ros1, same
+from vlatool.messages._members import members
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.geometry_msgs import Point, Twist, Vector3
 from vlatool.messages.sensor_msgs import CameraInfo, Image, JointState, LaserScan, PointCloud2, PointField
@@ -83,6 +84,41 @@ def test_wrong_value_is_named(codec: ModuleType, message: Message, problem: str)
     assert caught.value.fix
     with pytest.raises(BusError):
         codec.encode_parts(message)
+
+
+class Troublesome:
+    """A value that fails when it is read as a number or as an integer."""
+
+    def __float__(self) -> float:
+        raise ValueError("not now")
+
+    __index__ = __float__
+
+
+ODD = (
+    None, "x", b"x", -1, 2**70, 1.5, float("nan"), True, (), [], (1,), ["a", 2], ("a", "\ud800"), {}, object(), 1j,
+    Twist, Twist(), PointField(), Troublesome(), np.zeros(3), np.zeros((3, 3)), np.zeros(9, np.float32), np.zeros(36),
+    np.zeros(4, np.uint8), np.zeros(3, object), np.array(["a"]), np.float32(2.0), np.array(3.0), np.zeros(12)[::2],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("codec", [cdr, ros1], ids=["cdr", "ros1"])
+def test_any_value_is_encoded_or_named(codec: ModuleType) -> None:
+    """Each odd value in each field of each type: its bytes are read again, or the error names the field."""
+    refused = unnamed = 0
+    for cls in all_types():
+        for member in members(cls):
+            for value in ODD:
+                message = cls(**{member.attribute: value})
+                try:
+                    encoded = codec.encode(message)
+                except BusError as error:
+                    refused += 1
+                    unnamed += not error.message.startswith(f"{cls.TYPE}: {member.attribute}") or not error.fix
+                else:
+                    codec.decode(cls, encoded)
+    assert refused > 2000
+    assert not unnamed
 
 
 def test_values_of_numpy_and_python_that_fit() -> None:

@@ -12,7 +12,7 @@ from vlatool.errors import UsageError
 from vlatool.messages import all_types, find_type, same
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.geometry_msgs import Twist, Vector3
-from vlatool.messages.sensor_msgs import Image, LaserScan
+from vlatool.messages.sensor_msgs import Image, JointState, LaserScan
 
 
 def test_found_by_both_names() -> None:
@@ -47,6 +47,8 @@ def test_unknown_type_names_the_nearest() -> None:
 def test_equal_bit_for_bit() -> None:
     assert same(Twist(linear=Vector3(x=float("nan"))), Twist(linear=Vector3(x=float("nan"))))
     assert not same(Twist(), Twist(linear=Vector3(x=1e-300)))
+    assert not same(Twist(), Twist(linear=Vector3(x=-0.0)))
+    assert not same(JointState(name=("a",)), JointState(name=("a", "b")))
     assert same(Image(), Image())
     assert not same(Image(data=np.zeros(3, np.uint8)), Image(data=np.zeros(4, np.uint8)))
     assert not same(LaserScan(ranges=np.zeros(2, np.float32)), LaserScan(ranges=np.zeros(2)))

@@ -76,7 +76,7 @@ class Plan:
         """Append the bytes of a message, which begin at ``position``; return where they end.
 
         Raises:
-            WrongValue, struct.error, AttributeError, OverflowError, UnicodeEncodeError: for a value that does not fit;
+            ValueError, struct.error, AttributeError, TypeError, OverflowError: for a value that does not fit its field;
                 ``_wrong_values.explain`` says which.
         """
         if message.__class__ is not self.cls or self._get_classes(message) != self._classes:
