@@ -19,8 +19,8 @@ from vlatool.errors import BusError, MissingExtra
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 
-BUFFER_BYTES = 1 << 22
-"""What is read from a connection at a time: room for a camera image, so that an old one gives way to a new one."""
+BUFFER_BYTES = 1 << 18
+"""What is read from a connection at a time: a small camera image."""
 FLUSH_S = 0.5
 LINGER_S = 0.02
 """Time that is left to the threads of rospy to write what they took from their queues, in seconds."""

@@ -10,11 +10,11 @@ import sys
 import time
 from pathlib import Path
 
-DEBS = (
-    "catkin rospy rosmaster rosbag roslaunch rosgraph rosgraph-msgs roslib roslz4 rosparam rosclean roscpp-msg genmsg genpy "
-    "std-msgs std-srvs geometry-msgs sensor-msgs nav-msgs actionlib actionlib-msgs rosservice rostopic rosnode rosmsg "
-    "diagnostic-msgs trajectory-msgs visualization-msgs tf2-msgs"
-).split()
+DEBS = """
+catkin rospy rosmaster rosbag roslaunch rosgraph rosgraph-msgs roslib roslz4 rosparam rosclean roscpp-msg genmsg genpy
+std-msgs std-srvs geometry-msgs sensor-msgs nav-msgs actionlib actionlib-msgs rosservice rostopic rosnode rosmsg
+diagnostic-msgs trajectory-msgs visualization-msgs tf2-msgs
+""".split()  # noqa: SIM905
 PIP = ("pyyaml", "rospkg", "catkin_pkg", "netifaces", "defusedxml", "pycryptodomex", "python-gnupg")
 MODULES = "usr/lib/python3/dist-packages"
 ROOT = Path(__file__).resolve().parents[3]

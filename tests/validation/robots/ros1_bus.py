@@ -129,8 +129,8 @@ def services(bus: Any, rows: Rows) -> None:
     bus.serve("/our_fails", SetBoolRequest, SetBoolResponse, fail)
     with Peer("call") as peer:
         found = peer.read()
-    rows.append(("SetBool of ours, called by rospy", "both answers",
-                 found["answers"] == [[True, "ours ü"], [False, "ours ü"]] and "motor is hot" in found["failure"]))  # fmt: skip
+    right = found["answers"] == [[True, "ours ü"], [False, "ours ü"]] and "motor is hot" in found["failure"]
+    rows.append(("SetBool of ours, called by rospy", "both answers", right))
     for name, word in (("/peer_fails", "failed"), ("/nobody", "Nobody"), ("/peer_late", "no answer")):
         refused(rows, f"call of {name}", BusError, word, lambda name=name: bus.call(
             name, SetBoolRequest(), SetBoolResponse, 1.0))  # fmt: skip
@@ -264,7 +264,8 @@ def ends(master: Master, rows: Rows) -> None:
             ("a second bus in a process", "open_bus(f'ros1', 'third')"),
             ("publishing after close()", "bus.close(); send(Twist())"),
         ):
-            code = f"{begin}from vlatool.errors import BusError\ntry:\n    {attempt}\nexcept BusError as error:\n    print(error.message)\n"
+            caught = f"try:\n    {attempt}\nexcept BusError as error:\n    print(error.message)\n"
+            code = f"{begin}from vlatool.errors import BusError\n{caught}"
             said = subprocess.run(
                 [sys.executable, "-c", code], timeout=20, check=True, capture_output=True, text=True
             ).stdout
