@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from vlatool.buses._interface import M, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, resolve
+from vlatool.buses._resolved import check_node, resolve
 from vlatool.buses._ros1_master import Master, ask, is_loopback, master_uri
 from vlatool.buses._rospy_types import carrier, service_class
 from vlatool.errors import BusError, MissingExtra

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from vlatool.buses._interface import ActionType, Goal, M, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, resolve
+from vlatool.buses._resolved import check_node, resolve
 from vlatool.buses._rclpy_actions import ClientGoal, serve_action
 from vlatool.buses._rclpy_messages import from_ros, generated, to_ros
 from vlatool.errors import BusError, MissingExtra, UsageError
