@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
+from vlatool.errors import BusError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.registry import load
@@ -63,6 +64,20 @@ class TopicInfo:
     subscribers: tuple[str, ...] = ()
 
 
+class Fault(NamedTuple):
+    """What went wrong on a topic or a service while its messages were handled.
+
+    Args:
+        topic: The topic or service.
+        count: How often something went wrong there.
+        error: The latest error.
+    """
+
+    topic: str
+    count: int
+    error: BusError
+
+
 @runtime_checkable
 class Bus(Protocol):
     """A connection of one node to a bus; the class in ``vlatool/buses/NAME.py`` is built as ``NAME(address, node)``."""
@@ -89,6 +104,13 @@ class Bus(Protocol):
 
     def topics(self) -> list[TopicInfo]:
         """Return what is on the bus now, this node's own included, sorted by name."""
+
+    def faults(self) -> list[Fault]:
+        """Return what went wrong so far, one entry for each topic or service, sorted by name.
+
+        Malformed messages, errors that handlers raise, and another type that appears on a topic later are counted
+        here; none of them stops the bus.
+        """
 
     def stamp(self) -> Time:
         """Return the moment by the clock that stamps this bus's messages."""
