@@ -179,9 +179,7 @@ def test_a_latched_message_reaches_who_comes_later(node: Nodes) -> None:
     assert same(inbox.wait(1)[0], String("walls"))
 
 
-def test_a_malformed_message_and_a_failing_handler_end_nothing(node: Nodes, monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    monkeypatch.setattr(threading, "excepthook", lambda raised: said.append(str(raised.exc_value)))
+def test_a_malformed_message_and_a_failing_handler_end_nothing(node: Nodes) -> None:
     robot, controller, inbox = node("robot"), node("controller"), Inbox()
 
     def handle(reception: Reception) -> None:
@@ -196,14 +194,15 @@ def test_a_malformed_message_and_a_failing_handler_end_nothing(node: Nodes, monk
     inbox.wait(2)
     robot.close()
     controller.close()
-    assert (controller.malformed, said) == ({"/say": 1}, ["no", "no"])
+    (fault,) = controller.faults()
+    assert (fault.topic, fault.count) == ("/say", 3)
+    assert fault.error.message == "The handler of /say raised ValueError: no."
     for attempt in (lambda: send(String()), lambda: robot.topics(), lambda: robot.serve_action("/a", KIND, print)):  # type: ignore[arg-type]
         with pytest.raises(BusError, match="has left the bus"):
             attempt()
 
 
-def test_a_service_is_answered_while_topics_are_heard(node: Nodes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threading, "excepthook", lambda raised: None)
+def test_a_service_is_answered_while_topics_are_heard(node: Nodes) -> None:
     robot, monitor, inbox = node("robot"), node("monitor"), Inbox()
     go_on = threading.Event()
     monitor.subscribe("/say", String, inbox.put, QoS())
@@ -223,6 +222,7 @@ def test_a_service_is_answered_while_topics_are_heard(node: Nodes, monkeypatch: 
         robot.call("/set", SetBoolRequest(False), SetBoolResponse, 0.05)
     go_on.set()
     assert same(robot.call("/set", SetBoolRequest(False), SetBoolResponse, WAIT_S), SetBoolResponse())
+    assert [(each.topic, each.count) for each in monitor.faults()] == [("/set", 2)]
     with pytest.raises(BusError, match=r"Nobody has served /none within 0\.01 s"):
         robot.call("/none", SetBoolRequest(), SetBoolResponse, 0.01)
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from vlatool.buses._bag_reader import BagReader, Recorded
 from vlatool.buses._bag_writer import BagWriter
-from vlatool.buses._interface import M, QoS, Reception, TopicInfo
+from vlatool.buses._faults import Faults
+from vlatool.buses._interface import Fault, M, QoS, Reception, TopicInfo
 from vlatool.buses._resolved import check_node, resolve
 from vlatool.errors import BusError, UsageError
 from vlatool.messages import Message
@@ -58,6 +59,7 @@ class Bag:
         self._began_s: float | None = None
         self._time_ns: int | None = None
         self._failure: Exception | None = None
+        self._faults = Faults()
 
     @property
     def duration_s(self) -> float:
@@ -103,6 +105,10 @@ class Bag:
             TopicInfo(name, types[name], own if name in self._published else (), own if name in self._handlers else ())
             for name in sorted(types)
         ]
+
+    def faults(self) -> list[Fault]:
+        """See ``Bus.faults``; a damaged recording is not among them: ``close`` raises it."""
+        return self._faults.listing()
 
     def stamp(self) -> Time:
         """Return the recorded time of this moment; without a recording, that of the system's clock."""
@@ -219,8 +225,11 @@ class Bag:
                 if self._closed.wait(max(0.0, wait_s)) if wait_s > 0 else self._closed.is_set():
                     return
                 for handler in tuple(self._handlers[topic]):
-                    handler(Reception(message, time.monotonic()))
-        except Exception as error:  # the recording is damaged, or a handler failed
+                    try:
+                        handler(Reception(message, time.monotonic()))
+                    except Exception as error:
+                        self._faults.add_raised(topic, error)
+        except BusError as error:  # the recording is damaged
             self._failure = error
         finally:
             self.ended.set()

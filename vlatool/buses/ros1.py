@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import logging
 import os
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
-from vlatool.buses._interface import M, QoS, Reception, TopicInfo
+from vlatool.buses._faults import Faults
+from vlatool.buses._interface import Fault, M, QoS, Reception, TopicInfo
 from vlatool.buses._resolved import check_node, resolve
 from vlatool.buses._ros1_master import Master, ask, is_loopback, master_uri
 from vlatool.buses._rospy_types import carrier, service_class
@@ -49,8 +49,7 @@ class Ros1:
         if not _used.acquire(blocking=False):
             raise BusError("A second node of ROS 1 was opened in this process.", RESTART)
         self._rospy: Any = rospy
-        self.malformed: dict[str, int] = {}
-        """Topic -> messages that came and could not be read."""
+        self._faults = Faults()
         self._closed = threading.Event()
         self._kinds: dict[str, type[Message]] = {}
         self._publishers: dict[str, Any] = {}
@@ -83,10 +82,13 @@ class Ros1:
         def receive(got: Any) -> None:
             received_s = time.monotonic()
             if got.content is None:
-                self._count_malformed(name, message)
+                self._faults.add(name, _malformed(name, message))
                 return
-            with one_at_a_time:
-                handler(Reception(got.content, received_s))
+            try:
+                with one_at_a_time:
+                    handler(Reception(got.content, received_s))
+            except Exception as error:  # rospy would print it, once for each message
+                self._faults.add_raised(name, error)
 
         self._subscribers[name] = self._rospy.Subscriber(
             name, carrier(message), receive, queue_size=max(1, qos.depth), buff_size=BUFFER_BYTES, tcp_nodelay=True
@@ -119,6 +121,7 @@ class Ros1:
             try:
                 return kind._response_class(handler(got.content))
             except Exception as error:
+                self._faults.add_raised(name, error)
                 raise self._rospy.ServiceException(str(error)) from error
 
         self._rospy.Service(name, kind, answer)
@@ -162,6 +165,10 @@ class Ros1:
             BusError: when the master does not answer.
         """
         return self._master.topics()
+
+    def faults(self) -> list[Fault]:
+        """See ``Bus.faults``."""
+        return self._faults.listing()
 
     def stamp(self) -> Time:
         """Return ROS time: that of the system's clock, or that of ``/clock`` where ``/use_sim_time`` is set."""
@@ -221,11 +228,6 @@ class Ros1:
     def _why_over(self) -> str:
         return "it was closed" if self._closed.is_set() else "another node of the same name took its place"
 
-    def _count_malformed(self, name: str, message: type[Message]) -> None:
-        self.malformed[name] = self.malformed.get(name, 0) + 1
-        if self.malformed[name] == 1:
-            logging.getLogger(__name__).warning("A message on %s is no %s; such are left out.", name, message.TYPE)
-
     def _watch(self) -> None:
         """End the node when the main thread has, and register again at a master that was started anew."""
         looks = 0
@@ -249,6 +251,10 @@ class Ros1:
             ask(own, "publisherUpdate", "/master", name, present or [])
         for name, uri in registration.get_service_manager().get_services():
             self._master.ask("registerService", name, uri, own)
+
+
+def _malformed(name: str, message: type[Message]) -> BusError:
+    return BusError(f"A message on {name} is no {message.TYPE}, although its MD5 sum is.", "see what its node sends")
 
 
 def _is_waiting(publisher: Any) -> bool:

@@ -7,17 +7,16 @@ documented interface. The buses ``dds`` and ``zenoh`` speak with ROS 2 nodes wit
 from __future__ import annotations
 
 import importlib
-import logging
-import sys
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
-from vlatool.buses._interface import ActionType, Goal, M, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._resolved import check_node, resolve
+from vlatool.buses._faults import Faults
+from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
 from vlatool.buses._rclpy_actions import ClientGoal, serve_action
 from vlatool.buses._rclpy_messages import from_ros, generated, to_ros
+from vlatool.buses._resolved import check_node, resolve
 from vlatool.errors import BusError, MissingExtra, UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -41,8 +40,7 @@ class Ros2:
             raise UsageError(f"'{address}' is no domain of ROS 2; a number from 0 to {MAX_DOMAIN} is.", "write ros2:0")
         rclpy = _rclpy("rclpy")
         self._qos = _rclpy("rclpy.qos")
-        self.malformed: dict[str, int] = {}
-        """Topic -> messages that came and could not be converted."""
+        self._faults = Faults()
         self._context = _rclpy("rclpy.context").Context()
         signals = _rclpy("rclpy.signals").SignalHandlerOptions.NO
         domain = int(address) if address else None
@@ -68,14 +66,9 @@ class Ros2:
         def receive(theirs: Any) -> None:
             received_s = time.monotonic()
             try:
-                content = from_ros(message, theirs)
-            except BusError as error:
-                self._count_malformed(name, error)
-                return
-            try:
-                handler(Reception(content, received_s))
-            except Exception:  # it would end the executor, and with it every other subscription
-                threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
+                handler(Reception(from_ros(message, theirs), received_s))
+            except Exception as error:  # it would end the executor, and with it every other subscription
+                self._faults.add_raised(name, error)
 
         self._node.create_subscription(generated(message.TYPE), name, receive, self._profile(qos))
         self._subscriptions[name] = self._subscriptions.get(name, 0) + 1
@@ -101,11 +94,16 @@ class Ros2:
 
         async def answer(theirs: Any, empty: Any) -> Any:
             future = self._future()
-            threading.Thread(
-                target=_run_into, args=(future, lambda: to_ros(handler(from_ros(request, theirs)))), daemon=True
-            ).start()
-            answered = await future
-            return empty if answered is None else answered
+
+            def work() -> None:
+                try:
+                    future.set_result(to_ros(handler(from_ros(request, theirs))))
+                except Exception as error:  # the client gets an empty response
+                    self._faults.add_raised(name, error)
+                    future.set_result(empty)
+
+            threading.Thread(target=work, name=f"ros2 {name}", daemon=True).start()
+            return await future
 
         self._node.create_service(kind, name, answer)
 
@@ -155,6 +153,10 @@ class Ros2:
                 TopicInfo(name, tuple(types), tuple(map(_full_name, publishers)), tuple(map(_full_name, subscribers)))
             )
         return found
+
+    def faults(self) -> list[Fault]:
+        """See ``Bus.faults``."""
+        return self._faults.listing()
 
     def stamp(self) -> Time:
         """Return ROS time: that of the system's clock, or of ``/clock`` where ``use_sim_time`` is set."""
@@ -220,25 +222,10 @@ class Ros2:
         if self._closed or not self._context.ok():
             raise BusError(f"The node {self.node} has left the bus.", "open the bus again")
 
-    def _count_malformed(self, name: str, error: BusError) -> None:
-        self.malformed[name] = self.malformed.get(name, 0) + 1
-        if self.malformed[name] == 1:
-            logging.getLogger(__name__).warning("Messages on %s are left out. %s", name, error.message)
-
 
 def _service(request: type[Message]) -> Any:
     """Return the generated class of a service, by that of its requests."""
     return generated(request.TYPE.removesuffix("_Request"))
-
-
-def _run_into(future: Any, work: Callable[[], Any]) -> None:
-    """Set the result of a future; None where the work fails, which is printed."""
-    try:
-        found = work()
-    except Exception:
-        threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
-        found = None
-    future.set_result(found)
 
 
 def _full_name(end: Any) -> str:
