@@ -64,7 +64,8 @@ class TopicInfo:
     subscribers: tuple[str, ...] = ()
 
 
-class Fault(NamedTuple):
+@dataclass(frozen=True)
+class Fault:
     """What went wrong on a topic or a service while its messages were handled.
 
     Args:
