@@ -159,7 +159,8 @@ def ask(uri: str, method: str, *arguments: Any, timeout_s: float = TIMEOUT_S) ->
 
 
 def _reason(error: Exception) -> str:
-    return (getattr(error, "strerror", None) or str(error) or type(error).__name__).rstrip(".").lower()
+    words = " ".join((getattr(error, "strerror", None) or str(error)).split())[:100]
+    return words.rstrip(".").lower() or type(error).__name__
 
 
 def _types(name: str) -> tuple[str, ...]:

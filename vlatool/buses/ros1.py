@@ -11,10 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 from vlatool.buses._faults import Faults
-from vlatool.buses._interface import Fault, M, QoS, Reception, TopicInfo
+from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
 from vlatool.buses._resolved import check_node, resolve
 from vlatool.buses._ros1_master import Master, ask, is_loopback, master_uri
 from vlatool.buses._rospy_types import carrier, service_class
+from vlatool.buses._topic_actions import TopicActionClient, TopicActionServer, TopicGoal
 from vlatool.errors import BusError, MissingExtra
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -50,6 +51,8 @@ class Ros1:
             raise BusError("A second node of ROS 1 was opened in this process.", RESTART)
         self._rospy: Any = rospy
         self._faults = Faults()
+        self._actions: list[TopicActionServer] = []
+        self._action_clients: dict[str, TopicActionClient] = {}
         self._closed = threading.Event()
         self._kinds: dict[str, type[Message]] = {}
         self._publishers: dict[str, Any] = {}
@@ -158,6 +161,19 @@ class Ros1:
         found: M = answers[0].content
         return found
 
+    def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
+        """See ``ActionBus.serve_action``; the action is one of actionlib, whose topics are below its name."""
+        self._actions.append(TopicActionServer(self, self._resolved(action), kind, handler))
+
+    def send_goal(
+        self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
+    ) -> TopicGoal:
+        """See ``ActionBus.send_goal``."""
+        name = self._resolved(action)
+        if name not in self._action_clients:
+            self._action_clients[name] = TopicActionClient(self, self.node, name, kind)
+        return self._action_clients[name].send(goal, feedback)
+
     def topics(self) -> list[TopicInfo]:
         """See ``Bus.topics``; of each topic the master knows one type, that of its last publisher.
 
@@ -186,6 +202,8 @@ class Ros1:
         """See ``Bus.close``; what waits is written within half a second, and the master forgets this node."""
         if self._closed.is_set():
             return
+        for server in self._actions:
+            server.close()
         self._closed.set()
         until = time.monotonic() + FLUSH_S
         while any(map(_is_waiting, self._publishers.values())) and time.monotonic() < until:
