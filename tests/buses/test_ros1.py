@@ -116,7 +116,7 @@ def test_a_living_node_of_the_same_name_and_a_second_server_are_refused(master: 
 
 def test_what_is_no_master_is_told_at_once(master: Master) -> None:
     for method in ("odd", "absent"):
-        with pytest.raises(BusError, match=r"What answers at .* is no ROS 1 master"):
+        with pytest.raises(BusError, match=r"What answers at .* is not a ROS 1 master"):
             master.ask(method)
     with socket.create_server(("127.0.0.1", 0)) as mute:
         uri = f"http://127.0.0.1:{mute.getsockname()[1]}"

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from vlatool.buses import (
-    ABORTED,
-    CANCELED,
-    SUCCEEDED,
+    GOAL_ABORTED,
+    GOAL_CANCELED,
+    GOAL_SUCCEEDED,
     ActionBus,
     ActionType,
     Goal,
@@ -236,28 +236,28 @@ def test_an_action_reports_ends_and_is_canceled(node: Nodes) -> None:
         goal.feedback(RunInstructionFeedback(goal.message.instruction, 0.5))
         began.release()
         if goal.message.instruction == "go":
-            return Outcome(SUCCEEDED, RunInstructionResult(True, "there"))
+            return Outcome(GOAL_SUCCEEDED, RunInstructionResult(True, "there"))
         assert goal.canceled.wait(WAIT_S)
-        return Outcome(CANCELED, RunInstructionResult(False, "halfway"))
+        return Outcome(GOAL_CANCELED, RunInstructionResult(False, "halfway"))
 
     with pytest.raises(BusError, match="Nobody serves the action /run"):
         client.send_goal("/run", KIND, RunInstructionGoal())
     robot.serve_action("/run", KIND, run)
     said: list[Message] = []
     outcome = client.send_goal("/run", KIND, RunInstructionGoal("go", 9.0), said.append).result(WAIT_S)
-    assert (outcome.status, same(outcome.result, RunInstructionResult(True, "there"))) == (SUCCEEDED, True)
+    assert (outcome.status, same(outcome.result, RunInstructionResult(True, "there"))) == (GOAL_SUCCEEDED, True)
     assert same(said[0], RunInstructionFeedback("go", 0.5))
     asked, replaced = (client.send_goal("/run", KIND, RunInstructionGoal(word)) for word in ("stay", "wait"))
-    assert asked.result(WAIT_S).status == ABORTED
+    assert asked.result(WAIT_S).status == GOAL_ABORTED
     replaced.cancel()
-    assert replaced.result(WAIT_S).status == CANCELED
+    assert replaced.result(WAIT_S).status == GOAL_CANCELED
     with pytest.raises(BusError, match="no result within 0 s"):
         client.send_goal("/run", KIND, RunInstructionGoal("stay")).result(0.0)
 
 
 @pytest.mark.parametrize("address", ["233", "-1", "x", "1.5", "٣"])
 def test_an_impossible_domain_is_refused(address: str) -> None:
-    with pytest.raises(UsageError, match="is no domain of ROS 2; a number from 0 to 232 is"):
+    with pytest.raises(UsageError, match="is not a domain of ROS 2, which is a number from 0 to 232"):
         open_bus(f"ros2:{address}", "node")
 
 

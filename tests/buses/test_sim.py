@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from vlatool.buses import (
-    ABORTED,
-    CANCELED,
-    SUCCEEDED,
+    GOAL_ABORTED,
+    GOAL_CANCELED,
+    GOAL_SUCCEEDED,
     ActionBus,
     ActionType,
     Bus,
@@ -244,12 +244,12 @@ def test_an_action_reports_and_ends(node: Nodes) -> None:
         assert isinstance(goal.message, String)
         for word in goal.message.data.split():
             goal.feedback(String(word))
-        return Outcome(SUCCEEDED, Bool(True))
+        return Outcome(GOAL_SUCCEEDED, Bool(True))
 
     robot.serve_action("/say", KIND, run)
     said: list[Message] = []
     outcome = client.send_goal("/say", KIND, String("go to the ball"), said.append).result(WAIT_S)
-    assert outcome.status == SUCCEEDED
+    assert outcome.status == GOAL_SUCCEEDED
     assert isinstance(outcome.result, Bool)
     assert outcome.result.data
     assert [each.data for each in said if isinstance(each, String)] == ["go", "to", "the", "ball"]
@@ -273,7 +273,7 @@ def test_a_goal_is_canceled_by_its_client_by_a_newer_one_and_by_the_end(node: No
         if goal.message.data == "fail":
             raise ValueError("no such place")
         assert goal.canceled.wait(WAIT_S)
-        return Outcome(CANCELED, Bool())
+        return Outcome(GOAL_CANCELED, Bool())
 
     robot.serve_action("~say", KIND, run)
     first = client.send_goal("/robot/say", KIND, String("first"))
@@ -281,14 +281,14 @@ def test_a_goal_is_canceled_by_its_client_by_a_newer_one_and_by_the_end(node: No
     with pytest.raises(BusError, match=r"no result within 0\.01 s"):
         first.result(0.01)
     first.cancel()
-    assert first.result(WAIT_S).status == CANCELED
+    assert first.result(WAIT_S).status == GOAL_CANCELED
     second, third = (client.send_goal("/robot/say", KIND, String(word)) for word in ("second", "third"))
-    assert second.result(WAIT_S).status == CANCELED
+    assert second.result(WAIT_S).status == GOAL_CANCELED
     failing = client.send_goal("/robot/say", KIND, String("fail"))
-    assert [third.result(WAIT_S).status, failing.result(WAIT_S).status] == [CANCELED, ABORTED]
+    assert [third.result(WAIT_S).status, failing.result(WAIT_S).status] == [GOAL_CANCELED, GOAL_ABORTED]
     last = client.send_goal("/robot/say", KIND, String("last"))
     while "last" not in started:
         assert began.acquire(timeout=WAIT_S)
     robot.close()
-    assert last.result(WAIT_S).status == CANCELED
+    assert last.result(WAIT_S).status == GOAL_CANCELED
     assert traceback == ["no such place"]

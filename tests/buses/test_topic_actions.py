@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from vlatool.buses import ABORTED, CANCELED, SUCCEEDED, ActionType, Goal, Outcome, QoS
+from vlatool.buses import GOAL_ABORTED, GOAL_CANCELED, GOAL_SUCCEEDED, ActionType, Goal, Outcome, QoS
 from vlatool.buses import _topic_actions as topic_actions
 from vlatool.buses._topic_actions import TopicActionClient, TopicActionServer, types_of
 from vlatool.buses.sim import Sim
@@ -54,11 +54,11 @@ class Nodes:
         goal.feedback(RunInstructionFeedback(goal.message.instruction, 0.5))
         self.began.release()
         if goal.message.instruction == "fail":
-            return Outcome(ABORTED, RunInstructionResult(False, "blocked"))
+            return Outcome(GOAL_ABORTED, RunInstructionResult(False, "blocked"))
         if goal.message.instruction == "stay":
             assert goal.canceled.wait(WAIT_S)
-            return Outcome(CANCELED, RunInstructionResult(False, "halfway"))
-        return Outcome(SUCCEEDED, RunInstructionResult(True, "there"))
+            return Outcome(GOAL_CANCELED, RunInstructionResult(False, "halfway"))
+        return Outcome(GOAL_SUCCEEDED, RunInstructionResult(True, "there"))
 
     def states(self) -> list[int]:
         """Return the status of the last goal, as it changed."""
@@ -91,11 +91,11 @@ def test_types_are_those_that_actionlib_derives() -> None:
 def test_a_goal_reports_and_ends(nodes: Nodes) -> None:
     said: list[Message] = []
     outcome = nodes.client.send(RunInstructionGoal("go", 9.0), said.append).result(WAIT_S)
-    assert (outcome.status, same(outcome.result, RunInstructionResult(True, "there"))) == (SUCCEEDED, True)
+    assert (outcome.status, same(outcome.result, RunInstructionResult(True, "there"))) == (GOAL_SUCCEEDED, True)
     assert same(said[0], RunInstructionFeedback("go", 0.5))
     assert nodes.states()[-2:] == [GoalStatus.ACTIVE, GoalStatus.SUCCEEDED]
     failed = nodes.client.send(RunInstructionGoal("fail"), None).result(WAIT_S)
-    assert (failed.status, failed.result.message) == (ABORTED, "blocked")  # type: ignore[attr-defined]
+    assert (failed.status, failed.result.message) == (GOAL_ABORTED, "blocked")  # type: ignore[attr-defined]
     assert nodes.states()[-1] == GoalStatus.ABORTED
 
 
@@ -108,15 +108,15 @@ def test_a_goal_is_canceled_by_name_by_stamp_with_all_and_by_a_newer_one(nodes: 
     with pytest.raises(BusError, match="gave no result"):
         named.result(0.05)
     named.cancel()
-    assert named.result(WAIT_S).status == CANCELED
+    assert named.result(WAIT_S).status == GOAL_CANCELED
     assert nodes.states()[-3:] == [GoalStatus.ACTIVE, GoalStatus.PREEMPTING, GoalStatus.PREEMPTED]
     for cancel in (GoalID(), GoalID(Time(2**31 - 1, 0))):
         sent = nodes.client.send(RunInstructionGoal("stay"), None)
         assert nodes.began.acquire(timeout=WAIT_S)
         nodes.client.cancel(cancel)
-        assert sent.result(WAIT_S).status == CANCELED
+        assert sent.result(WAIT_S).status == GOAL_CANCELED
     first, second = (nodes.client.send(RunInstructionGoal(word), None) for word in ("stay", "go"))
-    assert [first.result(WAIT_S).status, second.result(WAIT_S).status] == [CANCELED, SUCCEEDED]
+    assert [first.result(WAIT_S).status, second.result(WAIT_S).status] == [GOAL_CANCELED, GOAL_SUCCEEDED]
 
 
 def test_a_goal_ends_with_its_server_and_none_is_sent_without_one(
@@ -125,7 +125,7 @@ def test_a_goal_ends_with_its_server_and_none_is_sent_without_one(
     sent = nodes.client.send(RunInstructionGoal("stay"), None)
     assert nodes.began.acquire(timeout=WAIT_S)
     nodes.server.close()
-    assert sent.result(WAIT_S).status == CANCELED
+    assert sent.result(WAIT_S).status == GOAL_CANCELED
     nodes.robot.close()
     monkeypatch.setattr(topic_actions, "ANSWER_S", 0.01)
     with pytest.raises(BusError, match="Nobody serves the action /run"):

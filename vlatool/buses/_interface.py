@@ -123,7 +123,7 @@ class Bus(Protocol):
         """Leave the bus; what is sent has left this process. Closing twice does nothing."""
 
 
-SUCCEEDED, CANCELED, ABORTED = "succeeded", "canceled", "aborted"
+GOAL_SUCCEEDED, GOAL_CANCELED, GOAL_ABORTED = "succeeded", "canceled", "aborted"
 """How a goal of an action ends."""
 
 
@@ -144,7 +144,7 @@ class ActionType(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How a goal ended: ``SUCCEEDED``, ``CANCELED`` or ``ABORTED``, and the result."""
+    """How a goal ended: ``GOAL_SUCCEEDED``, ``GOAL_CANCELED`` or ``GOAL_ABORTED``, and the result."""
 
     status: str
     result: Message

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 from vlatool.buses._goals import Goals
-from vlatool.buses._interface import ABORTED, CANCELED, SUCCEEDED, ActionType, Goal, Outcome
-from vlatool.buses._rclpy_messages import from_ros, generated, to_ros
+from vlatool.buses._interface import GOAL_ABORTED, GOAL_CANCELED, GOAL_SUCCEEDED, ActionType, Goal, Outcome
+from vlatool.buses._rclpy_messages import from_ros, generated_class, to_ros
 from vlatool.errors import BusError
 from vlatool.messages import Message
 
-STATUSES = {4: SUCCEEDED, 5: CANCELED, 6: ABORTED}
+STATUSES = {4: GOAL_SUCCEEDED, 5: GOAL_CANCELED, 6: GOAL_ABORTED}
 """Status of ``action_msgs/msg/GoalStatus`` -> how a goal ended."""
 ANSWER_S = 5.0
 """How long a client waits for a server to accept its goal, in seconds."""
@@ -44,9 +44,9 @@ def serve_action(
             future.set_result,
         )
         outcome = await future
-        ends = {SUCCEEDED: handle.succeed, CANCELED: handle.canceled, ABORTED: handle.abort}
+        ends = {GOAL_SUCCEEDED: handle.succeed, GOAL_CANCELED: handle.canceled, GOAL_ABORTED: handle.abort}
         # ROS 2 has no canceled goal without a client that asked for it: one that a newer goal replaced is aborted
-        status = ABORTED if outcome.status == CANCELED and not handle.is_cancel_requested else outcome.status
+        status = GOAL_ABORTED if outcome.status == GOAL_CANCELED and not handle.is_cancel_requested else outcome.status
         ends[status]()
         return to_ros(outcome.result)
 
@@ -54,7 +54,7 @@ def serve_action(
         goals.cancel(bytes(handle.goal_id.uuid).hex())
         return actions.CancelResponse.ACCEPT
 
-    server = actions.ActionServer(node, generated(kind.name), name, execute, cancel_callback=cancel)
+    server = actions.ActionServer(node, generated_class(kind.name), name, execute, cancel_callback=cancel)
 
     def end() -> None:
         goals.close()
@@ -68,7 +68,7 @@ class ClientGoal:
 
     def __init__(self, node: Any, name: str, kind: ActionType) -> None:
         self._name, self._kind = name, kind
-        self._client = importlib.import_module("rclpy.action").ActionClient(node, generated(kind.name), name)
+        self._client = importlib.import_module("rclpy.action").ActionClient(node, generated_class(kind.name), name)
         self._ended = threading.Event()
         self._handle: Any = None
         self._result: Any = None
@@ -100,7 +100,7 @@ class ClientGoal:
                 f"The action {self._name} gave no result within {timeout_s:g} s.", "wait longer, or cancel it"
             )
         found = self._result.result()
-        return Outcome(STATUSES.get(found.status, ABORTED), from_ros(self._kind.result, found.result))
+        return Outcome(STATUSES.get(found.status, GOAL_ABORTED), from_ros(self._kind.result, found.result))
 
     def cancel(self) -> None:
         """See ``ClientGoal.cancel``."""

@@ -42,7 +42,7 @@ def _field(name: str, hint: Any) -> _Field:
     return _Field(name, hint)
 
 
-def generated(type_name: str) -> Any:
+def generated_class(type_name: str) -> Any:
     """Return the class of rclpy for a ROS 2 name: ``geometry_msgs/msg/Twist``, ``std_srvs/srv/SetBool_Request``.
 
     Raises:
@@ -72,7 +72,7 @@ def to_ros(message: Message) -> Any:
         MissingExtra: when its package is not installed.
         BusError: when the installed definition lacks a field, or does not take a value.
     """
-    return _fill(generated(message.TYPE)(), message)
+    return _fill(generated_class(message.TYPE)(), message)
 
 
 def _fill(theirs: Any, message: Message) -> Any:

@@ -153,9 +153,9 @@ def ask(uri: str, method: str, *arguments: Any, timeout_s: float = TIMEOUT_S) ->
         raise BusError(f"No ROS 1 master answers at {uri}: {why}.", START) from None
     except (xmlrpc.client.Error, TypeError, ValueError, SyntaxError) as error:
         what = " ".join(str(error).split())[:100]
-        raise BusError(f"What answers at {uri} is no ROS 1 master: {what}.", START) from None
+        raise BusError(f"What answers at {uri} is not a ROS 1 master: {what}.", START) from None
     except Exception as error:  # expat's error, which has no base class but this
-        raise BusError(f"What answers at {uri} is no ROS 1 master: {str(error)[:100]}.", START) from None
+        raise BusError(f"What answers at {uri} is not a ROS 1 master: {str(error)[:100]}.", START) from None
 
 
 def _reason(error: Exception) -> str:

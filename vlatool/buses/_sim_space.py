@@ -145,7 +145,7 @@ class Space:
         self.actions: dict[str, ServedAction] = {}
         self.clock_s: float | None = None
 
-    def now(self) -> float:
+    def now_s(self) -> float:
         """Return the simulated time, or that of ``time.monotonic`` where none is set, in seconds."""
         return time.monotonic() if self.clock_s is None else self.clock_s
 

@@ -15,7 +15,17 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 from vlatool.buses._goals import Goals
-from vlatool.buses._interface import ABORTED, CANCELED, SUCCEEDED, ActionType, Bus, Goal, Outcome, QoS, Reception
+from vlatool.buses._interface import (
+    GOAL_ABORTED,
+    GOAL_CANCELED,
+    GOAL_SUCCEEDED,
+    ActionType,
+    Bus,
+    Goal,
+    Outcome,
+    QoS,
+    Reception,
+)
 from vlatool.errors import BusError
 from vlatool.messages import Message
 from vlatool.messages.actionlib_msgs import GoalID, GoalStatus, GoalStatusArray
@@ -29,7 +39,11 @@ KEPT_S = 5.0
 ANSWER_S = 5.0
 """How long a client waits for a server, in seconds."""
 RELIABLE = QoS(reliable=True, depth=10)
-OUTCOMES = {GoalStatus.SUCCEEDED: SUCCEEDED, GoalStatus.PREEMPTED: CANCELED, GoalStatus.RECALLED: CANCELED}
+OUTCOMES = {
+    GoalStatus.SUCCEEDED: GOAL_SUCCEEDED,
+    GoalStatus.PREEMPTED: GOAL_CANCELED,
+    GoalStatus.RECALLED: GOAL_CANCELED,
+}
 """Last status of a goal -> how it ended; aborted by any other one."""
 
 
@@ -148,7 +162,9 @@ class TopicActionServer:
             known = self._known[identifier]
             ran = known.status in (GoalStatus.ACTIVE, GoalStatus.PREEMPTING)
             canceled = GoalStatus.PREEMPTED if ran else GoalStatus.RECALLED
-            known.status = {SUCCEEDED: GoalStatus.SUCCEEDED, CANCELED: canceled}.get(outcome.status, GoalStatus.ABORTED)
+            known.status = {GOAL_SUCCEEDED: GoalStatus.SUCCEEDED, GOAL_CANCELED: canceled}.get(
+                outcome.status, GoalStatus.ABORTED
+            )
             known.ended_s = time.monotonic()
         self._result(self._types.result(Header(self._bus.stamp()), self._now(identifier), outcome.result))
         self._tell()
@@ -224,7 +240,7 @@ class TopicActionClient:
         got: Any = reception.message
         sent = self._sent.pop(got.status.goal_id.id, None)
         if sent is not None:
-            sent.finish(Outcome(OUTCOMES.get(got.status.status, ABORTED), got.result))
+            sent.finish(Outcome(OUTCOMES.get(got.status.status, GOAL_ABORTED), got.result))
 
 
 class TopicGoal:

@@ -11,7 +11,7 @@ from vlatool.buses._bag_reader import BagReader, Recorded
 from vlatool.buses._bag_writer import BagWriter
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import Fault, M, QoS, Reception, TopicInfo
-from vlatool.buses._resolved import check_node, resolve
+from vlatool.buses._ros_names import check_node, resolve
 from vlatool.errors import BusError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -138,7 +138,7 @@ class Bag:
         """
         if self._reader is None:
             raise BusError("This bus was opened without a recording.", "open bag:RECORDING")
-        yield from self._reader.messages(topics or self._reader.known())
+        yield from self._reader.messages(topics or self._reader.readable_topics())
 
     def play(self, until_s: float = float("inf")) -> int:
         """Hand the recorded messages to the handlers, in order and in this thread; return how many there were.

@@ -12,8 +12,8 @@ from typing import Any
 
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._resolved import check_node, resolve
 from vlatool.buses._ros1_master import Master, ask, is_loopback, master_uri
+from vlatool.buses._ros_names import check_node, resolve
 from vlatool.buses._rospy_types import carrier, service_class
 from vlatool.buses._topic_actions import TopicActionClient, TopicActionServer, TopicGoal
 from vlatool.errors import BusError, MissingExtra
@@ -272,7 +272,9 @@ class Ros1:
 
 
 def _malformed(name: str, message: type[Message]) -> BusError:
-    return BusError(f"A message on {name} is no {message.TYPE}, although its MD5 sum is.", "see what its node sends")
+    return BusError(
+        f"A message on {name} is malformed, although the MD5 sum is that of {message.TYPE}.", "see what its node sends"
+    )
 
 
 def _is_waiting(publisher: Any) -> bool:

@@ -15,8 +15,8 @@ from typing import Any
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
 from vlatool.buses._rclpy_actions import ClientGoal, serve_action
-from vlatool.buses._rclpy_messages import from_ros, generated, to_ros
-from vlatool.buses._resolved import check_node, resolve
+from vlatool.buses._rclpy_messages import from_ros, generated_class, to_ros
+from vlatool.buses._ros_names import check_node, resolve
 from vlatool.errors import BusError, MissingExtra, UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -37,7 +37,9 @@ class Ros2:
     def __init__(self, address: str, node: str) -> None:
         check_node(node)
         if address and not (address.isascii() and address.isdigit() and int(address) <= MAX_DOMAIN):
-            raise UsageError(f"'{address}' is no domain of ROS 2; a number from 0 to {MAX_DOMAIN} is.", "write ros2:0")
+            raise UsageError(
+                f"'{address}' is not a domain of ROS 2, which is a number from 0 to {MAX_DOMAIN}.", "write ros2:0"
+            )
         rclpy = _rclpy("rclpy")
         self._qos = _rclpy("rclpy.qos")
         self._faults = Faults()
@@ -70,13 +72,13 @@ class Ros2:
             except Exception as error:  # it would end the executor, and with it every other subscription
                 self._faults.add_raised(name, error)
 
-        self._node.create_subscription(generated(message.TYPE), name, receive, self._profile(qos))
+        self._node.create_subscription(generated_class(message.TYPE), name, receive, self._profile(qos))
         self._subscriptions[name] = self._subscriptions.get(name, 0) + 1
 
     def publisher(self, topic: str, message: type[M], qos: QoS) -> Callable[[M], None]:
         """See ``Bus.publisher``."""
         name = self._agreed(topic, message)
-        publisher = self._node.create_publisher(generated(message.TYPE), name, self._profile(qos))
+        publisher = self._node.create_publisher(generated_class(message.TYPE), name, self._profile(qos))
         self._publishers[name] = publisher
 
         def send(content: M) -> None:
@@ -225,7 +227,7 @@ class Ros2:
 
 def _service(request: type[Message]) -> Any:
     """Return the generated class of a service, by that of its requests."""
-    return generated(request.TYPE.removesuffix("_Request"))
+    return generated_class(request.TYPE.removesuffix("_Request"))
 
 
 def _full_name(end: Any) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 from vlatool.buses._faults import Faults
 from vlatool.buses._goals import Goals
 from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._resolved import check_node, resolve
+from vlatool.buses._ros_names import check_node, resolve
 from vlatool.buses._sim_space import LocalGoal, Served, ServedAction, Subscription, Topic, join
 from vlatool.errors import BusError
 from vlatool.messages import Message
@@ -46,7 +46,7 @@ class Sim:
             subscription = Subscription(self, found.name, self._ready, handler, qos.depth)
             found.subscriptions.append(subscription)
             if qos.latched and found.latched is not None:
-                subscription.put(Reception(found.latched, self._space.now()))
+                subscription.put(Reception(found.latched, self._space.now_s()))
             self._space.changed.notify_all()
 
     def publisher(self, topic: str, message: type[M], qos: QoS) -> Callable[[M], None]:
@@ -66,7 +66,7 @@ class Sim:
                 self._refuse_closed()
                 found.latched = content if qos.latched else found.latched
                 for subscription in found.subscriptions:
-                    subscription.put(Reception(content, self._space.now()))
+                    subscription.put(Reception(content, self._space.now_s()))
                 self._space.changed.notify_all()
 
         return send
@@ -180,12 +180,12 @@ class Sim:
     def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
         """See ``Bus.wait_for_peers``."""
 
-        def alone() -> tuple[str, ...]:
+        def without_peer() -> tuple[str, ...]:
             return tuple(name for name in topics if not self._has_peer(resolve(name, self.node)))
 
         with self._space.changed:
-            self._space.changed.wait_for(lambda: not alone(), timeout_s)
-            return alone()
+            self._space.changed.wait_for(lambda: not without_peer(), timeout_s)
+            return without_peer()
 
     def close(self) -> None:
         """See ``Bus.close``."""

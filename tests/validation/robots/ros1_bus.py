@@ -22,7 +22,7 @@ import numpy as np
 from _ros1 import Master, Peer, Rows, prepare, refused
 from _ros1_ends import ends, kill_of_the_master, without_a_master
 
-from vlatool.buses import CANCELED, SUCCEEDED, ActionType, Goal, Outcome, QoS, Reception, open_bus
+from vlatool.buses import GOAL_CANCELED, GOAL_SUCCEEDED, ActionType, Goal, Outcome, QoS, Reception, open_bus
 from vlatool.errors import BusError
 from vlatool.messages import Message
 from vlatool.messages.geometry_msgs import Twist, Vector3
@@ -143,7 +143,7 @@ def actions(bus: Any, rows: Rows) -> None:
         goal.feedback(TestFeedback(2 * number))
         if number < 0:
             goal.canceled.wait(10)
-        return Outcome(CANCELED if number < 0 else SUCCEEDED, TestResult(3 * number))
+        return Outcome(GOAL_CANCELED if number < 0 else GOAL_SUCCEEDED, TestResult(3 * number))
 
     bus.serve_action("/our_action", TEST, run)
     with Peer("action_client") as peer:
@@ -158,7 +158,7 @@ def actions(bus: Any, rows: Rows) -> None:
         sent.cancel()
         canceled = sent.result(10)
     told = [(each.status, each.result.result) for each in (ended, canceled)], [each.feedback for each in said]
-    right = told == ([(SUCCEEDED, 21), (CANCELED, -21)], [14, -14])
+    right = told == ([(GOAL_SUCCEEDED, 21), (GOAL_CANCELED, -21)], [14, -14])
     rows.append(("our client of actionlib's server", str(told), right))
 
 
