@@ -11,7 +11,7 @@ from vlatool.buses._bag_reader import BagReader, Recorded
 from vlatool.buses._bag_writer import BagWriter
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import Fault, M, QoS, Reception, TopicInfo
-from vlatool.buses._ros_names import check_node, resolve
+from vlatool.buses._names import check_node, resolve
 from vlatool.errors import BusError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time

@@ -12,8 +12,8 @@ from typing import Any
 
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
+from vlatool.buses._names import check_node, resolve
 from vlatool.buses._ros1_master import Master, ask, master_uri, own_address
-from vlatool.buses._ros_names import check_node, resolve
 from vlatool.buses._rospy_types import carrier, service_class
 from vlatool.buses._topic_actions import TopicActionClient, TopicActionServer, TopicGoal
 from vlatool.errors import BusError, MissingExtra
