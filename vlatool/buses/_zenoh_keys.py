@@ -7,40 +7,21 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from typing import NamedTuple
 
+from vlatool.buses._graph import CLIENT, PUBLISHER, SERVICE, SUBSCRIBER, Entity
 from vlatool.buses._interface import QoS
 from vlatool.buses._names import dds_type, ros_type
 
 SPACE = "@ros2_lv"
 """First part of every liveliness token."""
-NODE, PUBLISHER, SUBSCRIBER, SERVICE, CLIENT = "NN", "MP", "MS", "SS", "SC"
+NODE = "NN"
+"""Kind of a node's token; the other kinds are those of the graph."""
 NO_NAME = "%"
 """What stands for an empty name and for each slash in one."""
 ATTACHMENT = struct.Struct("<qqB16s")
 """Sequence number, nanoseconds since the epoch, length of what follows, identifier of the sender (gid)."""
 PARTS = 13
 """Parts of the token of a publisher, a subscriber, a service or a client."""
-
-
-class Entity(NamedTuple):
-    """A publisher, subscriber, service or client on the bus, as its token describes it.
-
-    Args:
-        session: Identifier of its Zenoh session.
-        kind: ``MP``, ``MS``, ``SS`` or ``SC``.
-        node: Name of its node, with the namespace if it is in one.
-        topic: Full name of its topic or service.
-        type_name: ROS 2 name of its type.
-        type_hash: RIHS01 hash of its type.
-    """
-
-    session: str
-    kind: str
-    node: str
-    topic: str
-    type_name: str
-    type_hash: str
 
 
 def data_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:

@@ -9,23 +9,12 @@ from itertools import count
 from typing import Any, TypeVar
 
 from vlatool.buses._faults import Faults
+from vlatool.buses._graph import CLIENT, PUBLISHER, SERVICE, SUBSCRIBER, Entity
 from vlatool.buses._inbox import Inbox
 from vlatool.buses._interface import Fault, QoS, Reception, TopicInfo
 from vlatool.buses._names import check_node, domain_id, full_topic
-from vlatool.buses._zenoh_graph import Graph
-from vlatool.buses._zenoh_keys import (
-    ATTACHMENT,
-    CLIENT,
-    PUBLISHER,
-    SERVICE,
-    SUBSCRIBER,
-    Entity,
-    attachment,
-    data_key,
-    entity_token,
-    gid_of,
-    node_token,
-)  # fmt: skip
+from vlatool.buses._zenoh_graph import ZenohGraph
+from vlatool.buses._zenoh_keys import ATTACHMENT, attachment, data_key, entity_token, gid_of, node_token
 from vlatool.buses._zenoh_session import open_session
 from vlatool.errors import BusError
 from vlatool.messages import Message
@@ -69,7 +58,7 @@ class Zenoh:
         self._inboxes: list[Inbox] = []
         self._clients: dict[str, bytes] = {}
         self._closed = False
-        self._graph = Graph(zenoh, self._session, self._domain, self._faults)
+        self._graph = ZenohGraph(zenoh, self._session, self._domain, self._faults)
         self._keep(self._session.liveliness().declare_token(node_token(self._domain, self._id, node)))
 
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
@@ -213,7 +202,7 @@ class Zenoh:
         entity = Entity(self._id, kind, self._node, topic, type_name, type_hash)
         token = entity_token(self._domain, next(self._numbers), entity, qos)
         self._keep(self._session.liveliness().declare_token(token))
-        self._graph.add_own(token)
+        self._graph.add_token(token)
         return gid_of(token)
 
     def _client(self, service: str, type_name: str, type_hash: str) -> bytes:
