@@ -47,7 +47,10 @@ def settings(interface: str, log: str) -> str:
         multicast = ' multicast="false"' if local else ""
         parts.append(f'<General><Interfaces><NetworkInterface {named}="{value}"{multicast}/></Interfaces></General>')
     if interface and local:
-        parts.append("<General><AllowMulticast>false</AllowMulticast></General>")
+        parts.append(
+            "<General><AllowMulticast>false</AllowMulticast><MaxMessageSize>32000B</MaxMessageSize>"
+            "<FragmentSize>31000B</FragmentSize></General>"
+        )
         parts.append(
             "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>63</MaxAutoParticipantIndex>"
             '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
