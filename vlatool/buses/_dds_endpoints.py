@@ -1,7 +1,7 @@
 """Readers and writers of Cyclone DDS that pass finished bytes, with a thread for each reader.
 
 The serializer of cyclonedds' Python package takes milliseconds for an image; its C functions take and return bytes.
-Readers wait in threads rather than in listeners: a listener holds locks of Cyclone DDS while it waits for Python's lock,
+Readers wait in threads rather than in listeners: a listener holds locks of Cyclone DDS while it waits for Python's,
 which a writer in another thread may hold.
 """
 
@@ -16,6 +16,8 @@ from vlatool.buses._interface import QoS
 from vlatool.errors import BusError, require
 
 FOREVER_NS = 2**63 - 1
+BATCH = 256
+"""Changes of the discovery that are taken at once."""
 ANY_STATE = 0x7F
 """Mask of all sample, view and instance states."""
 ALIGNMENT = 4
@@ -86,7 +88,7 @@ class Endpoints:
         reader = self._builtin.BuiltinDataReader(self.participant, builtin_topic)
 
         def pass_on() -> bool:
-            taken = reader.take(256)
+            taken = reader.take(BATCH)
             for sample in taken:
                 handle(sample)
             return bool(taken)

@@ -31,8 +31,6 @@ PREFIXES = {
     ("rq", SUBSCRIBER): SERVICE, ("rq", PUBLISHER): CLIENT,
 }  # fmt: skip
 """Prefix of a topic and kind of an endpoint -> what it is in ROS 2; replies are those of known services and clients."""
-BATCH = 256
-"""Endpoints that are taken at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +38,7 @@ class Gid(Message):
     """Identifier of an endpoint or a participant."""
 
     TYPE: ClassVar[str] = "rmw_dds_common/msg/Gid"
-    data: uint8_16 = zeros("uint8", 16)
+    data: uint8_16 = zeros("uint8", 16)  # noqa: RUF009  # a field with a factory
 
 
 @dataclass(frozen=True, eq=False)

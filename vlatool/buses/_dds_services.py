@@ -24,7 +24,7 @@ M = TypeVar("M", bound=Message)
 SERVICE_QOS = QoS(reliable=True, depth=10)
 """ROS 2's quality of service for services (rmw_qos_profile_services_default)."""
 REQUEST = struct.Struct("<Qq")
-"""Whose request it is (handle of the client's writer), and its number; in little endian, as Cyclone DDS hands it over."""
+"""Whose request it is (handle of the client's writer), and its number; Cyclone DDS hands over little endian."""
 MATCH_S, POLL_S = 0.1, 0.002
 """How long a server waits for the client's reader, as rmw_cyclonedds does, and how often it looks."""
 

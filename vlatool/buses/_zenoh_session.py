@@ -67,7 +67,7 @@ def _settings(zenoh: Any, endpoint: str, serves: bool, chosen: bool) -> Any:
 
 def _values(endpoint: str, serves: bool) -> dict[str, Any]:
     shared: dict[str, Any] = {
-        "scouting/multicast/enabled": False, "scouting/gossip/enabled": True, "timestamping/enabled": True,
+        "scouting/multicast/enabled": False, "scouting/delay": 1, "scouting/gossip/enabled": True, "timestamping/enabled": True,
     }  # fmt: skip
     if serves:
         return {**shared, "mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": []}

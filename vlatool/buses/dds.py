@@ -1,4 +1,4 @@
-"""DDS without ROS 2: its topic and type names in Cyclone DDS, so that ROS 2 nodes with any DDS see and hear this node."""
+"""DDS with ROS 2's names of topics and types, in Cyclone DDS: ROS 2 nodes on any DDS see and hear this node."""
 
 from __future__ import annotations
 

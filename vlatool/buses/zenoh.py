@@ -16,7 +16,7 @@ from vlatool.buses._names import check_node, domain_id, full_topic
 from vlatool.buses._zenoh_graph import ZenohGraph
 from vlatool.buses._zenoh_keys import ATTACHMENT, attachment, data_key, entity_token, gid_of, node_token
 from vlatool.buses._zenoh_session import open_session
-from vlatool.errors import BusError
+from vlatool.errors import BusError, require
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.cdr import decode, encode
@@ -47,9 +47,8 @@ class Zenoh:
         check_node(node)
         self._domain, self._node = domain_id(), node
         self._session = open_session(address)
-        import zenoh  # type: ignore[import-not-found, unused-ignore]
-
-        self._zenoh: Any = zenoh
+        self._zenoh: Any = require("zenoh", "zenoh")
+        self._advanced: Any = require("zenoh.ext", "zenoh")
         self._faults = Faults()
         self._id = str(self._session.info.zid())
         self._numbers = count(1)
@@ -58,7 +57,7 @@ class Zenoh:
         self._inboxes: list[Inbox] = []
         self._clients: dict[str, bytes] = {}
         self._closed = False
-        self._graph = ZenohGraph(zenoh, self._session, self._domain, self._faults)
+        self._graph = ZenohGraph(self._zenoh, self._session, self._domain, self._faults)
         self._keep(self._session.liveliness().declare_token(node_token(self._domain, self._id, node)))
 
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
@@ -73,10 +72,11 @@ class Zenoh:
         hear = zenoh.handlers.Callback(lambda sample: inbox.put(sample.payload), indirect=False)
         key = self._key(name, message)
         if qos.latched:
-            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=max(1, qos.depth))
-            recovery = zenoh.ext.RecoveryConfig(heartbeat=True)
+            advanced = self._advanced
+            history = advanced.HistoryConfig(detect_late_publishers=True, max_samples=max(1, qos.depth))
+            recovery = advanced.RecoveryConfig(heartbeat=True)
             self._keep(
-                zenoh.ext.declare_advanced_subscriber(self._session, key, hear, history=history, recovery=recovery)
+                advanced.declare_advanced_subscriber(self._session, key, hear, history=history, recovery=recovery)
             )
         else:
             self._keep(self._session.declare_subscriber(key, hear))
@@ -218,9 +218,10 @@ class Zenoh:
         }
         if not qos.latched:
             return self._session.declare_publisher(key, **options)
-        return zenoh.ext.declare_advanced_publisher(
-            self._session, key, **options, cache=zenoh.ext.CacheConfig(max(1, qos.depth)), publisher_detection=True,
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+        advanced = self._advanced
+        return advanced.declare_advanced_publisher(
+            self._session, key, **options, cache=advanced.CacheConfig(max(1, qos.depth)), publisher_detection=True,
+            sample_miss_detection=advanced.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
         )  # fmt: skip
 
 
