@@ -25,7 +25,7 @@ def parse_address(address: str) -> tuple[int, str]:
     """Return domain and interface of an address such as ``0``, ``0@127.0.0.1`` or ``@eth0``; empty where left out.
 
     Raises:
-        UsageError: for what is no domain or no interface.
+        UsageError: for an impossible domain or interface.
     """
     number, _, interface = address.partition("@")
     if not re.fullmatch(r"[\w.:-]*", interface) or address.endswith("@"):

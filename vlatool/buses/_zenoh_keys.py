@@ -56,7 +56,7 @@ def qos_text(qos: QoS) -> str:
 
 
 def parse(token: str) -> Entity | None:
-    """Return what a token describes; None for that of a node, and for what is no token of rmw_zenoh."""
+    """Return what a token describes; None for that of a node, and for what rmw_zenoh does not write."""
     parts = token.split("/")
     if len(parts) != PARTS or parts[0] != SPACE or parts[5] not in (PUBLISHER, SUBSCRIBER, SERVICE, CLIENT):
         return None
