@@ -15,7 +15,7 @@ from vlatool.errors import BusError, UsageError, require
 
 CONFIG = "CYCLONEDDS_URI"
 """Environment variable with the user's settings of Cyclone DDS; what the address says comes after them."""
-REFUSED = re.compile(r"deserialization (\S+)/([^\s/]+) failed")
+REFUSAL = re.compile(r"deserialization (\S+)/([^\s/]+) failed")
 """Warning of Cyclone DDS about a malformed message: topic and type."""
 _LOCK = threading.Lock()
 _DOMAINS: dict[int, SharedDomain] = {}
@@ -94,7 +94,7 @@ class SharedDomain:
     def _read(self, reading: int) -> None:
         with open(reading, encoding="utf-8", errors="replace") as lines:
             for line in lines:
-                if found := REFUSED.search(line):
+                if found := REFUSAL.search(line):
                     for user in tuple(self.users):
                         user(*found.groups())
 

@@ -1,6 +1,6 @@
 """Key expressions, liveliness tokens and attachments of rmw_zenoh, the ROS 2 middleware on Zenoh.
 
-Layout of tokens: ``docs/design.md`` and ``liveliness_utils.cpp`` of rmw_zenoh; of attachments: its 33 bytes since 0.3.
+Layout of tokens: the page on the design of rmw_zenoh and its ``liveliness_utils.cpp``; of attachments: its 33 bytes.
 """
 
 from __future__ import annotations

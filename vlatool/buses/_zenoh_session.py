@@ -55,9 +55,7 @@ def _settings(zenoh: Any, endpoint: str, serves: bool, chosen: bool) -> Any:
         try:
             settings = zenoh.Config.from_file(file)
         except zenoh.ZError as error:
-            raise UsageError(
-                f"{CONFIG} names '{file}', which Zenoh cannot read: {error}", "correct it"
-            ) from error
+            raise UsageError(f"{CONFIG} names '{file}', which Zenoh cannot read: {error}", "correct it") from error
         values = {"connect/endpoints": [endpoint]} if chosen and not serves else {}
         values |= _values(endpoint, serves) if serves else {}
     for key, value in values.items():
