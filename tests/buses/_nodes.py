@@ -161,14 +161,14 @@ class NetworkBus:
 
     def test_wrong_names_and_values_are_refused(self, open_node: Open) -> None:
         with opened(open_node, "robot") as (robot,):
-            with pytest.raises(UsageError, match="'/cmd vel' is not a name of a topic"):
+            with pytest.raises(UsageError, match="'/cmd vel' cannot be the name of a topic"):
                 robot.publisher("/cmd vel", Twist, QUALITY)
             with pytest.raises(BusError, match="Twist"):
                 robot.publisher("/cmd_vel", Twist, QUALITY)(Twist(linear="fast"))  # type: ignore[arg-type]
             assert robot.wait_for_peers(("/cmd_vel",), 0.01) == ("/cmd_vel",)
             stamp = robot.stamp()
             assert abs(stamp.seconds - time.time_ns() * 1e-9) < WAIT_S
-        with pytest.raises(UsageError, match="'1 node' is not a name of a node"):
+        with pytest.raises(UsageError, match="'1 node' cannot be the name of a node"):
             open_node("1 node")
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Names of ROS 2 as its middlewares write them: topics, nodes, types, and the domain."""
+"""Names of types as ROS 2's middlewares write them, and the domain."""
 
 from __future__ import annotations
 
@@ -7,36 +7,9 @@ import re
 
 from vlatool.errors import UsageError
 
-TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
-NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 DDS_TYPE = re.compile(r"(\w+)::(msg|srv|action)::dds_::(\w+)_")
 MAX_DOMAIN = 232
 """Largest domain whose ports are below 65536 (DDSI-RTPS 2.2, section 9.6.1.1)."""
-
-
-def full_topic(topic: str) -> str:
-    """Return a topic's or a service's full name, which starts with a slash.
-
-    Raises:
-        UsageError: for what is not a name of ROS 2.
-    """
-    name = topic if topic.startswith("/") else f"/{topic}"
-    if TOPIC.fullmatch(name):
-        return name
-    raise UsageError(
-        f"'{topic}' is not a name of a topic or a service: letters, digits and '_', parts with '/' between them, no "
-        "digit first in a part.",
-        "write it as ROS 2 does, such as /camera/image_raw",
-    )
-
-
-def check_node(node: str) -> None:
-    """Raise UsageError for what is not a name of a node."""
-    if not NODE.fullmatch(node):
-        raise UsageError(
-            f"'{node}' is not a name of a node: letters, digits and '_', no digit first.",
-            "write it as ROS 2 does, such as vlatool_vln",
-        )
 
 
 def dds_type(name: str) -> str:

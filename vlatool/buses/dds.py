@@ -14,7 +14,8 @@ from vlatool.buses._dds_services import Client, serve_requests
 from vlatool.buses._dds_types import describe
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import Fault, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, full_topic, ros_type
+from vlatool.buses._names import ros_type
+from vlatool.buses._ros_names import check_node, resolve
 from vlatool.errors import BusError, require
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -41,7 +42,7 @@ class Dds:
     """
 
     def __init__(self, address: str, node: str) -> None:
-        check_node(node)
+        self._node = check_node(node)
         number, interface = parse_address(address)
         require("cyclonedds", "dds")
         self._faults = Faults()
@@ -97,7 +98,7 @@ class Dds:
 
     def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
         """Answer a service, one request at a time, in a thread of the service."""
-        name = full_topic(service)
+        name = resolve(service, self._node)
         self._check_open(name)
         reader, writer = serve_requests(self._endpoints, name, request, response, handler, self._faults)
         self._graph.add_own(reader, writer)
@@ -108,7 +109,7 @@ class Dds:
         Raises:
             BusError: when nobody answers in time.
         """
-        name, deadline = full_topic(service), time.monotonic() + timeout_s
+        name, deadline = resolve(service, self._node), time.monotonic() + timeout_s
         self._check_open(name)
         with self._lock:
             if name not in self._clients:
@@ -131,7 +132,7 @@ class Dds:
 
     def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
         """Wait until each topic has a peer: a publisher, or a subscriber; return those without."""
-        names = {topic: full_topic(topic) for topic in topics}
+        names = {topic: resolve(topic, self._node) for topic in topics}
         self._graph.wait(lambda: all(self._graph.has_peer(name) for name in names.values()), timeout_s)
         return tuple(topic for topic, name in names.items() if not self._graph.has_peer(name))
 
@@ -149,7 +150,7 @@ class Dds:
             raise _closed(topic)
 
     def _check(self, topic: str, message: type[Message]) -> str:
-        name = full_topic(topic)
+        name = resolve(topic, self._node)
         self._check_open(name)
         self._discover()
         self._graph.check_type(name, message.TYPE)

@@ -12,7 +12,8 @@ from vlatool.buses._faults import Faults
 from vlatool.buses._graph import CLIENT, PUBLISHER, SERVICE, SUBSCRIBER, Entity
 from vlatool.buses._inbox import Inbox
 from vlatool.buses._interface import Fault, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, domain_id, full_topic
+from vlatool.buses._names import domain_id
+from vlatool.buses._ros_names import check_node, resolve
 from vlatool.buses._zenoh_graph import ZenohGraph
 from vlatool.buses._zenoh_keys import ATTACHMENT, attachment, data_key, entity_token, gid_of, node_token
 from vlatool.buses._zenoh_session import open_session
@@ -66,7 +67,7 @@ class Zenoh:
         Raises:
             BusError: when the topic carries another type.
         """
-        name, zenoh = full_topic(topic), self._zenoh
+        name, zenoh = resolve(topic, self._node), self._zenoh
         self._check(name, message)
         inbox = Inbox(name, message, handler, qos.depth, lambda payload: payload.to_bytes(), self._faults)
         hear = zenoh.handlers.Callback(lambda sample: inbox.put(sample.payload), indirect=False)
@@ -90,7 +91,7 @@ class Zenoh:
         Raises:
             BusError: when the topic carries another type.
         """
-        name = full_topic(topic)
+        name = resolve(topic, self._node)
         self._check(name, message)
         publisher = self._keep(self._declare_publisher(self._key(name, message), qos))
         gid = self._announce(PUBLISHER, name, message.TYPE, rihs01(message), qos)
@@ -106,7 +107,7 @@ class Zenoh:
 
     def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
         """Answer a service, one request at a time, in a thread of the service."""
-        name = full_topic(service)
+        name = resolve(service, self._node)
         type_name, type_hash = _service_type(request, response)
         key = data_key(self._domain, name, type_name, type_hash)
 
@@ -128,7 +129,7 @@ class Zenoh:
         Raises:
             BusError: when nobody answers in time, the server refuses, or it serves another type.
         """
-        name, deadline = full_topic(service), time.monotonic() + timeout_s
+        name, deadline = resolve(service, self._node), time.monotonic() + timeout_s
         type_name, type_hash = _service_type(type(request), response)
         gid = self._client(name, type_name, type_hash)
         if not self._graph.wait(lambda: bool(self._graph.service_types(name)), timeout_s):
@@ -168,7 +169,7 @@ class Zenoh:
 
     def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
         """Wait until each topic has a peer: a publisher, or a subscriber; return those without."""
-        names = {topic: full_topic(topic) for topic in topics}
+        names = {topic: resolve(topic, self._node) for topic in topics}
         self._graph.wait(lambda: all(self._graph.has_peer(name) for name in names.values()), timeout_s)
         return tuple(topic for topic, name in names.items() if not self._graph.has_peer(name))
 
