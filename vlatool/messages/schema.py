@@ -1,7 +1,8 @@
 """What a message is: a frozen dataclass whose annotations are types of the ROS interface language.
 
-Each field is annotated with one of the aliases below, with another message class, or with ``tuple[M, ...]`` of them.
-The order of the fields is that of the ROS 2 definition. Every field has a default, as in ROS: zero, false or empty.
+Each field is annotated with one of the aliases below, with another message class, or with ``tuple[M, ...]`` of them;
+a constant with ``ClassVar`` of an alias. The order of the fields is that of the ROS 2 definition. Every field has a
+default, as in ROS: zero, false or empty.
 Encodings (CDR, ROS 1), RIHS01 hashes and texts of definitions are derived from these classes.
 """
 
@@ -35,6 +36,23 @@ class Elements:
 
     name: str
     length: int | None = None
+
+
+@dataclass(frozen=True)
+class Ros1Form:
+    """How the ROS 1 definition of a type (Noetic) differs from that of ROS 2.
+
+    Args:
+        sequence: Whether a number ``uint32 seq`` comes first, which is written as 0 and not read.
+        names: Pairs of a field and its name in ROS 1.
+        absent: Fields and constants that ROS 1 lacks: they are not written, and read as their defaults.
+        constants: Primitive of the constants; that of ROS 2 when empty.
+    """
+
+    sequence: bool = False
+    names: tuple[tuple[str, str], ...] = ()
+    absent: tuple[str, ...] = ()
+    constants: str = ""
 
 
 boolean = Annotated[bool, Primitive("bool")]
@@ -75,11 +93,14 @@ class Message:
 
     TYPE: ClassVar[str] = ""
     """Name of the ROS 2 type, such as ``geometry_msgs/msg/Twist``."""
+    ROS1: ClassVar[Ros1Form] = Ros1Form()
+    """How the definition differs in ROS 1."""
 
-    def __init_subclass__(cls, name: str = "", **options: Any) -> None:
+    def __init_subclass__(cls, name: str = "", ros1: Ros1Form | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
         if name:
             cls.TYPE = name
+            cls.ROS1 = ros1 or Ros1Form()
             _TYPES[name] = cls
 
 
