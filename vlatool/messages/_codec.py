@@ -12,7 +12,7 @@ from vlatool.messages._wrong_values import WrongValue, explain
 from vlatool.messages.schema import Message
 
 M = TypeVar("M", bound=Message)
-LARGE = 1024
+LARGE_BYTES = 1024
 """Bytes from which a buffer is passed on by itself rather than copied together with others."""
 UNFIT = (WrongValue, struct.error, AttributeError, TypeError, OverflowError, UnicodeEncodeError)
 """What a plan raises for a value that does not fit its field."""
@@ -37,7 +37,7 @@ def merge(parts: list[Any]) -> list[bytes | memoryview]:
     merged: list[bytes | memoryview] = []
     small: list[Any] = []
     for part in parts:
-        if len(part) < LARGE:
+        if len(part) < LARGE_BYTES:
             small.append(part)
             continue
         if small:

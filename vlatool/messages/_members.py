@@ -48,12 +48,12 @@ class Constant(NamedTuple):
     value: Any
 
 
-def cached(function: F) -> F:
+def cache(function: F) -> F:
     """Return ``functools.cache`` of a function, typed as the function: for mypy, no message class is hashable."""
     return cast(F, functools.cache(function))
 
 
-@cached
+@cache
 def members(cls: type[Message], ros1: bool = False) -> tuple[Member, ...]:
     """Return the fields of a type, in order, as ROS 2 defines them or as ROS 1 does."""
     form, hints = cls.ROS1, get_type_hints(cls, include_extras=True)
@@ -76,7 +76,7 @@ def _member(attribute: str, name: str, hint: Any) -> Member:
     return Member(attribute, name, marker.name)
 
 
-@cached
+@cache
 def constants(cls: type[Message], ros1: bool = False) -> tuple[Constant, ...]:
     """Return the constants of a type, in order, as ROS 2 defines them or as ROS 1 does."""
     found = []

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlatool.errors import BusError
-from vlatool.messages._members import CODES, SIZES, Member, cached, members
+from vlatool.messages._members import CODES, SIZES, Member, cache, members
 from vlatool.messages._tails import LENGTH, Malformed, Messages, Numbers, Tail, Text, Texts, Wire
 from vlatool.messages._wrong_values import WrongValue
 from vlatool.messages.schema import Message
 
-COUNT, SKIPPED = "uint32", ""
+COUNT, NO_PATH = "uint32", ""
 
 
 class Leaf(NamedTuple):
@@ -48,7 +48,7 @@ class Step(NamedTuple):
     paths: tuple[str, ...]
 
 
-@cached
+@cache
 def plan_of(cls: type[Message], wire: Wire) -> Plan:
     """Return the plan of a type."""
     return Plan(cls, wire)
@@ -134,7 +134,7 @@ def _leaves(cls: type[Message], ros1: bool, prefix: str = "") -> list[Leaf]:
         if member.message is not None and not member.sequence:
             found += _leaves(member.message, ros1, f"{prefix}{member.attribute}.")
         else:
-            found.append(Leaf(prefix + member.attribute if member.attribute else SKIPPED, member))
+            found.append(Leaf(prefix + member.attribute if member.attribute else NO_PATH, member))
     return found
 
 
@@ -175,9 +175,9 @@ def _step(run: list[Leaf], tail: Tail | None, wire: Wire) -> Step:
     fixed = [(leaf.path, leaf.member.primitive) for leaf in (run if tail is None else run[:-1])]
     packed = [*fixed, ("count", COUNT)] if tail is not None and tail.counted else fixed
     if not run and not wire.ros1:
-        packed = [(SKIPPED, "uint8")]  # in ROS 2, a message without fields has one byte
-    paths = [leaf.path for leaf in run if leaf.path != SKIPPED]
-    kinds = [primitive for path, primitive in fixed if path != SKIPPED]
+        packed = [(NO_PATH, "uint8")]  # in ROS 2, a message without fields has one byte
+    paths = [leaf.path for leaf in run if leaf.path != NO_PATH]
+    kinds = [primitive for path, primitive in fixed if path != NO_PATH]
     align = tail.size if isinstance(tail, Numbers) and not tail.counted else 1
     structs = tuple(_struct(packed, align, start, wire) for start in range(8))
     return Step(_getter(paths), structs, tuple(i for i, kind in enumerate(kinds) if kind == "bool"), tail, tuple(paths))
@@ -189,7 +189,7 @@ def _struct(packed: list[tuple[str, str]], align: int, start: int, wire: Wire) -
     for path, primitive in packed:
         size = SIZES[primitive]
         pad = 0 if wire.ros1 else -position % size
-        codes.append(f"{pad}x{size}x" if path == SKIPPED else f"{pad}x{CODES[primitive]}")
+        codes.append(f"{pad}x{size}x" if path == NO_PATH else f"{pad}x{CODES[primitive]}")
         position += pad + size
     return struct.Struct("".join(codes) + f"{0 if wire.ros1 else -position % align}x")
 

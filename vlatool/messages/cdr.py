@@ -17,7 +17,7 @@ HEADER = bytes((0, 1, 0, 0))
 """Plain CDR in little endian, without options."""
 MAX_PADDING = 3
 """Bytes that may follow a message, so that its length is a multiple of four."""
-LITTLE, BIG = Wire(), Wire(order=">")
+LITTLE_ENDIAN, BIG_ENDIAN = Wire(), Wire(order=">")
 
 
 def encode(message: Message) -> bytes:
@@ -26,7 +26,7 @@ def encode(message: Message) -> bytes:
     Raises:
         BusError: when a value does not fit its field; names the message and the field.
     """
-    return b"".join(buffers(message, LITTLE, HEADER))
+    return b"".join(buffers(message, LITTLE_ENDIAN, HEADER))
 
 
 def encode_parts(message: Message) -> list[bytes | memoryview]:
@@ -35,7 +35,7 @@ def encode_parts(message: Message) -> list[bytes | memoryview]:
     Raises:
         BusError: when a value does not fit its field; names the message and the field.
     """
-    return merge(buffers(message, LITTLE, HEADER))
+    return merge(buffers(message, LITTLE_ENDIAN, HEADER))
 
 
 def decode(cls: type[M], buffer: Any) -> M:
@@ -59,4 +59,4 @@ def decode(cls: type[M], buffer: Any) -> M:
             f"A {cls.TYPE} in the encoding 0x{data[0]:02x}{data[1]:02x}, not in plain CDR (0x0000 or 0x0001).",
             "set the publisher's data representation to XCDR1, which ROS 2 uses",
         )
-    return read(cls, data[len(HEADER) :], LITTLE if data[1] else BIG, MAX_PADDING)
+    return read(cls, data[len(HEADER) :], LITTLE_ENDIAN if data[1] else BIG_ENDIAN, MAX_PADDING)

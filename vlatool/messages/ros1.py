@@ -11,10 +11,10 @@ import hashlib
 from typing import Any
 
 from vlatool.messages._codec import M, buffers, merge, octets, read
-from vlatool.messages._members import cached, constants, members
+from vlatool.messages._members import cache, constants, members
 from vlatool.messages._tails import Wire
 from vlatool.messages.definition import ROS1_PRIMITIVES, full_text, own_text
-from vlatool.messages.schema import Message
+from vlatool.messages.schema import Message, ros1_name
 
 ROS1 = Wire(ros1=True)
 
@@ -48,8 +48,7 @@ def decode(cls: type[M], buffer: Any) -> M:
 
 def type_name(cls: type[Message]) -> str:
     """Return the name of a type: ``geometry_msgs/Twist``, ``std_srvs/SetBoolRequest``."""
-    package, kind, name = cls.TYPE.split("/")
-    return f"{package}/{name if kind == 'msg' else name.replace('_', '')}"
+    return ros1_name(cls.TYPE)
 
 
 def service_name(request: type[Message]) -> str:
@@ -63,7 +62,7 @@ def definition(cls: type[Message]) -> str:
     return full_text(cls, ros1=True)
 
 
-@cached
+@cache
 def md5sum(cls: type[Message]) -> str:
     """Return the sum by which ROS 1 recognizes a type."""
     return _md5(_summed_text(cls))

@@ -9,7 +9,10 @@ Encodings (CDR, ROS 1), RIHS01 hashes and texts of definitions are derived from 
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import pkgutil
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -114,10 +117,34 @@ def find_type(name: str) -> type[Message]:
         UsageError: for an unknown type.
     """
     package, _, rest = name.partition("/")
+    if package in packages():
+        importlib.import_module(f"vlatool.messages.{package}")
     full = name if "/" in rest else f"{package}/msg/{rest}"
     if full not in _TYPES:
-        raise UsageError.unknown(f"Unknown type of message '{name}'", full, sorted(_TYPES))
+        by_ros1_name = {ros1_name(known): known for known in _TYPES}
+        full = by_ros1_name.get(name, full)
+    if full not in _TYPES:
+        raise UsageError.unknown(f"Unknown type of message '{name}'", full, [kind.TYPE for kind in all_types()])
     return _TYPES[full]
+
+
+def ros1_name(full: str) -> str:
+    """Return the ROS 1 name of a type: of a service, ``std_srvs/SetBoolRequest``."""
+    package, kind, name = full.split("/")
+    return f"{package}/{name if kind == 'msg' else name.replace('_', '')}"
+
+
+def packages() -> list[str]:
+    """Return the names of the ROS packages that have types here."""
+    names = (module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]))
+    return sorted(name for name in names if name.endswith(("_msgs", "_srvs", "_interfaces")))
+
+
+def all_types() -> list[type[Message]]:
+    """Return the classes of all types, sorted by name."""
+    for package in packages():
+        importlib.import_module(f"vlatool.messages.{package}")
+    return [_TYPES[name] for name in sorted(_TYPES)]
 
 
 def same(one: Any, other: Any) -> bool:

@@ -6,7 +6,7 @@ import hashlib
 import json
 from typing import Any
 
-from vlatool.messages._members import Member, cached, members
+from vlatool.messages._members import Member, cache, members
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.definition import types_in
 from vlatool.messages.schema import Message
@@ -22,13 +22,13 @@ ARRAY, BOUNDED_SEQUENCE, SEQUENCE = 48, 96, 144
 SERVICE_EVENT = "service_msgs/msg/ServiceEventInfo"
 
 
-@cached
+@cache
 def rihs01(cls: type[Message]) -> str:
     """Return the hash of a type: ``RIHS01_`` and 64 hexadecimal digits."""
     return _digest(_description(cls), [_description(kind) for kind in types_in(cls)])
 
 
-@cached
+@cache
 def service_rihs01(request: type[Message], response: type[Message]) -> str:
     """Return the hash of a service: of a type with its request, its response, and the event for introspection."""
     name = request.TYPE.rpartition("_")[0]
