@@ -307,6 +307,4 @@ class ArmController:
         if measured is not None:
             arms = [joint.command != "range" for joint in self._limits.joints]
             notes["lag_rad"] = float(np.abs(measured - np.array(envelope.position))[arms].max())
-        if envelope.apart is not None:
-            notes["arm_distance_m"] = float(envelope.apart.distance(np.array([envelope.position]))[0])
         return notes

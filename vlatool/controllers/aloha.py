@@ -9,7 +9,7 @@ from typing import ClassVar
 from vlatool.controllers._arm import ArmController
 from vlatool.controllers._arm_robot import ArmRobot
 from vlatool.runtime.envelope import KeepApart
-from vlatool.runtime.kinematics import VIPERX_CAPSULES, Chain, Clearance, Pose, arm
+from vlatool.runtime.kinematics import VIPERX_CAPSULES, VIPERX_REACH_M, Chain, Clearance, Pose, arm
 
 ARM = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
 JOINTS = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in (*ARM, "gripper"))
@@ -32,9 +32,12 @@ class Aloha(ArmController):
     other than ``clearance_m``, by capsules around their links; what the arms lag behind their commands is within that.
     """
 
+    speed: float = 0.3
+
     ROBOT: ClassVar[ArmRobot] = ArmRobot("aloha", JOINTS, JOINTS, POSE * 2, CHAINS)
 
     def _apart(self) -> KeepApart:
         left, right = (self.ROBOT.places(side) for side in ("left", "right"))
         capsules = (VIPERX_CAPSULES, VIPERX_CAPSULES)
-        return KeepApart(Clearance((CHAINS["left"], CHAINS["right"]), (left, right), capsules), self.clearance_m)
+        distance = Clearance((CHAINS["left"], CHAINS["right"]), (left, right), capsules)
+        return KeepApart(distance, self.clearance_m, (*VIPERX_REACH_M, 0.0) * 2)

@@ -23,6 +23,8 @@ class So101(ArmController):
     """
 
     rate: float = 30.0
+    speed: float = 0.3
+    margin_rad: float = 0.08
 
     ROBOT: ClassVar[ArmRobot] = ArmRobot(
         "so-101",

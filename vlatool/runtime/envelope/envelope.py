@@ -120,6 +120,10 @@ class Envelope:
         self._check_names(monitors)
         self._boxes = [_sides(limits, box.low, box.high) for box in limits.keep_out]
         self.apart = apart
+        if apart is not None and any(isinstance(axis, VelocityAxis) for axis in self._axes):
+            raise UsageError(
+                "Distances are kept along positions, and a joint takes velocities.", "command positions, or pass no apart"
+            )
         self.ready = False
         """Whether the envelope was started."""
         self._emergency: tuple[str, ...] = ()

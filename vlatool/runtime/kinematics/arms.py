@@ -79,6 +79,9 @@ VIPERX_CAPSULES = (
     Capsule(5, (0.081, 0.0, 0.0), (0.066, 0.0, 0.0), 0.083),
 )
 """Around all vertices of the meshes of gym-aloha's arm, fingers open: the smallest of each link, rounded up."""
+VIPERX_REACH_M = (0.85, 0.85, 0.55, 0.35, 0.25, 0.09)
+"""By how much a point of the arm, its capsules included, moves at most when a joint turns by 1 rad, in metres: its way to
+the farthest point of the links behind the joint, whose lengths are 0.306, 0.2, 0.1, 0.07 and 0.165 m."""
 SO101 = Chain(
     (
         Link("shoulder_pan", (0.0388353, -8.97657e-09, 0.0624), (0.0, 0.0, -1.0, 0.0)),
