@@ -252,9 +252,9 @@ def test_the_arms_of_aloha_never_come_near_each_other() -> None:
 
     arm = Arm(built("aloha", across))
     arm.until("acting")
-    command = arm.steps(150)
+    command = arm.steps(110)
     distance = arm.controller._apart().distance
-    assert command.notes["checks"] == "apart"
+    assert "apart" in command.notes["checks"]
     assert 0.09 <= distance(arm.path()).min() < 0.2
     direction[0] = -1.0
     arm.steps(50)
