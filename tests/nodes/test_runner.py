@@ -84,9 +84,7 @@ def test_step_that_raises_ends_in_rest(exchange, others, error):
     assert [message.linear.x for message in sent] == [1, 1, 0]
 
 
-@pytest.mark.parametrize(
-    ("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
-)
+@pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
 def test_signals_end_in_rest(exchange, others, number, raised):
     sent = collect(others, "/cmd_vel", Twist)
     handler = signal.getsignal(signal.SIGTERM)

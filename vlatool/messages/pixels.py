@@ -90,8 +90,8 @@ def image(message: Image) -> Array:
         raise BusError(f"An image of {width} x {height} pixels.", "wait until the camera sends images")
     if step < row or len(data) < (height - 1) * step + row:
         raise BusError(
-            f"An image of {width} x {height} pixels in {message.encoding} with rows of {step:,} bytes and {len(data):,} "
-            f"bytes of data; a row takes {row:,} bytes, all {height} at least {(height - 1) * max(step, row) + row:,}.",
+            f"An image of {width} x {height} pixels in {message.encoding} with rows of {step:,} bytes, {len(data):,} "
+            f"bytes in all; a row takes {row:,} bytes, all of them {(height - 1) * max(step, row) + row:,} or more.",
             "check the driver of the camera",
         )
     stored = dtype.newbyteorder(">" if message.is_bigendian else "<")

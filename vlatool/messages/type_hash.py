@@ -14,7 +14,7 @@ from vlatool.messages.schema import Message
 MESSAGE_ID = 1
 PRIMITIVE_IDS = {
     "int8": 2, "uint8": 3, "int16": 4, "uint16": 5, "int32": 6, "uint32": 7, "int64": 8, "uint64": 9, "float32": 10,
-    "float64": 11, "char": 13, "bool": 15, "byte": 16, "string": 17,
+    "float64": 11, "bool": 15, "byte": 16, "string": 17,
 }  # fmt: skip
 """Primitive -> its number in ``type_description_interfaces/msg/FieldType``."""
 ARRAY, BOUNDED_SEQUENCE, SEQUENCE = 48, 96, 144
@@ -40,7 +40,7 @@ def service_rihs01(request: type[Message], response: type[Message]) -> str:
     info = _type(SERVICE_EVENT, [
         _field("event_type", PRIMITIVE_IDS["uint8"]),
         _field("stamp", MESSAGE_ID, nested=Time.TYPE),
-        _field("client_gid", ARRAY + PRIMITIVE_IDS["char"], 16),
+        _field("client_gid", ARRAY + PRIMITIVE_IDS["uint8"], 16),  # char in the .msg, which is uint8 in IDL
         _field("sequence_number", PRIMITIVE_IDS["int64"]),
     ])  # fmt: skip
     service = _type(name, [

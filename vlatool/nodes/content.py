@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 
-from vlatool.errors import BusError, DataError
+from vlatool.errors import BusError, DataError, UsageError
 from vlatool.messages import Message, find_type
 from vlatool.messages.cdr import decode, encode, encode_parts
 
@@ -37,6 +37,11 @@ def to_text(message: Message) -> str:
     return f"{message.TYPE}={content.hex()}" if len(content) <= MAX_TEXT else f"{message.TYPE}#{digest(message)}"
 
 
+def digest_of(text: str) -> str:
+    """Return the digest of a message that ``to_text`` wrote out."""
+    return digest(from_text(text)) if "=" in text else text.partition("#")[2]
+
+
 def from_text(text: str) -> Message:
     """Return the message that ``to_text`` wrote out.
 
@@ -48,5 +53,5 @@ def from_text(text: str) -> Message:
         if not mark:
             raise ValueError("a digest")
         return decode(find_type(name), bytes.fromhex(content))
-    except (ValueError, BusError):
+    except (ValueError, BusError, UsageError):
         raise DataError(f"A recorded message is '{text:.60}', which cannot be read.", "record the run again") from None

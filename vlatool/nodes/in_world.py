@@ -16,7 +16,7 @@ from vlatool.errors import UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.nodes.content import digest
-from vlatool.nodes.stepper import Stepper, StepReport, check_command, topics_of
+from vlatool.nodes.stepper import Stepper, StepReport, check_command, ends_of, topics_of
 from vlatool.worlds import World
 
 Truth = Mapping[str, Any]
@@ -116,12 +116,11 @@ class Simulation:
         stated |= {topic: next(channel.message for channel in self.world.commands if channel.topic == command)
                    for topic, command in self._commands.items()}  # fmt: skip
         for node, topics in zip(self.nodes, self.topics, strict=True):
-            for each in (*node.controller.outputs, *node.controller.inputs):
-                topic = topics[each.name]
-                if stated.setdefault(topic, each.message) is not each.message:
+            for name, topic, message in ends_of(node.controller, topics):
+                if stated.setdefault(topic, message) is not message:
                     raise UsageError(
-                        f"The topic {topic} carries {stated[topic].TYPE}; the controller's '{each.name}' is "
-                        f"{each.message.TYPE}.", "map it to another topic",
+                        f"The topic {topic} carries {stated[topic].TYPE}; the controller's '{name}' is "
+                        f"{message.TYPE}.", "map it to another topic",
                     )  # fmt: skip
 
     @property

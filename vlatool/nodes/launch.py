@@ -17,8 +17,11 @@ from vlatool.machine.version import VERSION
 from vlatool.nodes.settings import build, to_plain
 from vlatool.nodes.step_record import ControllerRecord
 from vlatool.runtime import load
-from vlatool.runtime.envelope.limits import robot_names
-from vlatool.runtime.stack import Fallback, Stack
+from vlatool.runtime.control.deadline import Deadline
+from vlatool.runtime.envelope.limits import RobotLimits, robot_names
+from vlatool.runtime.interface import layers_of
+from vlatool.runtime.rungs import NO_MOTION
+from vlatool.runtime.stack import Fallback
 
 DEADLINE_SHARE = 0.8
 """Part of a controller's period in which its policy answers; the rest is for sensors, checks and sending."""
@@ -83,8 +86,11 @@ def open_controller(name: str, settings: Mapping[str, Any], options: PolicyOptio
     return with_policy(controller, open_policy(options, controller))  # type: ignore[no-any-return]
 
 
-def open_policy(options: PolicyOptions, controller: Any) -> Stack:
+def open_policy(options: PolicyOptions, controller: Any) -> Any:
     """Return the policy of a controller with its layers: the deadline, the fallback, the envelope of the robot.
+
+    A policy with discrete actions of which none is without motion has no fallback but its controller, which lets the
+    robot stand: it is a policy with a deadline then, not a stack.
 
     Args:
         controller: The controller without a policy, for its rate.
@@ -94,19 +100,20 @@ def open_policy(options: PolicyOptions, controller: Any) -> Stack:
     spec = Bundle.open(options.bundle).manifest.spec
     limit_ms = deadline_of(options.deadline_ms, controller, spec)
     robot = robot_name(options.robot)
-    stack = load(
+    if robot:
+        RobotLimits.named(robot)
+    opening: dict[str, Any] = {"engine": options.engine, "threads": options.threads, "seed": options.seed}
+    if spec.action.kind == "discrete" and not (options.neutral or {*spec.action.labels} & {*NO_MOTION}):
+        policy = load(options.bundle, **opening)
+        return policy if limit_ms is None else Deadline(policy, limit_ms)
+    return load(
         options.bundle,
-        engine=options.engine,
-        threads=options.threads,
-        seed=options.seed,
+        **opening,
         controllers=(),
         envelope=robot if robot and spec.action.kind != "discrete" else None,
         deadline_ms=limit_ms,
         fallback=Fallback(neutral=options.neutral) if limit_ms is not None else None,
     )
-    if not isinstance(stack, Stack):
-        raise TypeError("layers make a stack")
-    return stack
 
 
 def deadline_of(deadline_ms: float | None, controller: Any, spec: PolicySpec) -> float | None:
@@ -130,7 +137,7 @@ def _rate(controller: Any) -> float | None:
 
 def identity_of(policy: Any) -> str:
     """Return the identity of the bundle inside the layers of a policy; empty without one."""
-    layers = getattr(policy, "layers", [policy])
+    layers = [] if policy is None else getattr(policy, "layers", None) or layers_of(policy)
     return next((str(layer.identity) for layer in reversed(layers) if hasattr(layer, "identity")), "")
 
 

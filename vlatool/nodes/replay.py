@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,7 +11,7 @@ from vlatool.controllers import Reading, Request, RobotController, Snapshot
 from vlatool.errors import DataError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
-from vlatool.nodes.content import from_text
+from vlatool.nodes.content import digest_of, from_text
 from vlatool.nodes.run_log import Item, Received
 from vlatool.nodes.step_record import StepRecord, differences
 from vlatool.nodes.stepper import check_controller
@@ -48,6 +49,7 @@ class ReplayReport:
         differing: Steps whose commands differ; after the first one, the state may differ, too.
         difference: The first difference; None where all commands are equal bit for bit.
         unused: Recorded messages that no step read.
+        unheard: Commands in the records of the steps that are not among the recorded messages of their topics.
         note: Why the replay ends before the recording does; empty where it does not.
     """
 
@@ -57,6 +59,7 @@ class ReplayReport:
     difference: Difference | None
     unused: int
     note: str
+    unheard: int = 0
 
     @property
     def equal(self) -> bool:
@@ -76,8 +79,11 @@ class _Messages:
         self._waiting: dict[str, dict[str, list[Message]]] = {}
         self._order: dict[str, list[str]] = {}
         self.unused = 0
+        self.heard: Counter[tuple[str, str]] = Counter()
+        """How often each message came: (channel, digest) -> count."""
 
     def add(self, got: Received) -> None:
+        self.heard[got.channel, got.digest] += 1
         for name in self._inputs.get(got.channel, ()):
             self._waiting.setdefault(name, {}).setdefault(got.digest, []).append(got.message)
             order = self._order.setdefault(name, [])
@@ -135,12 +141,18 @@ def replay(controller: RobotController[Any], items: Iterable[Item], topics: Mapp
     for name in names:
         channel = name if topics is None else topics[name]
         channels[channel] = (*channels.get(channel, ()), name)
-    return _Replay(controller, _Messages(channels), names).run(items)
+    outputs = (
+        {} if topics is None else {each.name: topics[each.name] for each in controller.outputs if each.name in topics}
+    )
+    return _Replay(controller, _Messages(channels), names, outputs).run(items)
 
 
 class _Replay:
-    def __init__(self, controller: RobotController[Any], messages: _Messages, inputs: list[str]) -> None:
-        self._controller, self._messages, self._inputs = controller, messages, inputs
+    def __init__(
+        self, controller: RobotController[Any], messages: _Messages, inputs: list[str], outputs: Mapping[str, str]
+    ) -> None:
+        self._controller, self._messages, self._inputs, self._outputs = controller, messages, inputs, outputs
+        self._sent: Counter[tuple[str, str]] = Counter()
         self._state: Any = controller.start()
         self._newest: dict[str, Reading] = {}
         self._waiting: list[StepRecord] = []
@@ -162,7 +174,9 @@ class _Replay:
         if not self._steps and not note:
             raise DataError("The recording holds no step of a controller.",
                             "record the topics /NODE/steps and /NODE/controller, too: vlatool record, or all topics")  # fmt: skip
-        return ReplayReport(self._steps, self._compared, self._differing, self._first, self._messages.left(), note)
+        unheard = sum((self._sent - self._messages.heard).values())
+        return ReplayReport(self._steps, self._compared, self._differing, self._first, self._messages.left(), note,
+                            unheard)  # fmt: skip
 
     def _expect(self, record: StepRecord) -> None:
         if not self._steps and not self._waiting and record.step:
@@ -192,6 +206,8 @@ class _Replay:
         command, self._state = self._controller.step(snapshot, self._state)
         self._steps += 1
         self._compared += sum(map(len, record.messages.values()))
+        for name, topic in self._outputs.items():
+            self._sent.update((topic, digest_of(text)) for text in record.messages.get(name, ()))
         found = differences(record.messages, command)
         self._differing += bool(found)
         if found and self._first is None:
@@ -208,6 +224,8 @@ def lines(report: ReplayReport) -> Iterator[str]:
         yield f"{count}: {report.differing} steps differ, the first is {first.step}, '{first.output}'"
         yield f"  recorded  {_shown(first.recorded)}"
         yield f"  computed  {_shown(first.computed)}"
+    if report.unheard:
+        yield f"{report.unheard} of them are not among the recorded messages of their topics"
     if report.note:
         yield f"the replay ends there: {report.note}"
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlatool.buses import Bus, QoS
-from vlatool.errors import BusError, DataError
+from vlatool.errors import BusError, DataError, UsageError
 from vlatool.messages import Message, find_type
 from vlatool.messages.cdr import decode, encode
 from vlatool.messages.std_msgs import String
@@ -47,6 +47,10 @@ class Background:
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="vlatool-observers", daemon=True)
         self._thread.start()
+
+    def observe(self, *observers: Callable[[StepReport], None]) -> None:
+        """Add observers, before the first report."""
+        self._observers.extend(observers)
 
     def __call__(self, report: StepReport) -> None:
         """Take a report; never waits."""
@@ -164,7 +168,7 @@ def read_log(path: Path) -> Iterator[Item]:
             elif frame.kind is FrameKind.CALL:
                 message = decode(find_type(frame.values["type"]), frame.arrays["cdr"].tobytes())
                 yield Received(str(frame.values["input"]), message, str(frame.values["digest"]))
-        except (KeyError, AttributeError, BusError) as error:
+        except (KeyError, AttributeError, BusError, UsageError) as error:
             raise DataError(f"{path} is not the log of a controller: {error}.",
                             "name a file of vlatool run --record, or a bag") from None  # fmt: skip
 

@@ -15,11 +15,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from vlatool.buses import Bus, QoS
+from vlatool.buses import Bus, QoS, Reception
 from vlatool.controllers import Command, RobotController, Service
 from vlatool.errors import BusError
 from vlatool.messages import Message
-from vlatool.nodes.stepper import Stepper, StepReport, check_command, topics_of
+from vlatool.nodes.inbox import Inbox
+from vlatool.nodes.stepper import Stepper, StepReport, check_command, ends_of, topics_of
 
 Observer = Callable[[StepReport], None]
 MAX_SAMPLES = 100_000
@@ -100,21 +101,19 @@ class Runner:
             self._senders[output.name] = bus.publisher(self.topics[output.name], output.message, qos)
         for entry in controller.inputs:
             qos = QoS(entry.reliable, max(1, entry.depth), entry.latched)
-            inbox = self._stepper.inboxes[entry.name]
-            bus.subscribe(self.topics[entry.name], entry.message, lambda got, inbox=inbox: inbox.put(*got), qos)
+            bus.subscribe(self.topics[entry.name], entry.message, _filling(self._stepper.inboxes[entry.name]), qos)
         for service in controller.services:
             bus.serve(self.topics[service.name], service.request, service.response, self._answering(service))
 
     def _refuse_conflicts(self, alone: bool) -> None:
         """Raise BusError where a topic carries another type, or an output has a publisher already."""
         present = {info.topic: info for info in self.bus.topics()}
-        for each in (*self.controller.inputs, *self.controller.outputs):
-            topic = self.topics[each.name]
+        for name, topic, message in ends_of(self.controller, self.topics):
             info = present.get(topic)
-            if info is not None and info.types and each.message.TYPE not in info.types:
+            if info is not None and info.types and message.TYPE not in info.types:
                 raise BusError(
-                    f"The topic {topic} carries {', '.join(info.types)}; the controller's '{each.name}' is "
-                    f"{each.message.TYPE}.", f"map '{each.name}' to a topic of that type: --map {each.name}=/TOPIC",
+                    f"The topic {topic} carries {', '.join(info.types)}; the controller's '{name}' is "
+                    f"{message.TYPE}.", f"map '{name}' to a topic of that type: --map {name}=/TOPIC",
                 )  # fmt: skip
         for output in self.controller.outputs if alone else ():
             info = present.get(self.topics[output.name])
@@ -199,6 +198,10 @@ class Runner:
                     failure = error
         if failure is not None and not sent:
             raise failure
+
+
+def _filling(inbox: Inbox) -> Callable[[Reception], None]:
+    return lambda got: inbox.put(got.message, got.received_s)
 
 
 @contextlib.contextmanager

@@ -20,7 +20,8 @@ from vlatool.files.json import read_json
 MAX_BYTES = 1_000_000
 """Largest file of settings."""
 WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Mapping: "an object"}
-ARGUMENT = re.compile(r"^(\w+): (.*)$")
+ARGUMENT = re.compile(r"^(\w+(?:, \w+)*): (.*)$")
+"""A line of a docstring that begins the words on an argument, or on several with commas between."""
 
 
 @dataclass(frozen=True)
@@ -76,21 +77,25 @@ def _kind(annotation: Any, where: str) -> tuple[type, bool, bool]:
         return annotation, False, False
     if origin is not None and inspect.isclass(origin) and issubclass(origin, Mapping):
         return Mapping, False, False
-    raise TypeError(f"{where} is {annotation}; a setting is a float, int, bool, str, a tuple of one of these, or a dict")
+    raise TypeError(
+        f"{where} is {annotation}; a setting is a float, int, bool, str, a tuple of one of these, or a dict"
+    )
 
 
 def _arguments(text: str) -> dict[str, str]:
     """Return what the section Args of a docstring says of each argument, as one line."""
     found: dict[str, str] = {}
-    name = ""
+    names: list[str] = []
     for line in text.partition("Args:\n")[2].splitlines():
         if line.strip() and not line.startswith("    "):
             break
         match = ARGUMENT.match(line[4:])
         if match:
-            name, found[match[1]] = match[1], match[2]
-        elif line.strip() and name:
-            found[name] += f" {line.strip()}"
+            names = match[1].split(", ")
+        elif not line.strip() or not names:
+            continue
+        for name in names:
+            found[name] = match[2] if match else f"{found[name]} {line.strip()}"
     return {name: words.rstrip(".")[:1].lower() + words.rstrip(".")[1:] for name, words in found.items()}
 
 
@@ -166,5 +171,5 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 def to_plain(entry: Any) -> dict[str, Any]:
     """Return the settings of a controller or a world as JSON has them."""
-    values = {setting.name: getattr(entry, setting.name) for setting in settings_of(type(entry))}
+    values = {setting.name: getattr(entry, setting.name) for setting in settings_of(entry.__class__)}
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from vlatool.controllers import Command, RobotController, Snapshot
 from vlatool.errors import BusError, UsageError
+from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.nodes.inbox import Calls, Inbox
 
@@ -71,6 +72,20 @@ class Stepper:
         return report
 
 
+class End(NamedTuple):
+    """One end of a topic: an input or an output of a controller."""
+
+    name: str
+    topic: str
+    message: type[Message]
+
+
+def ends_of(controller: RobotController[Any], topics: Mapping[str, str]) -> list[End]:
+    """Return the inputs and outputs of a controller with their topics."""
+    inputs = [End(entry.name, topics[entry.name], entry.message) for entry in controller.inputs]
+    return [*inputs, *(End(output.name, topics[output.name], output.message) for output in controller.outputs)]
+
+
 def check_controller(controller: RobotController[Any]) -> None:
     """Raise UsageError where a controller cannot be run: an impossible rate, or two of its topics share a name."""
     rate = controller.rate_hz
@@ -93,7 +108,8 @@ def topics_of(controller: RobotController[Any], renamed: Mapping[str, str]) -> d
     Raises:
         UsageError: for an unknown name, or a topic that does not begin with a slash.
     """
-    known = {each.name: each.topic for each in (*controller.inputs, *controller.outputs)}
+    known = {entry.name: entry.topic for entry in controller.inputs}
+    known |= {output.name: output.topic for output in controller.outputs}
     known |= {each.name: each.service for each in controller.services}
     by_topic = {topic: [name for name in known if known[name] == topic] for topic in known.values()}
     found = dict(known)

@@ -1,0 +1,149 @@
+"""The HTML report of a run: one page without scripts, with the path from above, states, latencies and settings."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from vlatool.files.printable import amount, printable
+from vlatool.files.user_files import write_own_file
+from vlatool.nodes.session import RunResult
+from vlatool.nodes.trace import Trace, TracePoint, phases
+from vlatool.render.charts.run import bands, over_time, path_from_above
+from vlatool.render.charts.svg import Canvas
+
+WIDE, NARROW = 996, 366
+STYLE = Path(__file__).parent.parent / "render/formats/page.css"
+MAX_LINES = 6
+"""Notes and inputs of which a line is drawn, each in a panel of its own kind."""
+
+
+def write_page(path: Path, result: RunResult, trace: Trace) -> None:
+    """Write the report; raises OutputError where the file exists already."""
+    write_own_file(path, page(result, trace), force=False, comment="<!-- {} -->")
+
+
+def page(result: RunResult, trace: Trace) -> str:
+    """Return the report as HTML."""
+    found, points = result.to_dict(), trace.points
+    title = f"{result.about.controller}, {found['steps']} steps in {found['seconds']:.1f} s"
+    sections = [*_sections(points), _table("Times of the steps", _times(found)), _table("Topics", _topics(result)),
+                _table("Settings", _settings(result))]  # fmt: skip
+    lead = "".join(f"<p>{_text(line)}</p>" for line in _summary(found, points))
+    head = f"<title>{_text(title)}</title><style>{STYLE.read_text(encoding='utf-8')}</style>"
+    top = '<!doctype html><html lang="en"><meta charset="utf-8">'
+    top += '<meta name="viewport" content="width=device-width,initial-scale=1">'
+    over = f'<p class="over">a run of {_text(result.about.node)}, vlatool {_text(result.about.version)}</p>'
+    return f"{top}{head}<body><main>{over}<h1>{_text(title)}</h1>{lead}{''.join(sections)}</main></body></html>\n"
+
+
+def _text(content: Any) -> str:
+    return escape(printable(str(content)))
+
+
+def _summary(found: Mapping[str, Any], points: Sequence[TracePoint]) -> Iterator[str]:
+    yield f"It ended with the status: {found['status'] or 'none'}."
+    words = Counter((point.status.split() or ["no status"])[0] for point in points)
+    if points:
+        yield (
+            "Statuses: " + ", ".join(f"{word} {count / len(points):.0%}" for word, count in words.most_common(8)) + "."
+        )
+    if found["skipped"]:
+        yield f"{amount(found['skipped'], 'step')} left out, because the one before took too long."
+    if any(found["overwritten"].values()):
+        many = ", ".join(f"{name} {count}" for name, count in found["overwritten"].items() if count)
+        yield f"Messages that came faster than the controller reads: {many}."
+    if found["lost_records"] or found["failure"]:
+        yield f"The records of the steps are not whole: {found['failure'] or found['lost_records']}."
+
+
+def _sections(points: Sequence[TracePoint]) -> Iterator[str]:
+    """Yield the sections with drawings, those that there is something for."""
+    if not points:
+        return
+    path = [point.position for point in points if point.position is not None]
+    if path:
+        marks = list(_changes(points))
+        yield _section("Path from above", "The ring is the start, the dot the end; circles are changes of the status.",
+                       [path_from_above(path, marks, width) for width in (WIDE, NARROW)])  # fmt: skip
+    rows = {"status": list(phases(list(points)))}
+    rows |= {key: list(phases(list(points), key)) for key in _state_notes(points)}
+    yield _section("Statuses and levels", "What held when; the first word of a status.",
+                   [bands(rows, points[-1].time_s, width) for width in (WIDE, NARROW)])  # fmt: skip
+    panels = _panels(points)
+    yield _section("Latencies and speeds", "Of each step.", [over_time(panels, width) for width in (WIDE, NARROW)])
+
+
+def _changes(points: Sequence[TracePoint]) -> Iterator[tuple[float, float, str]]:
+    last = ""
+    for point in points:
+        word = (point.status.split() or [""])[0]
+        if word != last and point.position is not None:
+            yield (*point.position, f"{point.status} at {point.time_s:.1f} s")
+        last = word
+
+
+def _state_notes(points: Sequence[TracePoint]) -> list[str]:
+    """Return the notes that are states: texts, and levels."""
+    names = {name: value for point in points for name, value in point.notes.items()}
+    return [name for name, value in names.items() if isinstance(value, str) or name == "level"][:MAX_LINES]
+
+
+def _panels(points: Sequence[TracePoint]) -> dict[str, dict[str, list[tuple[float, float]]]]:
+    def line(values: Iterator[tuple[float, float | None]]) -> list[tuple[float, float]]:
+        return [(time, value) for time, value in values if value is not None and math.isfinite(value)]
+
+    panels: dict[str, dict[str, list[tuple[float, float]]]] = {
+        "time of a step, ms": {
+            "controller": line((point.time_s, point.compute_ms) for point in points),
+            "around it": line((point.time_s, point.total_ms - point.compute_ms) for point in points),
+            "late": line((point.time_s, point.late_ms) for point in points),
+        }
+    }
+    inputs = list(dict.fromkeys(name for point in points for name in point.ages_ms))[:MAX_LINES]
+    if inputs:
+        panels["age of the newest message, ms"] = {
+            name: line((point.time_s, point.ages_ms.get(name)) for point in points) for name in inputs
+        }
+    if any(point.speeds for point in points):
+        for index, name in enumerate(("speed commanded, m/s", "turn commanded, rad/s")):
+            values = ((point.time_s, point.speeds[index] if point.speeds else None) for point in points)
+            panels[name] = {name: line(values)}
+    numbers = list(dict.fromkeys(name for point in points for name, value in point.notes.items()
+                                 if not isinstance(value, str) and name != "level"))[:MAX_LINES]  # fmt: skip
+    for name in numbers:
+        values = ((point.time_s, float(point.notes[name]) if name in point.notes else None) for point in points)
+        panels[name] = {name: line(values)}
+    return {name: lines for name, lines in panels.items() if any(lines.values())}
+
+
+def _section(title: str, words: str, canvases: Sequence[Canvas]) -> str:
+    drawn = "".join(f'<div class="{css}">{canvas.svg()}</div>'
+                    for css, canvas in zip(("wide", "narrow"), canvases, strict=True))  # fmt: skip
+    return f'<section><h2>{_text(title)}</h2><p class="sub">{_text(words)}</p>{drawn}</section>'
+
+
+def _table(title: str, rows: Sequence[Sequence[str]]) -> str:
+    body = "".join(f"<tr><th>{_text(first)}</th>{''.join(f'<td>{_text(cell)}</td>' for cell in rest)}</tr>"
+                   for first, *rest in rows)  # fmt: skip
+    return f'<section><h2>{_text(title)}</h2><div class="scroll"><table>{body}</table></div></section>' if rows else ""
+
+
+def _times(found: Mapping[str, Any]) -> list[list[str]]:
+    names = {"late_ms": "late", "compute_ms": "controller", "overhead_ms": "inboxes, checks, sending"}
+    return [[words, f"p50 {found[name]['p50']:.3f} ms", f"p99 {found[name]['p99']:.3f} ms"]
+            for name, words in names.items() if found[name]["samples"]]  # fmt: skip
+
+
+def _topics(result: RunResult) -> list[list[str]]:
+    return [[name, topic] for name, topic in result.about.topics.items()]
+
+
+def _settings(result: RunResult) -> list[list[str]]:
+    about = result.about
+    more = {"bundle": about.policy, "robot": about.robot}
+    return [[name, str(value)] for name, value in {**about.settings, **more}.items() if value not in ("", None)]
