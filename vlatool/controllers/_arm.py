@@ -220,7 +220,7 @@ class ArmController:
     ) -> tuple[list[float] | None, ArmState]:
         """Return the positions that are wanted, in the order of the robot, or None for the next step of the stop."""
         envelope = state.envelope
-        assert envelope is not None  # noqa: S101 - the caller looked
+        assert envelope is not None
         if measured is None:
             return None, state._replace(way=None, detail=problem)
         late = self._lagging(envelope, measured)
@@ -249,7 +249,7 @@ class ArmController:
 
     def _return(self, snapshot: Snapshot, state: ArmState) -> tuple[list[float] | None, ArmState]:
         envelope, now = state.envelope, snapshot.time_s
-        assert envelope is not None  # noqa: S101 - the caller looked
+        assert envelope is not None
         way = state.way
         if way is None:
             if not envelope.at_rest():
@@ -261,7 +261,7 @@ class ArmController:
         return way.at(now), state._replace(way=way, detail="to the start pose")
 
     def _act(self, snapshot: Snapshot, state: ArmState, measured: Array) -> tuple[list[float] | None, ArmState]:
-        assert state.envelope is not None  # noqa: S101 - the caller looked
+        assert state.envelope is not None
         seen, missing = self._sees.observation(snapshot, self.ROBOT, measured)
         if seen is None:
             return None, state._replace(detail=missing)
@@ -277,12 +277,14 @@ class ArmController:
     ) -> tuple[Command, ArmState]:
         """Let the envelope answer, and put its positions into messages."""
         envelope = state.envelope
-        assert envelope is not None  # noqa: S101 - the caller looked
+        assert envelope is not None
         result = envelope.step(wanted, elapsed_s=snapshot.time_s - state.last_s)
         state = state._replace(last_s=snapshot.time_s)
         if state.way is not None and wanted is not None and result.level >= Level.CRITICAL:
             attempts = state.attempts + 1
-            phase, detail = (RETURNING, "stopped on the way") if attempts < ATTEMPTS else (STOPPED, "the way is not free")
+            phase, detail = (
+                (RETURNING, "stopped on the way") if attempts < ATTEMPTS else (STOPPED, "the way is not free")
+            )
             state = state._replace(phase=phase, way=None, attempts=attempts, detail=detail)
         answers, state = self._answers(state)
         checks = ",".join(result.checks)

@@ -112,16 +112,20 @@ def policy_of(spec: PolicySpec, robot: ArmRobot) -> ArmPolicy:
     action = spec.action
     if action.kind == "discrete" or action.mode not in MODES:
         raise UsageError(
-            f"The action '{action.name}' is {action.kind}, mode '{action.mode or 'not stated'}'; an arm takes tensors of "
-            f"the modes {', '.join(MODES)}.",
+            f"The action '{action.name}' is {action.kind}, mode '{action.mode or 'not stated'}'; an arm takes "
+            f"tensors of the modes {', '.join(MODES)}.",
             "state the mode in policy.yaml, and let 'convert' make relative actions absolute",
         )
     places = _places(action, robot)
     joints = robot.limits().joints
     ranges = tuple(joint.command == "range" for joint in joints)
     rates = [action.mode == "velocity" and not alone for alone in ranges]
-    _check_units(action, [f"{joint.unit}/s" if rate else joint.unit for joint, rate in zip(joints, rates, strict=True)], places)
-    state, order, cameras, text, targets = "", (), [], "", False
+    _check_units(
+        action, [f"{joint.unit}/s" if rate else joint.unit for joint, rate in zip(joints, rates, strict=True)], places
+    )
+    order: tuple[int, ...] = ()
+    cameras: list[str] = []
+    state, text, targets = "", "", False
     for tensor in spec.inputs:
         if tensor.kind == "text" and not text:
             text = tensor.name
@@ -135,8 +139,8 @@ def policy_of(spec: PolicySpec, robot: ArmRobot) -> ArmPolicy:
             state, order = tensor.name, tuple(robot.joints.index(label) for label in tensor.labels)
         else:
             raise UsageError(
-                f"The input '{tensor.name}' of the policy is neither a camera, a text, '{TARGET}', nor labelled by the joints "
-                f"{', '.join(robot.joints)}.",
+                f"The input '{tensor.name}' of the policy is neither a camera, a text, '{TARGET}', nor labelled by the "
+                f"joints {', '.join(robot.joints)}.",
                 "label it in policy.yaml, or run it with: vlatool run policy",
             )
     return ArmPolicy(state, order, targets, tuple(cameras), text, action.mode, places, ranges)
@@ -167,7 +171,7 @@ def _check_target(tensor: TensorSpec, robot: ArmRobot) -> bool:
     width = 3 * len(robot.chains)
     if tensor.robot_width != width:
         raise UsageError(
-            f"'{TARGET}' has {tensor.robot_width} elements; {robot.name} takes {width}: x, y, z of each arm, in metres.",
+            f"'{TARGET}' has {tensor.robot_width} elements; {robot.name} takes {width}: x, y, z of each arm, in m.",
             "change the input in policy.yaml",
         )
     return True

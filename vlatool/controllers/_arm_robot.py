@@ -94,8 +94,8 @@ def driver_names(robot: ArmRobot, wanted: Sequence[str]) -> tuple[str, ...]:
     names = tuple(wanted) or robot.driver_names
     if len(names) != len(robot.joints) or len({*names}) < len(names):
         raise UsageError(
-            f"joint_names has {len(names)} names, {len({*names})} of them different; allowed: {len(robot.joints)} different "
-            "ones.",
+            f"joint_names has {len(names)} names, {len({*names})} of them different; allowed: {len(robot.joints)} "
+            "different ones.",
             f"name what the driver calls {', '.join(robot.joints)}, in this order",
         )
     return names

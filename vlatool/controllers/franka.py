@@ -17,8 +17,8 @@ JOINTS = tuple(f"joint{number}" for number in range(1, 8))
 class Franka(ArmController):
     """Franka Emika Panda: the policy gives positions of ``joint1`` to ``joint7`` in rad.
 
-    In messages they are ``panda_joint1`` to ``panda_joint7`` (franka_ros; an FR3 has other limits). 50 steps in a second,
-    between which the driver interpolates. No gripper: Franka's is an action of its own (``franka_gripper``). The start
+    In messages they are ``panda_joint1`` to ``panda_joint7`` (franka_ros; an FR3 has other limits). 50 steps in a
+    second, between which the driver interpolates. No gripper: Franka's is an action of its own. The start
     pose is that of franka_ros: 0, -pi/4, 0, -3 pi/4, 0, pi/2, pi/4.
     """
 

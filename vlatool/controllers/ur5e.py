@@ -17,9 +17,9 @@ JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist
 class Ur5e(ArmController):
     """Universal Robots UR5e: the policy gives positions of ``shoulder_pan`` to ``wrist_3`` in rad.
 
-    In messages each has ``_joint`` behind its name (ur_robot_driver, whose JointState is in another order: by name, that
-    does not matter). 50 steps in a second, between which the driver interpolates. No gripper: a tool has a driver of its
-    own. The start pose is 0, -pi/2, pi/2, -pi/2, -pi/2, 0: upper arm up, forearm ahead, tool down.
+    In messages each has ``_joint`` behind its name (ur_robot_driver, whose JointState is in another order: by name,
+    that does not matter). 50 steps in a second, between which the driver interpolates. No gripper: a tool has a driver
+    of its own. The start pose is 0, -pi/2, pi/2, -pi/2, -pi/2, 0: upper arm up, forearm ahead, tool down.
     """
 
     ROBOT: ClassVar[ArmRobot] = ArmRobot(

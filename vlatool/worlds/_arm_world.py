@@ -212,7 +212,10 @@ class ArmWorld:
                 self._refused = "a trajectory without points"
                 return
             point = message.points[-1]
-            seconds, message = point.time_from_start.seconds, JointState(message.header, message.joint_names, point.positions)
+            seconds, message = (
+                point.time_from_start.seconds,
+                JointState(message.header, message.joint_names, point.positions),
+            )
         try:
             positions = joint_values(message, self._names)  # type: ignore[arg-type]  # one of two classes
         except BusError as error:
@@ -226,8 +229,8 @@ class ArmWorld:
     def truth(self) -> Mapping[str, Any]:
         """Return ``positions`` and ``velocities`` (A,), ``tips``, ``lowest``, ``highest``, ``fastest``, ``refused``.
 
-        ``tips`` are places in the world (3,) in metres. The extremes are those of all steps since the reset, in rad or m,
-        and per second. A robot of two arms has ``distance_m`` and ``least_distance_m`` between them, of their meshes.
+        ``tips`` are places in the world (3,) in metres. The extremes are those of all steps since the reset, in rad or
+        m, and per second. A robot of two arms has ``distance_m`` and ``least_distance_m`` between their geometries.
         """
         data = self._data
         values: dict[str, Any] = {

@@ -15,7 +15,7 @@ SIDES = ("left", "right")
 
 @dataclass
 class Aloha(ArmWorld):
-    """ALOHA: model and servos of gym-aloha's table with a cube; the position of a gripper is that of its left finger."""
+    """ALOHA: model and servos of gym-aloha's table with a cube; a gripper's position is that of its left finger."""
 
     SETUP: ClassVar[ArmSetup] = ArmSetup(
         ModelFile("gym-aloha", "0.1.5", "gym_aloha/assets/bimanual_viperx_transfer_cube.xml"),

@@ -10,7 +10,9 @@ from vlatool.errors import UsageError
 from vlatool.runtime.envelope import Envelope, JointLimits, KeepApart, RobotLimits
 
 PERIOD = 0.02
-LIMITS = RobotLimits("bars", tuple(JointLimits(name, "rad", -3.0, 3.0, (-2.0, 2.0), 10.0, 200.0) for name in ("a", "b")))
+LIMITS = RobotLimits(
+    "bars", tuple(JointLimits(name, "rad", -3.0, 3.0, (-2.0, 2.0), 10.0, 200.0) for name in ("a", "b"))
+)
 GRIPPER = LIMITS.plus(JointLimits("gripper", "m", 0.0, 1.0, command="range"))
 
 
@@ -47,7 +49,10 @@ def test_random_commands_never_bring_the_arms_nearer() -> None:
     goals = random.uniform(-2.5, 2.5, (5, 2))
 
     def ask(step: int, position: tuple[float, ...]) -> list[float]:
-        return [value + float(np.clip(goal - value, -0.038, 0.038)) for value, goal in zip(position, goals[step // 50], strict=True)]
+        return [
+            value + float(np.clip(goal - value, -0.038, 0.038))
+            for value, goal in zip(position, goals[step // 50], strict=True)
+        ]
 
     assert distance(np.array(drive(envelope, 250, ask))).min() >= 0.15 - 1e-6
 

@@ -1,4 +1,4 @@
-"""Forward kinematics and Jacobians: against MuJoCo, by models written here and, where installed, by those of the packages."""
+"""Forward kinematics and Jacobians: against MuJoCo, by models written here and, where installed, the packages'."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from vlatool.worlds import aloha, franka_panda, so101, ur5e
 from vlatool.worlds._arm_model import compiled
 
 POSES = small_or_full(200, 100_000)
-UR_DH = ((0.0, 0.1625, 90), (-0.425, 0.0, 0), (-0.3922, 0.0, 0), (0.0, 0.1333, 90), (0.0, 0.0997, -90), (0.0, 0.0996, 0))
+UR_DH = (
+    (0.0, 0.1625, 90),
+    (-0.425, 0.0, 0),
+    (-0.3922, 0.0, 0),
+    (0.0, 0.1333, 90),
+    (0.0, 0.0997, -90),
+    (0.0, 0.0996, 0),
+)
 MODELS = {
     "franka_panda": (franka_panda.FrankaPanda, "link7", (0.0, 0.0, 0.0)),
     "ur5e_robosuite": (ur5e.Ur5e, "wrist_3_link", (0.0, 0.0, 0.0)),
@@ -38,7 +45,9 @@ def dh_model(rows: tuple[tuple[float, float, float], ...], *, modified: bool) ->
     return f'<mujoco><compiler angle="degree"/><worldbody>{text}{ends}</worldbody></mujoco>'
 
 
-def compare(chain: Chain, model: object, body: str, count: int, base: tuple[float, float, float], *, end: bool) -> tuple[float, float]:
+def compare(
+    chain: Chain, model: object, body: str, count: int, base: tuple[float, float, float], *, end: bool
+) -> tuple[float, float]:
     """Return the largest difference of poses and of Jacobians at random positions of the joints."""
     import mujoco
 
@@ -73,7 +82,15 @@ def test_arms_are_where_mujoco_has_them(name: str) -> None:
 
 def test_tables_are_those_of_dh_models() -> None:
     mujoco = pytest.importorskip("mujoco", reason="the extra worlds is not installed")
-    panda = ((0.0, 0.333, 0), (0, 0, -90), (0, 0.316, 90), (0.0825, 0, 90), (-0.0825, 0.384, -90), (0, 0, 90), (0.088, 0, 90))
+    panda = (
+        (0.0, 0.333, 0),
+        (0, 0, -90),
+        (0, 0.316, 90),
+        (0.0825, 0, 90),
+        (-0.0825, 0.384, -90),
+        (0, 0, 90),
+        (0.088, 0, 90),
+    )
     model = mujoco.MjModel.from_xml_string(dh_model(panda, modified=True))
     assert max(compare(Chain(arm("franka_panda").links), model, "l6", POSES, (0, 0, 0), end=True)) < 1e-9
     model = mujoco.MjModel.from_xml_string(dh_model(UR_DH, modified=False))
@@ -83,7 +100,11 @@ def test_tables_are_those_of_dh_models() -> None:
 def test_a_planar_arm_has_the_positions_of_the_school_formula() -> None:
     chain = from_standard_dh(("shoulder", "elbow"), ((0.3, 0.0, 0.0), (0.2, 0.0, 0.0)))
     first, second = 0.4, -1.1
-    expected = [0.3 * math.cos(first) + 0.2 * math.cos(first + second), 0.3 * math.sin(first) + 0.2 * math.sin(first + second), 0]
+    expected = [
+        0.3 * math.cos(first) + 0.2 * math.cos(first + second),
+        0.3 * math.sin(first) + 0.2 * math.sin(first + second),
+        0,
+    ]
     assert chain.tip_position([first, second]) == pytest.approx(expected, abs=1e-15)
     assert from_modified_dh(("only",), ((0.1, 0.2, 0.0),)).tip_position([0.0]) == pytest.approx([0.1, 0.0, 0.2])
 

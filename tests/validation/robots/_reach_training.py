@@ -59,14 +59,17 @@ class Reach(nn.Module):
         opening: That position.
     """
 
-    def __init__(self, places: list[list[int]], width: int, grippers: list[int], opening: float, hidden: int = 256) -> None:
+    def __init__(self, places: list[list[int]], width: int, grippers: list[int], opening: float) -> None:
         super().__init__()
+        hidden = 256
         self.places, self.grippers, self.opening = places, grippers, opening
         self.register_buffer("middle", torch.zeros(width))
         self.register_buffer("extent", torch.ones(width))
         self.arms = nn.ModuleList(
-            nn.Sequential(nn.Linear(3, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, hidden),
-                          nn.ReLU(), nn.Linear(hidden, len(own)))
+            nn.Sequential(
+                nn.Linear(3, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
+                nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, len(own)),
+            )
             for own in places
         )
 
@@ -92,8 +95,10 @@ def chain_of(name: str, robot: ArmRobot, side: str) -> Chain:
     return arm("ur5e_robosuite") if name == "ur5e" else robot.chains[side]
 
 
-def solve(chain: Chain, start: np.ndarray, targets: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return joints (K, N) for tips (K, 3), by damped least squares from one start, and the distances that remain (K,)."""
+def solve(
+    chain: Chain, start: np.ndarray, targets: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return joints (K, N) for tips (K, 3), from one start, and the distances that remain (K,)."""
     joints = np.tile(start, (len(targets), 1))
     for _ in range(80):
         error = targets - chain.tip_position(joints)
@@ -135,7 +140,7 @@ class Task:
         apart = built._apart()
         self.targets, joints = np.concatenate(targets, axis=1), np.concatenate(goals, axis=1)
         whole = np.tile(np.array(self.robot.start), (count, 1))
-        whole[:, sum(self.places, [])] = joints
+        whole[:, [place for own in self.places for place in own]] = joints
         if apart is not None:
             good &= apart.distance(whole) > apart.minimum_m + 0.03
         self.share = float(good.mean())
@@ -162,14 +167,17 @@ def train(task: Task, folder: Path, seconds: float) -> dict[str, float]:
     begin, steps = time.process_time(), 0
     total = 4000
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total)
-    moving = sum(task.places, [])
+    moving = [place for own in task.places for place in own]
     while steps < total and time.process_time() - begin < seconds:
         rows = torch.randint(0, len(targets), (512,))
         spread = 10.0 ** (-2.5 * torch.rand(512, 1))
         states = goals[rows] + spread * torch.randn(512, goals.shape[1])
         expert = STEP_RAD * torch.tanh(GAIN / STEP_RAD * (goals[rows] - states))
         error = (policy(states, targets[rows])[:, 0] - expert)[:, moving] / STEP_RAD
-        near = torch.cat([policy.goal(targets[rows], arm) for arm in range(len(task.places))], dim=1) - goals[rows][:, moving]
+        near = (
+            torch.cat([policy.goal(targets[rows], arm) for arm in range(len(task.places))], dim=1)
+            - goals[rows][:, moving]
+        )
         loss = (error**2).mean() + (near**2).mean()
         optimizer.zero_grad()
         loss.backward()
@@ -189,7 +197,9 @@ def _write(task: Task, folder: Path, policy: Any) -> None:
 
     random = np.random.default_rng(1)
     rows = random.integers(0, len(task.targets), 256)
-    states = task.states[rows] + 10.0 ** random.uniform(-2.5, 0, (256, 1)) * random.standard_normal((256, task.states.shape[1]))
+    states = task.states[rows] + 10.0 ** random.uniform(-2.5, 0, (256, 1)) * random.standard_normal(
+        (256, task.states.shape[1])
+    )
     states, targets = states.astype(np.float32), task.targets[rows].astype(np.float32)
     with torch.no_grad():
         actions = policy(torch.tensor(states), torch.tensor(targets)).numpy()
@@ -205,7 +215,14 @@ def _write(task: Task, folder: Path, policy: Any) -> None:
             {"name": "target", "shape": [1, targets.shape[1]], "dtype": "float32", "unit": "m"},
         ],
         "outputs": [
-            {"name": "action", "shape": [1, 1, len(labels)], "dtype": "float32", "labels": labels, "unit": units, "mode": "delta"}
+            {
+                "name": "action",
+                "shape": [1, 1, len(labels)],
+                "dtype": "float32",
+                "labels": labels,
+                "unit": units,
+                "mode": "delta",
+            }
         ],
         "control_hz": 30 if task.name == "so101" else 50,
         "chunk": 1,

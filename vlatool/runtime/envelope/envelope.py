@@ -49,8 +49,8 @@ class Envelope:
     """Bounds the commands of a robot, so that at each step a stop within its limits is known.
 
     In this order: finite, fresh (age, sequence), contract (shape, dtype), absolute position from the *commanded* state,
-    workspace, keep-out boxes and distances to keep, position, velocity, acceleration, jerk, and a stop that is proven to stay within all
-    of them. A command within the limits passes unchanged. One that is near is slowed, each joint by itself. One that is
+    workspace, keep-out boxes and distances to keep, position, velocity, acceleration, jerk, and a stop that is proven
+    to stay within all of them. A command within the limits passes unchanged. One that is near is slowed, each joint by itself. One that is
     beyond (a discontinuity, not finite, stale, of another shape) is rejected: the robot follows the stop that was
     proven last. So it does when a check raises, and when no command comes.
 
@@ -122,7 +122,8 @@ class Envelope:
         self.apart = apart
         if apart is not None and any(isinstance(axis, VelocityAxis) for axis in self._axes):
             raise UsageError(
-                "Distances are kept along positions, and a joint takes velocities.", "command positions, or pass no apart"
+                "Distances are kept along positions, and a joint takes velocities.",
+                "command positions, or pass no apart",
             )
         self.ready = False
         """Whether the envelope was started."""

@@ -79,7 +79,7 @@ class KeepApart:
 
 
 def _stop_of(axis: PositionAxis, sample: Sample, interval: float) -> tuple[tuple[float, float, float], Any, float]:
-    """Return start, phases (None for an axis without a stop of its own) and remaining time of the stop behind a sample."""
+    """Return start, phases (None for an axis that has no stop) and remaining time of the stop behind a sample."""
     if axis.max_jerk <= 0.0:
         return (sample.value, 0.0, 0.0), None, 0.0
     if sample.start is None:

