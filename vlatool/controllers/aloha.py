@@ -25,11 +25,12 @@ CHAINS: Mapping[str, Chain] = {
 class Aloha(ArmController):
     """ALOHA: the policy gives positions of 14 joints, those of the left arm first, 50 times in a second.
 
-    ``left_waist``, ``left_shoulder``, ``left_elbow``, ``left_forearm_roll``, ``left_wrist_angle`` and
-    ``left_wrist_rotate`` in rad, ``left_gripper`` in metres, and the same with ``right_``; messages have the same names. A gripper is the
-    position of its left finger from 0.021 (closed) to 0.057 (open), absolute in any mode. The start pose of each arm is
-    that of gym-aloha: 0, -0.96, 1.16, 0, -0.3, 0, 0.024. Neither a command nor the stop behind it brings the arms
-    nearer to each other than ``clearance_m``, by capsules around their links; the lag of the arms is within that.
+    They are ``left_waist``, ``left_shoulder``, ``left_elbow``, ``left_forearm_roll``, ``left_wrist_angle`` and
+    ``left_wrist_rotate`` in rad, ``left_gripper`` in metres, and the same with ``right_``; messages have these names. A
+    gripper is the position of its left finger from 0.021 (closed) to 0.057 (open), absolute in any mode. The start
+    pose of each arm is that of gym-aloha: 0, -0.96, 1.16, 0, -0.3, 0, 0.024. Neither a command nor the stop behind it
+    brings the arms nearer to each other than ``clearance_m``, by capsules around their links; what the arms lag behind
+    their commands is within that.
     """
 
     speed: float = 0.3

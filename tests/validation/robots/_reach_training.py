@@ -16,6 +16,7 @@ from vlatool.runtime.kinematics import Chain, arm
 GAIN, STEP_RAD = 0.12, 0.02
 """Share of the way to the goal in a step, and the longest step of a joint."""
 DAMPING = 0.05
+MAX_STEPS = 4000
 BOXES = {
     "franka": {"": ((0.3, -0.3, 0.2), (0.6, 0.3, 0.7))},
     "ur5e": {"": ((-0.6, -0.35, 0.2), (-0.3, 0.15, 0.6))},
@@ -100,7 +101,7 @@ def solve(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return joints (K, N) for tips (K, 3), from one start, and the distances that remain (K,)."""
     joints = np.tile(start, (len(targets), 1))
-    for _ in range(80):
+    for _ in range(50):
         error = targets - chain.tip_position(joints)
         error *= np.minimum(1.0, 0.05 / np.maximum(np.linalg.norm(error, axis=1, keepdims=True), 1e-9))
         jacobian = chain.jacobian(joints)[:, :3]
@@ -165,7 +166,7 @@ def train(task: Task, folder: Path, seconds: float) -> dict[str, float]:
     targets, goals = (torch.tensor(values, dtype=torch.float32) for values in (task.targets, task.states))
     optimizer = torch.optim.Adam(policy.parameters(), 2e-3)
     begin, steps = time.process_time(), 0
-    total = 4000
+    total = MAX_STEPS if seconds >= 60.0 else int(MAX_STEPS * seconds / 60.0)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total)
     moving = [place for own in task.places for place in own]
     while steps < total and time.process_time() - begin < seconds:

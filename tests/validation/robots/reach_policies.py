@@ -178,7 +178,7 @@ def judge(name: str, options: argparse.Namespace) -> bool:
     """Train, play and attack one robot; print what happened, and return whether all of it is right."""
     folder, models = options.output / name, str(options.models)
     controller = load("controllers", name)
-    task = Task(name, controller, 8000, seed=0)
+    task = Task(name, controller, 4000, seed=0)
     print(f"{name}: {len(task.targets)} targets ({task.share:.0%} of those drawn)", flush=True)
     if options.train or not (folder / "int8").is_dir():
         print(f"  trained: {train(task, folder / 'policy', options.seconds)}", flush=True)

@@ -50,9 +50,9 @@ class Envelope:
 
     In this order: finite, fresh (age, sequence), contract (shape, dtype), absolute position from the *commanded* state,
     workspace, keep-out boxes and distances to keep, position, velocity, acceleration, jerk, and a stop that is proven
-    to stay within all of them. A command within the limits passes unchanged. One that is near is slowed, each joint by itself. One that is
-    beyond (a discontinuity, not finite, stale, of another shape) is rejected: the robot follows the stop that was
-    proven last. So it does when a check raises, and when no command comes.
+    to stay within all of them. A command within the limits passes unchanged. One that is near is slowed, each joint by
+    itself. One that is beyond (a discontinuity, not finite, stale, of another shape) is rejected: the robot follows the
+    stop that was proven last. So it does when a check raises, and when no command comes.
 
     The state belongs to the robot, not to a policy: keep one envelope for each robot across chunks, episodes, fallbacks
     and policies. It is not a safety-rated function, and limits of velocity and acceleration do not bound torque.
