@@ -15,7 +15,7 @@ from vlatool.controllers._arm_messages import OUTPUTS, command_messages
 from vlatool.controllers._arm_policy import ArmPolicy, policy_of
 from vlatool.controllers._arm_return import plan_return
 from vlatool.controllers._arm_robot import ArmRobot, driver_names, finite, start_pose
-from vlatool.controllers._arm_state import ACTING, RETURNING, HALT, WAITING, ArmState
+from vlatool.controllers._arm_state import ACTING, HALT, RETURNING, WAITING, ArmState
 from vlatool.controllers._freshness import age_s, note_changes
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
 from vlatool.controllers._settings import check_range, check_rate
