@@ -77,6 +77,7 @@ def test_attention_of_torch_counts_as_its_two_products(policy_dir: Path, tmp_pat
     assert (found.macs, found.layers, found.traits) == (wanted.macs, wanted.layers, wanted.traits)
 
 
+@pytest.mark.soak("the counts of smaller policies in this file")
 def test_a_large_policy_is_counted_without_its_memory(tmp_path: Path) -> None:
     folder = tmp_path / "large"
     folder.mkdir()

@@ -189,7 +189,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BusError, match="There is no bag"):
         Bag(str(tmp_path / "none.mcap"), "node")
     (tmp_path / "note.txt").write_text("hello")
-    with pytest.raises(BusError, match=r"note.txt is no bag: its name ends in none of .bag, .mcap, .db3"):
+    with pytest.raises(BusError, match=r"note.txt is not a bag: its name ends in none of .bag, .mcap, .db3"):
         Bag(str(tmp_path / "note.txt"), "node")
     for name in ("junk.bag", "junk.mcap", "junk.db3", "junk"):
         path = tmp_path / name

@@ -13,8 +13,8 @@ import pytest
 import yaml
 from test_cli_run import written
 
-from vlatool.buses import QoS, open_bus
 from vlatool.bundle.spec import TensorSpec
+from vlatool.buses import QoS, open_bus
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.sensor_msgs import JointState
 from vlatool.messages.std_msgs import Header, String

@@ -303,7 +303,8 @@ def test_ignored_elements_and_scales():
 
 def test_proposal_guesses_what_the_spec_says():
     assert propose(spec_of((CAMERA,), SPEEDS))["output"] == {
-        "topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "elements": {"forward": "linear.x", "turn": "angular.z"},
+        "topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist",
+        "elements": {"forward": "linear.x", "turn": "angular.z"},
     }  # fmt: skip
     velocities = TensorSpec("state", (1, 2), unit=("rad", "rad/s"), labels=("a", "b"))
     assert propose(spec_of((velocities,)))["inputs"]["state"]["elements"] == {"a": "a.position", "b": "b.velocity"}

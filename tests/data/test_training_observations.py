@@ -114,6 +114,7 @@ def test_ranges_cover_what_the_training_saw_and_the_recording_did_not(tmp_path: 
     assert int8.manifest.made_by["calibration"]["samples"] == 16 + MAX_PLAYED, "half of a recording is held out"
 
 
+@pytest.mark.soak("observations of one training: test_ranges_cover_what_the_training_saw_and_the_recording_did_not")
 def test_an_input_may_be_called_as_it_likes_and_a_second_training_keeps_its_own(tmp_path: Path):
     folder = folder_of(tmp_path / "policy")
     for name in ("policy.yaml", "policy.py", "environment.py"):

@@ -146,6 +146,7 @@ def test_a_policy_that_was_edited_has_students_too(deep: Path, tmp_path: Path):
     assert training_of(made)["parameters"]["teacher"] == parameters(load_modules(source))
 
 
+@pytest.mark.soak("the stages one by one: test_it_is_what_the_stages_make_one_by_one_and_is_made_again")
 def test_a_candidate_of_a_recipe_is_the_same(deep: Path, tmp_path: Path):
     entries = ({"distill.policy": {**SHORT, "student": STUDENT, "control": "noise"}},)
     assert [stage.name() for stage in transforms(entries)] == STAGES

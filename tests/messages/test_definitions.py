@@ -66,7 +66,7 @@ def test_ros1_text_and_sum_are_those_of_rosbags(cls: type[Message]) -> None:
 
 
 def test_hashes_that_rmw_zenoh_documents() -> None:
-    """From docs/design.md of rmw_zenoh: the topic and the service of ROS 2's tutorials."""
+    """From the design page of rmw_zenoh: the topic and the service of ROS 2's tutorials."""
     assert rihs01(String) == "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
     added = service_rihs01(AddTwoIntsRequest, AddTwoIntsResponse)
     assert added == "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"

@@ -52,7 +52,7 @@ def test_bag_of_another_node_is_replayed_bit_for_bit(tmp_path, monkeypatch, requ
     assert (found.equal, found.note, found.unheard) == (True, "", 0)
     assert found.steps == result.summary.steps
     assert replay(GoTo(**{**SETTINGS, "speed": 0.01}), recording.items(), recording.topics).differing > 0
-    with pytest.raises(DataError, match="was recorded with 'go-to'.*not with 'vln'"):
+    with pytest.raises(DataError, match=r"was recorded with 'go-to'.*not with 'vln'"):
         open_recording(path, "vln")
 
 

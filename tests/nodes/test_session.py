@@ -58,7 +58,7 @@ def test_run_moves_the_robot_and_its_log_is_replayed(plan, world, tmp_path):
     assert ended[0][0] is result
     assert ended[0][1].steps == found["steps"]
     assert ended[0][1].points[-1].notes["seen"] == 1.0
-    again = replay(GoTo(**{**plan.settings}), read_log(tmp_path / "log"), None)
+    again = replay(GoTo(**plan.settings), read_log(tmp_path / "log"), None)
     assert (again.equal, again.steps, again.note) == (True, found["steps"], "")
     json.dumps(found, allow_nan=False)
 

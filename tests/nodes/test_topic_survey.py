@@ -47,7 +47,7 @@ def test_rates_ages_publishers_and_conflicts():
     found = {report.topic: report for report in survey(bus, "survey", 0.5)}
     assert list(found) == sorted(found)
     assert found["/odom"].publishers == ("robot",)
-    assert found["/odom"].messages >= 3
+    assert found["/odom"].messages >= 2
     assert found["/odom"].hz > 1
     assert found["/odom"].age_ms == pytest.approx(100, abs=90)
     assert found["/odom"].problems == ()

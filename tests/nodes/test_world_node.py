@@ -78,7 +78,7 @@ def test_bus_that_fails_ends_it(exchange):
 
 
 def test_message_without_header_is_passed_on():
-    from vlatool.nodes.world_node import stamped
+    from vlatool.nodes.world_node import restamp
 
     message = String("a")
-    assert stamped(message, 5.0) is message
+    assert restamp(message, 5.0) is message

@@ -134,6 +134,7 @@ def made_at(cache: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in (cache / "stages").rglob("*") if path.is_file()}
 
 
+@pytest.mark.soak("a search that was interrupted and goes on: test_an_interrupted_search_goes_on_where_it_was")
 def test_a_second_search_makes_and_measures_nothing_again(search, shared_cache) -> None:
     search(cache=shared_cache).run({})
     before = made_at(shared_cache)

@@ -162,6 +162,7 @@ def test_the_luckiest_run_of_the_whole_policy_is_not_what_it_takes(
     assert 0.95 * target <= clock.ms(read_edits(pruned)) <= 1.01 * target
 
 
+@pytest.mark.soak("targets that are met: test_the_target_is_met_and_made_again_without_measuring")
 def test_kernels_that_like_some_widths_better_do_not_end_the_search(
     counted: None, deep: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

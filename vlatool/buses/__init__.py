@@ -1,9 +1,9 @@
 """Buses: how a controller's messages reach a robot; one file each, whose library is imported when it is opened."""
 
 from vlatool.buses._interface import (
-    ABORTED,
-    CANCELED,
-    SUCCEEDED,
+    GOAL_ABORTED,
+    GOAL_CANCELED,
+    GOAL_SUCCEEDED,
     ActionBus,
     ActionType,
     Bus,
@@ -18,9 +18,9 @@ from vlatool.buses._interface import (
 )
 
 __all__ = [
-    "ABORTED",
-    "CANCELED",
-    "SUCCEEDED",
+    "GOAL_ABORTED",
+    "GOAL_CANCELED",
+    "GOAL_SUCCEEDED",
     "ActionBus",
     "ActionType",
     "Bus",

@@ -49,7 +49,7 @@ class BagReader:
                 f"There is no bag {path}.", "name a .bag, .mcap or .db3 file, or the directory of a ROS 2 bag"
             )
         if not path.is_dir() and path.suffix not in SUFFIXES:
-            raise BusError(f"{path} is no bag: its name ends in none of {', '.join(SUFFIXES)}.", "name a bag")
+            raise BusError(f"{path} is not a bag: its name ends in none of {', '.join(SUFFIXES)}.", "name a bag")
         with _readable(path):
             self._reader = library.Reader(path)
             self._reader.open()
@@ -86,7 +86,7 @@ class BagReader:
                 )  # fmt: skip
         return kind
 
-    def known(self) -> tuple[str, ...]:
+    def readable_topics(self) -> tuple[str, ...]:
         """Return the topics whose messages can be read, sorted by name."""
         found = []
         for topic in sorted(self.types):

@@ -16,7 +16,7 @@ ROSBAG2_VERSION = 8
 """Version of the metadata; that of Iron, which later releases read, too."""
 MAX_WAITING_BYTES = 256_000_000
 """Encoded messages that wait for the disk at most; what comes beyond is not recorded, and counted."""
-ANOTHER = "name a path that does not exist; nothing is replaced"
+ANOTHER_PATH = "name a path that does not exist; nothing is replaced"
 
 
 class _Line(NamedTuple):
@@ -43,7 +43,7 @@ class BagWriter:
         self.path = path if self._first or path.suffix not in (".mcap", ".db3") else path.with_suffix("")
         library: Any = require("rosbags.rosbag1" if self._first else "rosbags.rosbag2", "data")
         if self.path.exists():
-            raise OutputError(f"{self.path} exists already.", ANOTHER)
+            raise OutputError(f"{self.path} exists already.", ANOTHER_PATH)
         self.lost = 0
         """Messages that were not recorded, because the disk was too slow."""
         self._changed = threading.Condition()

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from typing import NamedTuple
 
-from vlatool.buses._interface import ABORTED, CANCELED, Goal, Outcome
+from vlatool.buses._interface import GOAL_ABORTED, GOAL_CANCELED, Goal, Outcome
 from vlatool.messages import Message
 
 
@@ -98,10 +98,10 @@ class Goals:
     def _outcome(self, entry: _Entry) -> Outcome:
         """Return how a goal ends; a goal that was canceled before its start does not run."""
         if entry.goal.canceled.is_set():
-            return Outcome(CANCELED, self._result())
+            return Outcome(GOAL_CANCELED, self._result())
         entry.started()
         try:
             return self._handler(entry.goal)
         except Exception:  # the client learns that its goal is over; who wrote the handler sees the traceback
             threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
-            return Outcome(ABORTED, self._result())
+            return Outcome(GOAL_ABORTED, self._result())

@@ -64,7 +64,8 @@ class TopicInfo:
     subscribers: tuple[str, ...] = ()
 
 
-class Fault(NamedTuple):
+@dataclass(frozen=True)
+class Fault:
     """What went wrong on a topic or a service while its messages were handled.
 
     Args:
@@ -122,7 +123,7 @@ class Bus(Protocol):
         """Leave the bus; what is sent has left this process. Closing twice does nothing."""
 
 
-SUCCEEDED, CANCELED, ABORTED = "succeeded", "canceled", "aborted"
+GOAL_SUCCEEDED, GOAL_CANCELED, GOAL_ABORTED = "succeeded", "canceled", "aborted"
 """How a goal of an action ends."""
 
 
@@ -143,7 +144,7 @@ class ActionType(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How a goal ended: ``SUCCEEDED``, ``CANCELED`` or ``ABORTED``, and the result."""
+    """How a goal ended: ``GOAL_SUCCEEDED``, ``GOAL_CANCELED`` or ``GOAL_ABORTED``, and the result."""
 
     status: str
     result: Message

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import ipaddress
 import os
 import socket
 import xmlrpc.client
@@ -43,13 +42,20 @@ def master_uri(address: str) -> str:
     return uri
 
 
-def is_loopback(uri: str) -> bool:
-    """Return whether a master runs on this machine's loopback interface, by its address."""
-    host = urlsplit(uri).hostname or ""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+def own_address(uri: str) -> str:
+    """Return the address at which this machine is reached from a master, an IPv4 address; empty where none is found.
+
+    rospy would tell other nodes this machine's host name, which they often cannot resolve; then no message arrives, and
+    nothing says why.
+    """
+    parts = urlsplit(uri)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
+        try:
+            route.connect((parts.hostname or "", parts.port or 0))  # sends nothing
+        except OSError:
+            return ""
+        address: str = route.getsockname()[0]
+    return address
 
 
 class _Transport(xmlrpc.client.Transport):
@@ -153,13 +159,14 @@ def ask(uri: str, method: str, *arguments: Any, timeout_s: float = TIMEOUT_S) ->
         raise BusError(f"No ROS 1 master answers at {uri}: {why}.", START) from None
     except (xmlrpc.client.Error, TypeError, ValueError, SyntaxError) as error:
         what = " ".join(str(error).split())[:100]
-        raise BusError(f"What answers at {uri} is no ROS 1 master: {what}.", START) from None
+        raise BusError(f"What answers at {uri} is not a ROS 1 master: {what}.", START) from None
     except Exception as error:  # expat's error, which has no base class but this
-        raise BusError(f"What answers at {uri} is no ROS 1 master: {str(error)[:100]}.", START) from None
+        raise BusError(f"What answers at {uri} is not a ROS 1 master: {str(error)[:100]}.", START) from None
 
 
 def _reason(error: Exception) -> str:
-    return (getattr(error, "strerror", None) or str(error) or type(error).__name__).rstrip(".").lower()
+    words = " ".join((getattr(error, "strerror", None) or str(error)).split())[:100]
+    return words.rstrip(".").lower() or type(error).__name__
 
 
 def _types(name: str) -> tuple[str, ...]:

@@ -5,7 +5,6 @@ All of it is guarded by ``Space.changed``, which whoever calls a method holds un
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 import uuid
@@ -27,15 +26,16 @@ class Subscription:
 
     Args:
         owner: Node that subscribes.
+        topic: Name of the topic.
         ready: What that node has to deliver, in order: a subscription for each message that waits in it.
         handler: Called with each message.
         depth: How many messages wait; the oldest gives way.
     """
 
     def __init__(
-        self, owner: Sim, ready: deque[Subscription], handler: Callable[[Reception], None], depth: int
+        self, owner: Sim, topic: str, ready: deque[Subscription], handler: Callable[[Reception], None], depth: int
     ) -> None:
-        self.owner, self._ready, self._handler = owner, ready, handler
+        self.owner, self._topic, self._ready, self._handler = owner, topic, ready, handler
         self.waiting: deque[Reception] = deque(maxlen=max(1, depth))
 
     def put(self, reception: Reception) -> None:
@@ -45,11 +45,11 @@ class Subscription:
         self.waiting.append(reception)
 
     def handle(self, reception: Reception) -> None:
-        """Call the handler, without the lock; what it raises is printed, and the next message comes nevertheless."""
+        """Call the handler, without the lock; what it raises is counted, and the next message comes nevertheless."""
         try:
             self._handler(reception)
-        except Exception:
-            threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
+        except Exception as error:
+            self.owner.record_fault(self._topic, error)
 
 
 class Topic:
@@ -75,9 +75,10 @@ class Served:
     """A service of an address."""
 
     def __init__(
-        self, owner: Sim, request: type[Message], response: type[Message], handler: Callable[[Any], Message]
+        self, owner: Sim, name: str, request: type[Message], response: type[Message], handler: Callable[[Any], Message]
     ) -> None:
-        self.owner, self.request, self.response, self._handler = owner, request, response, handler
+        self.owner, self.request, self.response = owner, request, response
+        self._name, self._handler = name, handler
 
     def ask(self, request: Message, timeout_s: float) -> Message | Exception | None:
         """Return the answer, what the handler raised, or None when neither comes in time; called without the lock."""
@@ -87,6 +88,7 @@ class Served:
             try:
                 answers.append(self._handler(request))
             except Exception as error:
+                self.owner.record_fault(self._name, error)
                 answers.append(error)
 
         thread = threading.Thread(target=answer, name="sim service", daemon=True)
@@ -143,7 +145,7 @@ class Space:
         self.actions: dict[str, ServedAction] = {}
         self.clock_s: float | None = None
 
-    def now(self) -> float:
+    def now_s(self) -> float:
         """Return the simulated time, or that of ``time.monotonic`` where none is set, in seconds."""
         return time.monotonic() if self.clock_s is None else self.clock_s
 

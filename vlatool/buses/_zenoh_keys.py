@@ -1,46 +1,27 @@
 """Key expressions, liveliness tokens and attachments of rmw_zenoh, the ROS 2 middleware on Zenoh.
 
-Layout of tokens: ``docs/design.md`` and ``liveliness_utils.cpp`` of rmw_zenoh; of attachments: its 33 bytes since 0.3.
+Layout of tokens: the page on the design of rmw_zenoh and its ``liveliness_utils.cpp``; of attachments: its 33 bytes.
 """
 
 from __future__ import annotations
 
 import hashlib
 import struct
-from typing import NamedTuple
 
+from vlatool.buses._graph import CLIENT, PUBLISHER, SERVICE, SUBSCRIBER, Entity
 from vlatool.buses._interface import QoS
 from vlatool.buses._names import dds_type, ros_type
 
 SPACE = "@ros2_lv"
 """First part of every liveliness token."""
-NODE, PUBLISHER, SUBSCRIBER, SERVICE, CLIENT = "NN", "MP", "MS", "SS", "SC"
+NODE = "NN"
+"""Kind of a node's token; the other kinds are those of the graph."""
 NO_NAME = "%"
 """What stands for an empty name and for each slash in one."""
 ATTACHMENT = struct.Struct("<qqB16s")
 """Sequence number, nanoseconds since the epoch, length of what follows, identifier of the sender (gid)."""
 PARTS = 13
 """Parts of the token of a publisher, a subscriber, a service or a client."""
-
-
-class Entity(NamedTuple):
-    """A publisher, subscriber, service or client on the bus, as its token describes it.
-
-    Args:
-        session: Identifier of its Zenoh session.
-        kind: ``MP``, ``MS``, ``SS`` or ``SC``.
-        node: Name of its node, with the namespace if it is in one.
-        topic: Full name of its topic or service.
-        type_name: ROS 2 name of its type.
-        type_hash: RIHS01 hash of its type.
-    """
-
-    session: str
-    kind: str
-    node: str
-    topic: str
-    type_name: str
-    type_hash: str
 
 
 def data_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:
@@ -75,7 +56,7 @@ def qos_text(qos: QoS) -> str:
 
 
 def parse(token: str) -> Entity | None:
-    """Return what a token describes; None for that of a node, and for what is no token of rmw_zenoh."""
+    """Return what a token describes; None for that of a node, and for what rmw_zenoh does not write."""
     parts = token.split("/")
     if len(parts) != PARTS or parts[0] != SPACE or parts[5] not in (PUBLISHER, SUBSCRIBER, SERVICE, CLIENT):
         return None

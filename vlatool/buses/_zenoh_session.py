@@ -55,9 +55,7 @@ def _settings(zenoh: Any, endpoint: str, serves: bool, chosen: bool) -> Any:
         try:
             settings = zenoh.Config.from_file(file)
         except zenoh.ZError as error:
-            raise UsageError(
-                f"{CONFIG} names '{file}', which is no settings of Zenoh: {error}", "correct it"
-            ) from error
+            raise UsageError(f"{CONFIG} names '{file}', which Zenoh cannot read: {error}", "correct it") from error
         values = {"connect/endpoints": [endpoint]} if chosen and not serves else {}
         values |= _values(endpoint, serves) if serves else {}
     for key, value in values.items():
@@ -67,7 +65,8 @@ def _settings(zenoh: Any, endpoint: str, serves: bool, chosen: bool) -> Any:
 
 def _values(endpoint: str, serves: bool) -> dict[str, Any]:
     shared: dict[str, Any] = {
-        "scouting/multicast/enabled": False, "scouting/gossip/enabled": True, "timestamping/enabled": True,
+        "scouting/multicast/enabled": False, "scouting/gossip/enabled": True, "scouting/delay": 1,
+        "timestamping/enabled": True,
     }  # fmt: skip
     if serves:
         return {**shared, "mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": []}

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from vlatool.buses._bag_reader import BagReader, Recorded
 from vlatool.buses._bag_writer import BagWriter
-from vlatool.buses._interface import M, QoS, Reception, TopicInfo
+from vlatool.buses._faults import Faults
+from vlatool.buses._interface import Fault, M, QoS, Reception, TopicInfo
 from vlatool.buses._names import check_node, resolve
 from vlatool.errors import BusError, UsageError
 from vlatool.messages import Message
@@ -55,9 +56,11 @@ class Bag:
         self._lock = threading.Lock()
         self._closed, self.ended = threading.Event(), threading.Event()
         """``ended`` is set when the recording is over."""
+        self._thread: threading.Thread | None = None
         self._began_s: float | None = None
         self._time_ns: int | None = None
         self._failure: Exception | None = None
+        self._faults = Faults()
 
     @property
     def duration_s(self) -> float:
@@ -104,6 +107,10 @@ class Bag:
             for name in sorted(types)
         ]
 
+    def faults(self) -> list[Fault]:
+        """See ``Bus.faults``; a damaged recording is not among them: ``close`` raises it."""
+        return self._faults.listing()
+
     def stamp(self) -> Time:
         """Return the recorded time of this moment; without a recording, that of the system's clock."""
         if self._reader is None:
@@ -132,7 +139,7 @@ class Bag:
         """
         if self._reader is None:
             raise BusError("This bus was opened without a recording.", "open bag:RECORDING")
-        yield from self._reader.messages(topics or self._reader.known())
+        yield from self._reader.messages(topics or self._reader.readable_topics())
 
     def play(self, until_s: float = float("inf")) -> int:
         """Hand the recorded messages to the handlers, in order and in this thread; return how many there were.
@@ -165,8 +172,10 @@ class Bag:
         if self._closed.is_set():
             return
         self._closed.set()
-        if self._began_s is not None and threading.current_thread() is not self._thread:
-            self._thread.join(5.0)
+        with self._lock:
+            thread = self._thread
+        if thread is not None and threading.current_thread() is not thread:
+            thread.join(5.0)
         if self._reader is not None:
             self._reader.close()
         if self._writer is not None:
@@ -208,8 +217,8 @@ class Bag:
             if self._began_s is not None or self._reader is None or self._closed.is_set():
                 return
             self._began_s = time.monotonic()
-        self._thread = threading.Thread(target=self._play_in_time, name="bag", daemon=True)
-        self._thread.start()
+            self._thread = threading.Thread(target=self._play_in_time, name="bag", daemon=True)
+            self._thread.start()
 
     def _play_in_time(self) -> None:
         began = self._began_s or 0.0
@@ -219,8 +228,11 @@ class Bag:
                 if self._closed.wait(max(0.0, wait_s)) if wait_s > 0 else self._closed.is_set():
                     return
                 for handler in tuple(self._handlers[topic]):
-                    handler(Reception(message, time.monotonic()))
-        except Exception as error:  # the recording is damaged, or a handler failed
+                    try:
+                        handler(Reception(message, time.monotonic()))
+                    except Exception as error:
+                        self._faults.add_raised(topic, error)
+        except BusError as error:  # the recording is damaged
             self._failure = error
         finally:
             self.ended.set()

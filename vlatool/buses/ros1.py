@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import logging
 import os
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
-from vlatool.buses._interface import M, QoS, Reception, TopicInfo
+from vlatool.buses._faults import Faults
+from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
 from vlatool.buses._names import check_node, resolve
-from vlatool.buses._ros1_master import Master, ask, is_loopback, master_uri
+from vlatool.buses._ros1_master import Master, ask, master_uri, own_address
 from vlatool.buses._rospy_types import carrier, service_class
+from vlatool.buses._topic_actions import TopicActionClient, TopicActionServer, TopicGoal
 from vlatool.errors import BusError, MissingExtra
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -49,8 +50,9 @@ class Ros1:
         if not _used.acquire(blocking=False):
             raise BusError("A second node of ROS 1 was opened in this process.", RESTART)
         self._rospy: Any = rospy
-        self.malformed: dict[str, int] = {}
-        """Topic -> messages that came and could not be read."""
+        self._faults = Faults()
+        self._actions: list[TopicActionServer] = []
+        self._action_clients: dict[str, TopicActionClient] = {}
         self._closed = threading.Event()
         self._kinds: dict[str, type[Message]] = {}
         self._publishers: dict[str, Any] = {}
@@ -61,8 +63,8 @@ class Ros1:
 
     def _start(self, uri: str, node: str) -> None:
         os.environ["ROS_MASTER_URI"] = uri
-        if is_loopback(uri) and not {"ROS_IP", "ROS_HOSTNAME"} & {*os.environ}:
-            os.environ["ROS_IP"] = "127.0.0.1"
+        if not {"ROS_IP", "ROS_HOSTNAME"} & {*os.environ} and (address := own_address(uri)):
+            os.environ["ROS_IP"] = address
         renamed = self._rospy.names.get_mappings().get("__name", node)
         self._master.caller = f"{self._rospy.get_namespace()}{renamed.lstrip('/')}"
         try:
@@ -83,10 +85,13 @@ class Ros1:
         def receive(got: Any) -> None:
             received_s = time.monotonic()
             if got.content is None:
-                self._count_malformed(name, message)
+                self._faults.add(name, _malformed(name, message))
                 return
-            with one_at_a_time:
-                handler(Reception(got.content, received_s))
+            try:
+                with one_at_a_time:
+                    handler(Reception(got.content, received_s))
+            except Exception as error:  # rospy would print it, once for each message
+                self._faults.add_raised(name, error)
 
         self._subscribers[name] = self._rospy.Subscriber(
             name, carrier(message), receive, queue_size=max(1, qos.depth), buff_size=BUFFER_BYTES, tcp_nodelay=True
@@ -119,6 +124,7 @@ class Ros1:
             try:
                 return kind._response_class(handler(got.content))
             except Exception as error:
+                self._faults.add_raised(name, error)
                 raise self._rospy.ServiceException(str(error)) from error
 
         self._rospy.Service(name, kind, answer)
@@ -155,6 +161,19 @@ class Ros1:
         found: M = answers[0].content
         return found
 
+    def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
+        """See ``ActionBus.serve_action``; the action is one of actionlib, whose topics are below its name."""
+        self._actions.append(TopicActionServer(self, self._resolved(action), kind, handler))
+
+    def send_goal(
+        self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
+    ) -> TopicGoal:
+        """See ``ActionBus.send_goal``."""
+        name = self._resolved(action)
+        if name not in self._action_clients:
+            self._action_clients[name] = TopicActionClient(self, self.node, name, kind)
+        return self._action_clients[name].send(goal, feedback)
+
     def topics(self) -> list[TopicInfo]:
         """See ``Bus.topics``; of each topic the master knows one type, that of its last publisher.
 
@@ -162,6 +181,10 @@ class Ros1:
             BusError: when the master does not answer.
         """
         return self._master.topics()
+
+    def faults(self) -> list[Fault]:
+        """See ``Bus.faults``."""
+        return self._faults.listing()
 
     def stamp(self) -> Time:
         """Return ROS time: that of the system's clock, or that of ``/clock`` where ``/use_sim_time`` is set."""
@@ -179,6 +202,8 @@ class Ros1:
         """See ``Bus.close``; what waits is written within half a second, and the master forgets this node."""
         if self._closed.is_set():
             return
+        for server in self._actions:
+            server.close()
         self._closed.set()
         until = time.monotonic() + FLUSH_S
         while any(map(_is_waiting, self._publishers.values())) and time.monotonic() < until:
@@ -221,11 +246,6 @@ class Ros1:
     def _why_over(self) -> str:
         return "it was closed" if self._closed.is_set() else "another node of the same name took its place"
 
-    def _count_malformed(self, name: str, message: type[Message]) -> None:
-        self.malformed[name] = self.malformed.get(name, 0) + 1
-        if self.malformed[name] == 1:
-            logging.getLogger(__name__).warning("A message on %s is no %s; such are left out.", name, message.TYPE)
-
     def _watch(self) -> None:
         """End the node when the main thread has, and register again at a master that was started anew."""
         looks = 0
@@ -249,6 +269,12 @@ class Ros1:
             ask(own, "publisherUpdate", "/master", name, present or [])
         for name, uri in registration.get_service_manager().get_services():
             self._master.ask("registerService", name, uri, own)
+
+
+def _malformed(name: str, message: type[Message]) -> BusError:
+    return BusError(
+        f"A message on {name} is malformed, although the MD5 sum is that of {message.TYPE}.", "see what its node sends"
+    )
 
 
 def _is_waiting(publisher: Any) -> bool:

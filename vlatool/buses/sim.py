@@ -8,8 +8,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from vlatool.buses._faults import Faults
 from vlatool.buses._goals import Goals
-from vlatool.buses._interface import ActionType, Goal, M, Outcome, QoS, Reception, TopicInfo
+from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
 from vlatool.buses._names import check_node, resolve
 from vlatool.buses._sim_space import LocalGoal, Served, ServedAction, Subscription, Topic, join
 from vlatool.errors import BusError
@@ -33,6 +34,7 @@ class Sim:
         self.busy = self._closed = False
         """Whether a handler of this node is at work."""
         self._actions: list[Goals] = []
+        self._faults = Faults()
         self._space = join(address, self)
         self._thread = threading.Thread(target=self._deliver, name=f"sim {node}", daemon=True)
         self._thread.start()
@@ -41,10 +43,10 @@ class Sim:
         """See ``Bus.subscribe``."""
         with self._space.changed:
             found = self._topic(topic, message)
-            subscription = Subscription(self, self._ready, handler, qos.depth)
+            subscription = Subscription(self, found.name, self._ready, handler, qos.depth)
             found.subscriptions.append(subscription)
             if qos.latched and found.latched is not None:
-                subscription.put(Reception(found.latched, self._space.now()))
+                subscription.put(Reception(found.latched, self._space.now_s()))
             self._space.changed.notify_all()
 
     def publisher(self, topic: str, message: type[M], qos: QoS) -> Callable[[M], None]:
@@ -64,7 +66,7 @@ class Sim:
                 self._refuse_closed()
                 found.latched = content if qos.latched else found.latched
                 for subscription in found.subscriptions:
-                    subscription.put(Reception(content, self._space.now()))
+                    subscription.put(Reception(content, self._space.now_s()))
                 self._space.changed.notify_all()
 
         return send
@@ -79,7 +81,7 @@ class Sim:
                     f"The service {name} is served already, by {self._space.services[name].owner.node}.",
                     "stop that node, or give the service another name",
                 )
-            self._space.services[name] = Served(self, request, response, handler)
+            self._space.services[name] = Served(self, name, request, response, handler)
             self._space.changed.notify_all()
 
     def call(self, service: str, request: Message, response: type[M], timeout_s: float) -> M:
@@ -136,6 +138,14 @@ class Sim:
         with self._space.changed:
             return [topic.info() for _, topic in sorted(self._space.topics.items()) if topic.is_used()]
 
+    def faults(self) -> list[Fault]:
+        """See ``Bus.faults``."""
+        return self._faults.listing()
+
+    def record_fault(self, topic: str, error: Exception) -> None:
+        """Count what a handler of a topic or service raised."""
+        self._faults.add_raised(topic, error)
+
     def stamp(self) -> Time:
         """Return the simulated time where one is set, else that of the system's clock."""
         with self._space.changed:
@@ -170,12 +180,12 @@ class Sim:
     def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
         """See ``Bus.wait_for_peers``."""
 
-        def alone() -> tuple[str, ...]:
+        def without_peer() -> tuple[str, ...]:
             return tuple(name for name in topics if not self._has_peer(resolve(name, self.node)))
 
         with self._space.changed:
-            self._space.changed.wait_for(lambda: not alone(), timeout_s)
-            return alone()
+            self._space.changed.wait_for(lambda: not without_peer(), timeout_s)
+            return without_peer()
 
     def close(self) -> None:
         """See ``Bus.close``."""

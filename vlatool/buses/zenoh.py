@@ -9,25 +9,15 @@ from itertools import count
 from typing import Any, TypeVar
 
 from vlatool.buses._faults import Faults
+from vlatool.buses._graph import CLIENT, PUBLISHER, SERVICE, SUBSCRIBER, Entity
 from vlatool.buses._inbox import Inbox
 from vlatool.buses._interface import Fault, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, domain_id, full_topic
-from vlatool.buses._zenoh_graph import Graph
-from vlatool.buses._zenoh_keys import (
-    ATTACHMENT,
-    CLIENT,
-    PUBLISHER,
-    SERVICE,
-    SUBSCRIBER,
-    Entity,
-    attachment,
-    data_key,
-    entity_token,
-    gid_of,
-    node_token,
-)  # fmt: skip
+from vlatool.buses._names import domain_id
+from vlatool.buses._ros_names import check_node, resolve
+from vlatool.buses._zenoh_graph import ZenohGraph
+from vlatool.buses._zenoh_keys import ATTACHMENT, attachment, data_key, entity_token, gid_of, node_token
 from vlatool.buses._zenoh_session import open_session
-from vlatool.errors import BusError
+from vlatool.errors import BusError, require
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.cdr import decode, encode
@@ -58,9 +48,8 @@ class Zenoh:
         check_node(node)
         self._domain, self._node = domain_id(), node
         self._session = open_session(address)
-        import zenoh  # type: ignore[import-not-found, unused-ignore]
-
-        self._zenoh: Any = zenoh
+        self._zenoh: Any = require("zenoh", "zenoh")
+        self._advanced: Any = require("zenoh.ext", "zenoh")
         self._faults = Faults()
         self._id = str(self._session.info.zid())
         self._numbers = count(1)
@@ -69,7 +58,7 @@ class Zenoh:
         self._inboxes: list[Inbox] = []
         self._clients: dict[str, bytes] = {}
         self._closed = False
-        self._graph = Graph(zenoh, self._session, self._domain, self._faults)
+        self._graph = ZenohGraph(self._zenoh, self._session, self._domain, self._faults)
         self._keep(self._session.liveliness().declare_token(node_token(self._domain, self._id, node)))
 
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
@@ -78,16 +67,17 @@ class Zenoh:
         Raises:
             BusError: when the topic carries another type.
         """
-        name, zenoh = full_topic(topic), self._zenoh
+        name, zenoh = resolve(topic, self._node), self._zenoh
         self._check(name, message)
         inbox = Inbox(name, message, handler, qos.depth, lambda payload: payload.to_bytes(), self._faults)
         hear = zenoh.handlers.Callback(lambda sample: inbox.put(sample.payload), indirect=False)
         key = self._key(name, message)
         if qos.latched:
-            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=max(1, qos.depth))
-            recovery = zenoh.ext.RecoveryConfig(heartbeat=True)
+            advanced = self._advanced
+            history = advanced.HistoryConfig(detect_late_publishers=True, max_samples=max(1, qos.depth))
+            recovery = advanced.RecoveryConfig(heartbeat=True)
             self._keep(
-                zenoh.ext.declare_advanced_subscriber(self._session, key, hear, history=history, recovery=recovery)
+                advanced.declare_advanced_subscriber(self._session, key, hear, history=history, recovery=recovery)
             )
         else:
             self._keep(self._session.declare_subscriber(key, hear))
@@ -101,7 +91,7 @@ class Zenoh:
         Raises:
             BusError: when the topic carries another type.
         """
-        name = full_topic(topic)
+        name = resolve(topic, self._node)
         self._check(name, message)
         publisher = self._keep(self._declare_publisher(self._key(name, message), qos))
         gid = self._announce(PUBLISHER, name, message.TYPE, rihs01(message), qos)
@@ -117,7 +107,7 @@ class Zenoh:
 
     def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
         """Answer a service, one request at a time, in a thread of the service."""
-        name = full_topic(service)
+        name = resolve(service, self._node)
         type_name, type_hash = _service_type(request, response)
         key = data_key(self._domain, name, type_name, type_hash)
 
@@ -139,7 +129,7 @@ class Zenoh:
         Raises:
             BusError: when nobody answers in time, the server refuses, or it serves another type.
         """
-        name, deadline = full_topic(service), time.monotonic() + timeout_s
+        name, deadline = resolve(service, self._node), time.monotonic() + timeout_s
         type_name, type_hash = _service_type(type(request), response)
         gid = self._client(name, type_name, type_hash)
         if not self._graph.wait(lambda: bool(self._graph.service_types(name)), timeout_s):
@@ -179,7 +169,7 @@ class Zenoh:
 
     def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
         """Wait until each topic has a peer: a publisher, or a subscriber; return those without."""
-        names = {topic: full_topic(topic) for topic in topics}
+        names = {topic: resolve(topic, self._node) for topic in topics}
         self._graph.wait(lambda: all(self._graph.has_peer(name) for name in names.values()), timeout_s)
         return tuple(topic for topic, name in names.items() if not self._graph.has_peer(name))
 
@@ -213,7 +203,7 @@ class Zenoh:
         entity = Entity(self._id, kind, self._node, topic, type_name, type_hash)
         token = entity_token(self._domain, next(self._numbers), entity, qos)
         self._keep(self._session.liveliness().declare_token(token))
-        self._graph.add_own(token)
+        self._graph.add_token(token)
         return gid_of(token)
 
     def _client(self, service: str, type_name: str, type_hash: str) -> bytes:
@@ -229,9 +219,10 @@ class Zenoh:
         }
         if not qos.latched:
             return self._session.declare_publisher(key, **options)
-        return zenoh.ext.declare_advanced_publisher(
-            self._session, key, **options, cache=zenoh.ext.CacheConfig(max(1, qos.depth)), publisher_detection=True,
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+        advanced = self._advanced
+        return advanced.declare_advanced_publisher(
+            self._session, key, **options, cache=advanced.CacheConfig(max(1, qos.depth)), publisher_detection=True,
+            sample_miss_detection=advanced.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
         )  # fmt: skip
 
 

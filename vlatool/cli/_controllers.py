@@ -240,12 +240,15 @@ def _plan_lines(found: Mapping[str, Any]) -> Iterator[str]:
 def _lines(result: RunResult) -> Iterator[str]:
     found = result.to_dict()
     late, compute, over = (found[name] for name in ("late_ms", "compute_ms", "overhead_ms"))
-    yield f"{found['steps']} steps in {found['seconds']:.1f} s, {found['skipped']} left out; {printable(found['status'])}"
+    yield printable(
+        f"{found['steps']} steps in {found['seconds']:.1f} s, {found['skipped']} left out; {found['status']}"
+    )
     if found["steps"]:
         yield (f"  late p99 {late['p99']:.2f} ms, controller p50 {compute['p50']:.2f} ms, p99 {compute['p99']:.2f} ms, "
                f"overhead p99 {over['p99']:.2f} ms")  # fmt: skip
     if any(found["overwritten"].values()):
-        yield f"  came too fast: {', '.join(f'{name} {count}' for name, count in found['overwritten'].items() if count)}"
+        many = ", ".join(f"{name} {count}" for name, count in found["overwritten"].items() if count)
+        yield f"  came faster than the steps: {many}"
     if found["lost_records"] or found["failure"] or found["log_full"]:
         reason = found["failure"] or ("the log was full" if found["log_full"] else f"{found['lost_records']} were lost")
         yield printable(f"  the records of the steps are not whole: {reason}")

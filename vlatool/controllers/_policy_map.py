@@ -1,9 +1,10 @@
 """Which topics are the inputs of a policy, and what its actions command: read from a map, checked against the spec.
 
 A map has two parts. ``inputs``: input of the spec -> ``topic``, ``type``, and for a vector ``elements``: element ->
-``JOINT.position`` of a JointState, or a path such as ``pose.pose.position.x`` of another message. A text has ``topic`` or
-``text``, past actions have ``source: actions``. ``output``: ``topic``, ``type``, and ``elements``: element of the action ->
-joint, or path in a Twist; of discrete actions, ``labels``: label -> path -> number. What is not used is in ``ignore``.
+``JOINT.position`` of a JointState, or a path such as ``pose.pose.position.x`` of another message. A text has ``topic``
+or ``text``, past actions have ``source: actions``. ``output``: ``topic``, ``type``, and ``elements``: element of the
+action -> joint, or path in a Twist; of discrete actions, ``labels``: label -> path -> number. What is not used is in
+``ignore``.
 """
 
 from __future__ import annotations
@@ -147,7 +148,8 @@ KEYS = {
 def _input(tensor: TensorSpec, entry: Any) -> InputMap:
     kind, where = kind_of(tensor), f"The map of the input '{tensor.name}'"
     _check_keys(entry, KEYS[kind], where)
-    shared: dict[str, Any] = {"stale_s": _number(entry.get("stale_s", 0.5), f"{where}: stale_s"), "noisy": bool(entry.get("noisy"))}
+    stale_s = _number(entry.get("stale_s", 0.5), f"{where}: stale_s")
+    shared: dict[str, Any] = {"stale_s": stale_s, "noisy": bool(entry.get("noisy"))}
     if kind == ACTIONS:
         if entry.get("source") != "actions":
             raise UsageError(f"{where} is {entry!r:.60}; it holds past actions.", "write source: actions")
@@ -325,6 +327,6 @@ def _number(value: Any, where: str, least: float = 1e-9) -> float:
     """Return a finite number above a bound; a bound of 0 means any, as for a speed."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise UsageError(f"{where} is {value!r:.40}; it must be a number.", PRINT)
-    if value == 0.0 and least == -math.inf or 0 < least and value < least:
+    if (value == 0.0 and least == -math.inf) or 0 < least > value:
         raise UsageError(f"{where} is {value!r:.40}; it must be above 0.", PRINT)
     return float(value)

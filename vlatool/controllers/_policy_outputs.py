@@ -63,8 +63,8 @@ def _joints(output: OutputMap, header: Header, values: Array, velocity: bool, pe
 
 
 def stop_of(output: OutputMap, stamp: Time, positions: Array | None = None) -> tuple[Message, ...]:
-    """Return what stops the robot: no speed; for positions an empty trajectory, at which ros2_control's joint trajectory
-    controller stops, or the positions where the joints are, or nothing where those are unknown.
+    """Return what stops the robot: no speed; for positions an empty trajectory, at which ros2_control's joint
+    trajectory controller stops, or the positions where the joints are, or nothing where those are unknown.
     """
     header = Header(stamp, output.frame)
     if output.message in (Twist, TwistStamped):

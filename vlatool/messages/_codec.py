@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 from vlatool.errors import BusError
 from vlatool.messages._plan import plan_of
 from vlatool.messages._tails import Wire
-from vlatool.messages._wrong_values import WrongValue, explain
+from vlatool.messages._wrong_values import explain
 from vlatool.messages.schema import Message
 
 M = TypeVar("M", bound=Message)
 LARGE_BYTES = 1024
 """Bytes from which a buffer is passed on by itself rather than copied together with others."""
-UNFIT = (WrongValue, struct.error, AttributeError, TypeError, OverflowError, UnicodeEncodeError)
+UNFIT = (ValueError, struct.error, AttributeError, TypeError, OverflowError)
 """What a plan raises for a value that does not fit its field."""
 
 

@@ -78,7 +78,7 @@ def _scalar_problem(value: Any, primitive: str) -> tuple[str, str] | None:
         return None
     try:
         number = operator.index(value)
-    except TypeError:
+    except (TypeError, ValueError):
         return f"is {_shown(value)}, not an integer", "give an int"
     limits = np.iinfo("uint8" if primitive == "byte" else primitive)
     if limits.min <= number <= limits.max:

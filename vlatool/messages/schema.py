@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import pkgutil
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -148,7 +149,7 @@ def all_types() -> list[type[Message]]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Return whether two messages, or values of fields, are equal bit for bit; NaN equals NaN."""
+    """Return whether two messages, or values of fields, are equal bit for bit: 0.0 is not -0.0; NaN equals NaN."""
     if isinstance(one, Message):
         return type(one) is type(other) and all(
             same(getattr(one, entry.name), getattr(other, entry.name))
@@ -159,4 +160,6 @@ def same(one: Any, other: Any) -> bool:
         return left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes()
     if isinstance(one, tuple):
         return isinstance(other, tuple) and len(one) == len(other) and all(map(same, one, other))
-    return bool(one == other) or (one != one and other != other)
+    if isinstance(one, float) and isinstance(other, float):
+        return struct.pack("d", one) == struct.pack("d", other) or (one != one and other != other)
+    return bool(one == other)

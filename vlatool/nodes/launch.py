@@ -145,5 +145,5 @@ def record_of(
     name: str, controller: Any, node: str, topics: Mapping[str, str], options: PolicyOptions
 ) -> ControllerRecord:
     """Return the record of what runs."""
-    return ControllerRecord(name, to_plain(controller), dict(topics), node, identity_of(getattr(controller, "policy", None)),
-                            robot_name(options.robot), VERSION)  # fmt: skip
+    policy = identity_of(getattr(controller, "policy", None))
+    return ControllerRecord(name, to_plain(controller), dict(topics), node, policy, robot_name(options.robot), VERSION)

@@ -1,4 +1,4 @@
-"""Recordings of runs as a replay reads them: the log of a run, or a bag in which a node's records are beside messages."""
+"""Recordings of runs as a replay reads them: the log of a run, or a bag with a node's records beside the messages."""
 
 from __future__ import annotations
 
@@ -82,8 +82,11 @@ def _of_bag(path: Path, controller: str, node: str) -> Recording:
     if not fitting:
         raise _other(path, found, controller)
     if len(fitting) > 1:
-        raise DataError(f"{path} has several runs of '{fitting[0].controller}': {', '.join(about.node for about in fitting)}.",
-                        f"name one of them: --node {fitting[0].node}")  # fmt: skip
+        names = ", ".join(about.node for about in fitting)
+        raise DataError(
+            f"{path} has several runs of '{fitting[0].controller}': {names}.",
+            f"name one of them: --node {fitting[0].node}",
+        )
     steps, present = topic_of(fitting[0].node, STEPS), _topics(path)
     if steps not in present:
         raise DataError(f"{path} lacks the topic {steps}, which says what each step read.", "record it, too")
@@ -120,8 +123,10 @@ def _is(about: ControllerRecord, controller: str) -> bool:
 
 def _other(path: Path, found: list[ControllerRecord], controller: str) -> DataError:
     if not found:
-        return DataError(f"{path} does not say which controller ran.",
-                         f"record the topics /NODE/{CONTROLLER} and /NODE/{STEPS}, too, from before the start")  # fmt: skip
+        return DataError(
+            f"{path} does not say which controller ran.",
+            f"record the topics /NODE/{CONTROLLER} and /NODE/{STEPS}, too, from before the start",
+        )
     names = ", ".join(f"'{about.controller}' ({about.node})" for about in found)
     return DataError(f"{path} was recorded with {names}, not with '{controller}'.",
                      f"vlatool replay {path} {found[0].controller}")  # fmt: skip

@@ -119,7 +119,7 @@ class _Messages:
             found[name] = tuple(taken)
         return found
 
-    def left(self) -> int:
+    def unread(self) -> int:
         """Return how many messages no step has read."""
         return self.unused + sum(len(left) for there in self._waiting.values() for left in there.values())
 
@@ -173,9 +173,9 @@ class _Replay:
             note = self._missing() if self._waiting else ""
         if not self._steps and not note:
             raise DataError("The recording holds no step of a controller.",
-                            "record the topics /NODE/steps and /NODE/controller, too: vlatool record, or all topics")  # fmt: skip
+                            "record the topics /NODE/steps and /NODE/controller, too, or all topics")  # fmt: skip
         unheard = sum((self._sent - self._messages.heard).values())
-        return ReplayReport(self._steps, self._compared, self._differing, self._first, self._messages.left(), note,
+        return ReplayReport(self._steps, self._compared, self._differing, self._first, self._messages.unread(), note,
                             unheard)  # fmt: skip
 
     def _expect(self, record: StepRecord) -> None:

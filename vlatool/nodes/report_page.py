@@ -16,8 +16,10 @@ from vlatool.nodes.trace import Trace, TracePoint, phases
 from vlatool.render.charts.run import bands, over_time, path_from_above
 from vlatool.render.charts.svg import Canvas
 
-WIDE, NARROW = 996, 366
+WIDTHS = (996, 366)
+"""Pixels of a drawing on a wide page and on a narrow one."""
 STYLE = Path(__file__).parent.parent / "render/formats/page.css"
+MAX_STATES = 8
 MAX_LINES = 6
 """Notes and inputs of which a line is drawn, each in a panel of its own kind."""
 
@@ -31,7 +33,7 @@ def page(result: RunResult, trace: Trace) -> str:
     """Return the report as HTML."""
     found, points = result.to_dict(), trace.points
     title = f"{result.about.controller}, {found['steps']} steps in {found['seconds']:.1f} s"
-    sections = [*_sections(points), _table("Times of the steps", _times(found)), _table("Topics", _topics(result)),
+    sections = [*_sections(trace), _table("Times of the steps", _times(found)), _table("Topics", _topics(result)),
                 _table("Settings", _settings(result))]  # fmt: skip
     lead = "".join(f"<p>{_text(line)}</p>" for line in _summary(found, points))
     head = f"<title>{_text(title)}</title><style>{STYLE.read_text(encoding='utf-8')}</style>"
@@ -61,21 +63,40 @@ def _summary(found: Mapping[str, Any], points: Sequence[TracePoint]) -> Iterator
         yield f"The records of the steps are not whole: {found['failure'] or found['lost_records']}."
 
 
-def _sections(points: Sequence[TracePoint]) -> Iterator[str]:
+def _sections(trace: Trace) -> Iterator[str]:
     """Yield the sections with drawings, those that there is something for."""
+    points = trace.points
     if not points:
         return
     path = [point.position for point in points if point.position is not None]
     if path:
         marks = list(_changes(points))
         yield _section("Path from above", "The ring is the start, the dot the end; circles are changes of the status.",
-                       [path_from_above(path, marks, width) for width in (WIDE, NARROW)])  # fmt: skip
-    rows = {"status": list(phases(list(points)))}
-    rows |= {key: list(phases(list(points), key)) for key in _state_notes(points)}
+                       [path_from_above(path, marks, width) for width in WIDTHS])  # fmt: skip
+    rows = _rows(trace)
     yield _section("Statuses and levels", "What held when; the first word of a status.",
-                   [bands(rows, points[-1].time_s, width) for width in (WIDE, NARROW)])  # fmt: skip
+                   [bands(rows, points[-1].time_s, width) for width in WIDTHS])  # fmt: skip
     panels = _panels(points)
-    yield _section("Latencies and speeds", "Of each step.", [over_time(panels, width) for width in (WIDE, NARROW)])
+    yield _section("Latencies and speeds", "Of each step.", [over_time(panels, width) for width in WIDTHS])
+
+
+def _rows(trace: Trace) -> dict[str, list[tuple[float, float, str]]]:
+    """Return what held when: the status, its details where they are few words, levels and other states."""
+    points = trace.points
+    rows = {"status": list(phases(points))}
+    details = [point._replace(status=point.status.partition(" ")[2]) for point in points]
+    words = {point.status for point in details}
+    if 1 < len(words) <= MAX_STATES and not any(letter.isdigit() for word in words for letter in word):
+        rows["in detail"] = list(phases(details, whole=True))
+    rows |= {key: list(phases(points, key)) for key in _state_notes(points)}
+    return rows | {topic: _levels(trace, heard) for topic, heard in trace.levels.items() if heard}
+
+
+def _levels(trace: Trace, heard: Sequence[tuple[float, str]]) -> list[tuple[float, float, str]]:
+    """Return from when to when another node was at each level, in seconds from the first step."""
+    end_s = trace.points[-1].time_s
+    times = [min(max(0.0, moment - trace.first_s), end_s) for moment, _ in heard]
+    return [(began, ended, word) for began, ended, (_, word) in zip(times, [*times[1:], end_s], heard, strict=True)]
 
 
 def _changes(points: Sequence[TracePoint]) -> Iterator[tuple[float, float, str]]:
@@ -104,7 +125,9 @@ def _panels(points: Sequence[TracePoint]) -> dict[str, dict[str, list[tuple[floa
             "late": line((point.time_s, point.late_ms) for point in points),
         }
     }
-    inputs = list(dict.fromkeys(name for point in points for name in point.ages_ms))[:MAX_LINES]
+    half_ms = points[-1].time_s * 500
+    inputs = list(dict.fromkeys(name for point in points for name in point.ages_ms if point.ages_ms[name] <= half_ms))
+    inputs = [name for name in inputs if points[-1].ages_ms.get(name, 0.0) <= half_ms][:MAX_LINES]
     if inputs:
         panels["age of the newest message, ms"] = {
             name: line((point.time_s, point.ages_ms.get(name)) for point in points) for name in inputs

@@ -164,6 +164,8 @@ class Runner:
             self._tick(scheduled, skipped=max(0, tick - last - 1))
             last = tick
             tick = max(tick + 1, math.ceil((time.monotonic() - began) * rate))
+        if math.isfinite(seconds):
+            self.summary.skipped += max(0, math.ceil(seconds * rate - 1e-9) - last - 1)
 
     def _tick(self, scheduled: float, skipped: int) -> None:
         now = time.monotonic()

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.buses import Bus, QoS, open_bus
+from vlatool.buses import ActionBus, Bus, QoS, open_bus
 from vlatool.errors import OutputError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.std_msgs import String
+from vlatool.nodes.instruction_action import InstructionAction
 from vlatool.nodes.launch import PolicyOptions, open_controller, record_of
 from vlatool.nodes.run_log import Background, RunLog, StepPublisher
 from vlatool.nodes.runner import Runner, RunSummary
 from vlatool.nodes.settings import to_plain
 from vlatool.nodes.step_record import ControllerRecord
 from vlatool.nodes.stepper import check_controller, topics_of
-from vlatool.nodes.trace import Trace
-
+from vlatool.nodes.trace import Trace, watch_levels
 
 SETTLE_S = 0.5
 """Recorders look for new topics ten times a second (``ros2 bag record``, ``vlatool record``); the first step of a
@@ -53,7 +53,7 @@ class RunPlan:
 
     controller: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    policy: PolicyOptions = PolicyOptions()
+    policy: PolicyOptions = field(default_factory=PolicyOptions)
     bus: str = ""
     node: str = ""
     topics: Mapping[str, str] = field(default_factory=dict)
@@ -135,11 +135,15 @@ def run_on_bus(
         runner = Runner(controller, bus, topics=plan.topics, observers=[background], alone=not plan.shared)
         about = record_of(plan.controller, controller, node, runner.topics, plan.policy)
         log = None if plan.record is None else RunLog(plan.record, about)
+        if plan.report is not None:
+            watch_levels(bus, trace)
         background.observe(StepPublisher(bus, about), trace, *([] if log is None else [log]))
         on_start(about)
-        say = _instructor(bus, controller, runner.topics) if plan.instruction else None
+        say = _instructor(bus, controller, runner.topics, required=bool(plan.instruction))
+        if say is not None and isinstance(bus, ActionBus):
+            background.observe(InstructionAction(bus, node, say))
         time.sleep(plan.settle_s)
-        if say is not None:
+        if say is not None and plan.instruction:
             say(String(plan.instruction))
         if missing := runner.missing(plan.wait_s):
             warnings.warn(f"nobody publishes {', '.join(missing)} yet; the controller waits for it", stacklevel=2)
@@ -151,9 +155,17 @@ def run_on_bus(
     return result
 
 
-def _instructor(bus: Bus, controller: Any, topics: Mapping[str, str]) -> Callable[[String], None]:
-    """Return what publishes to the controller's instruction; raises UsageError where it has none."""
+def _instructor(
+    bus: Bus, controller: Any, topics: Mapping[str, str], required: bool
+) -> Callable[[String], None] | None:
+    """Return what publishes to the controller's instruction, None where it has none and none is required.
+
+    Raises:
+        UsageError: where it has none, and one is required.
+    """
     texts = [entry.name for entry in controller.inputs if entry.message is String]
+    if "instruction" not in texts and not required:
+        return None
     if "instruction" not in texts and len(texts) != 1:
         raise UsageError("The controller takes no instruction.", "leave --instruction out")
     name = "instruction" if "instruction" in texts else texts[0]

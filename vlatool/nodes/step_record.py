@@ -1,7 +1,7 @@
 """Records of steps: which messages a controller saw at which time and what it answered, enough to compute it again.
 
-A node publishes one as JSON (``std_msgs/msg/String``) after each step, so that a bag of any recorder holds it beside the
-messages themselves, and once, latched, what runs: the name of the controller, its settings and its topics.
+A node publishes one as JSON (``std_msgs/msg/String``) after each step, so that a bag of any recorder holds it beside
+the messages themselves, and once, latched, what runs: the name of the controller, its settings and its topics.
 """
 
 from __future__ import annotations

@@ -121,6 +121,9 @@ def topics_of(controller: RobotController[Any], renamed: Mapping[str, str]) -> d
                              "write it from its slash on: --map scan=/front/scan")  # fmt: skip
         for each in by_topic.get(name, [name]):
             found[each] = topic
+    written = [found[output.name] for output in controller.outputs]
+    if double := next((topic for topic in written if written.count(topic) > 1), ""):
+        raise UsageError(f"Two outputs of the controller are mapped to {double}.", "map each to a topic of its own")
     return found
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
 
+from vlatool.buses import Bus, QoS, Reception
 from vlatool.controllers import Snapshot
 from vlatool.messages import Message
 from vlatool.messages.geometry_msgs import PoseStamped, Twist
 from vlatool.messages.nav_msgs import Odometry
+from vlatool.messages.std_msgs import String
 from vlatool.nodes.stepper import StepReport
 
 MAX_POINTS = 20_000
@@ -49,18 +51,40 @@ class Trace:
         self.points: list[TracePoint] = []
         self.steps = 0
         """Steps that were seen."""
+        self.levels: dict[str, list[tuple[float, str]]] = {}
+        """Topic -> time and text of what another node said of its level."""
         self._every = 1
-        self._first_s = 0.0
+        self.first_s = 0.0
+        """Time of the first step."""
 
     def __call__(self, report: StepReport) -> None:
         """Take a step."""
         if not self.steps:
-            self._first_s = report.snapshot.time_s
+            self.first_s = report.snapshot.time_s
         if self.steps % self._every == 0:
-            self.points.append(_point(report, self._first_s))
+            self.points.append(_point(report, self.first_s))
             if len(self.points) > MAX_POINTS:
                 self.points, self._every = self.points[::2], 2 * self._every
         self.steps += 1
+
+
+def watch_levels(bus: Bus, trace: Trace) -> None:
+    """Keep what other nodes say of their levels: topics of texts that end in ``/level``, such as a safety monitor's."""
+
+    def watching(topic: str) -> Callable[[Reception], None]:
+        heard = trace.levels.setdefault(topic, [])
+
+        def hear(got: Reception) -> None:
+            text: Any = got.message
+            word = (text.data.split() or [""])[0]
+            if not heard or heard[-1][1] != word:
+                heard.append((got.received_s, word))
+
+        return hear
+
+    for info in bus.topics():
+        if info.topic.endswith("/level") and info.types == (String.TYPE,):
+            bus.subscribe(info.topic, String, watching(info.topic), QoS())
 
 
 def _point(report: StepReport, first_s: float) -> TracePoint:
@@ -79,9 +103,9 @@ def _position(snapshot: Snapshot) -> tuple[float, float] | None:
         message = reading.message
         pose = message.pose.pose if isinstance(message, Odometry) else getattr(message, "pose", None)
         if isinstance(message, Odometry | PoseStamped) and pose is not None:
-            place = pose.position
-            if math.isfinite(place.x) and math.isfinite(place.y):
-                return place.x, place.y
+            x, y = pose.position.x, pose.position.y
+            if math.isfinite(x) and math.isfinite(y):
+                return x, y
     return None
 
 
@@ -90,14 +114,14 @@ def _speeds(sent: list[Message]) -> tuple[float, float] | None:
     return None if twist is None else (math.hypot(twist.linear.x, twist.linear.y), twist.angular.z)
 
 
-def phases(points: list[TracePoint], key: str = "") -> Iterator[tuple[float, float, str]]:
+def phases(points: list[TracePoint], key: str = "", whole: bool = False) -> Iterator[tuple[float, float, str]]:
     """Return from when to when, in seconds, which word held: of the status, or of a note of this name.
 
-    The word of a status is its first one, so that ``going 0.31`` and ``going 0.32`` are one phase.
+    The word of a status is its first one, so that ``going 0.31`` and ``going 0.32`` are one phase; or the ``whole``.
     """
     began, word = 0.0, None
     for point in points:
-        text = str(point.notes.get(key, "")) if key else (point.status.split() or [""])[0]
+        text = str(point.notes.get(key, "")) if key else point.status if whole else (point.status.split() or [""])[0]
         if text != word:
             if word is not None:
                 yield began, point.time_s, word

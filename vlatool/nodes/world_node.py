@@ -20,6 +20,8 @@ TICK_S = 0.01
 MAX_BEHIND_S = 0.25
 """Simulated time that is caught up on at most; what is beyond it is given up and counted."""
 MAX_COMMANDS = 100
+LATCHED_QOS = QoS(reliable=True, latched=True)
+"""Of a topic that a robot sends once, such as its task, for nodes that come later."""
 
 
 @dataclass
@@ -57,7 +59,8 @@ class WorldNode:
         self._commands: queue.Queue[tuple[str, Message]] = queue.Queue(MAX_COMMANDS)
         world.reset(seed)
         self._senders = {
-            channel.topic: bus.publisher(channel.topic, channel.message, QoS()) for channel in world.sensors
+            channel.topic: bus.publisher(channel.topic, channel.message, QoS() if channel.rate_hz else LATCHED_QOS)
+            for channel in world.sensors
         }
         for channel in world.commands:
             bus.subscribe(channel.topic, channel.message, self._taker(channel.topic), QoS(reliable=True, depth=10))
@@ -112,11 +115,11 @@ class WorldNode:
             self.summary.commands += 1
         self.world.advance(TICK_S)
         for topic, message in self.world.reports():
-            self._senders[topic](stamped(message, epoch_s))
+            self._senders[topic](restamp(message, epoch_s))
             self.summary.reports += 1
 
 
-def stamped(message: Any, epoch_s: float) -> Any:
+def restamp(message: Any, epoch_s: float) -> Any:
     """Return a message whose stamp, in simulated seconds, is that many seconds later: by the clock of the bus."""
     header = getattr(message, "header", None)
     if header is None:

@@ -155,6 +155,7 @@ def test_a_disturbance_that_costs_more_than_the_baseline_fails():
     assert found(Disturbed(), episodes=firm).verdict == "pass"
 
 
+@pytest.mark.soak("each claim on its own here; a whole gate: tests/gate/test_gate_run.py")
 def test_a_gate_with_every_claim_runs_the_episodes_once(tmp_path: Path):
     good, rough, eager = (bundle_of(tmp_path / name, kind) for name, kind in
                           (("good", (0.2, 0.0)), ("rough", TREMBLES), ("eager", EAGER)))  # fmt: skip

@@ -209,6 +209,7 @@ print(run(50), run(2000))
 """
 
 
+@pytest.mark.soak("the statistics of batches in this file")
 def test_memory_does_not_grow_with_the_samples(tmp_path: Path) -> None:
     """2000 samples of 22 recorded tensors would be 11 MB when they were kept."""
     looping(tmp_path / "bundle")

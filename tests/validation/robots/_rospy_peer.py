@@ -11,8 +11,10 @@ import sys
 import threading
 import time
 
+import actionlib
 import numpy as np
 import rospy
+from actionlib.msg import TestAction, TestFeedback, TestGoal, TestResult
 from geometry_msgs.msg import Twist
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
@@ -82,6 +84,39 @@ def subscribe(topic: str) -> None:
     rospy.Subscriber(topic, Twist, show, tcp_nodelay=True)
     say("ready")
     rospy.spin()
+
+
+def action_server() -> None:
+    """Serve /peer_action as actionlib does: three times the goal; a negative goal lasts until it is canceled."""
+
+    def run(goal: TestGoal) -> None:
+        server.publish_feedback(TestFeedback(2 * goal.goal))
+        while goal.goal < 0 and not server.is_preempt_requested():
+            time.sleep(0.01)
+        end = server.set_preempted if goal.goal < 0 else server.set_succeeded
+        end(TestResult(3 * goal.goal))
+
+    server = actionlib.SimpleActionServer("/peer_action", TestAction, run, auto_start=False)
+    server.start()
+    say("ready")
+    rospy.spin()
+
+
+def action_client() -> None:
+    """Send goals to /our_action, one of which is canceled, and print how they ended."""
+    client = actionlib.SimpleActionClient("/our_action", TestAction)
+    if not client.wait_for_server(rospy.Duration(10)):
+        raise SystemExit("no server within ten seconds")
+    said: list[int] = []
+    client.send_goal(TestGoal(7), feedback_cb=lambda each: said.append(each.feedback))
+    client.wait_for_result(rospy.Duration(10))
+    first = [client.get_state(), client.get_result().result, said]
+    client.send_goal(TestGoal(-7))
+    while client.get_state() != actionlib.GoalStatus.ACTIVE:
+        time.sleep(0.01)
+    client.cancel_goal()
+    client.wait_for_result(rospy.Duration(10))
+    say([first, [client.get_state(), client.get_result().result]])
 
 
 class Junk(Twist):

@@ -9,56 +9,55 @@ exits with 1 when a line of it failed.
 from __future__ import annotations
 
 import argparse
-import contextlib
-import json
 import os
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-from _ros1 import Master, free_port, prepare
+from _ros1 import Master, Peer, Rows, prepare, refused
+from _ros1_ends import ends, kill_of_the_master, without_a_master
 
-from vlatool.buses import QoS, Reception, open_bus
-from vlatool.errors import BusError, VlatoolError
+from vlatool.buses import GOAL_CANCELED, GOAL_SUCCEEDED, ActionType, Goal, Outcome, QoS, Reception, open_bus
+from vlatool.errors import BusError
+from vlatool.messages import Message
 from vlatool.messages.geometry_msgs import Twist, Vector3
 from vlatool.messages.ros1 import encode
+from vlatool.messages.schema import int32
 from vlatool.messages.sensor_msgs import Image
 from vlatool.messages.std_msgs import String
 from vlatool.messages.std_srvs import SetBoolRequest, SetBoolResponse
 
 HERE = Path(__file__).resolve().parent
 TWISTS, IMAGES = 1000, 300
-Rows = list[tuple[str, str, bool]]
 
 
-class Peer:
-    """A process with a node of rospy; a context."""
+@dataclass(frozen=True, eq=False)
+class TestGoal(Message, name="actionlib/action/Test_Goal"):
+    """The goal of actionlib's own tests."""
 
-    def __init__(self, *arguments: object) -> None:
-        command = [sys.executable, str(HERE / "_rospy_peer.py"), *map(str, arguments)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    goal: int32 = 0
 
-    def read(self) -> Any:
-        """Return the next line that it says."""
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            with contextlib.suppress(ValueError):
-                return json.loads(line)
-        raise SystemExit("a peer ended without a word")
 
-    def __enter__(self) -> Peer:
-        return self
+@dataclass(frozen=True, eq=False)
+class TestFeedback(Message, name="actionlib/action/Test_Feedback"):
+    """The feedback of actionlib's own tests."""
 
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.wait()
+    feedback: int32 = 0
+
+
+@dataclass(frozen=True, eq=False)
+class TestResult(Message, name="actionlib/action/Test_Result"):
+    """The result of actionlib's own tests."""
+
+    result: int32 = 0
+
+
+TEST = ActionType("actionlib/action/Test", TestGoal, TestFeedback, TestResult)
 
 
 def twists(number: int) -> list[Twist]:
@@ -136,16 +135,31 @@ def services(bus: Any, rows: Rows) -> None:
             name, SetBoolRequest(), SetBoolResponse, 1.0))  # fmt: skip
 
 
-def refused(rows: Rows, what: str, kind: type[Exception], word: str, attempt: Callable[[], object]) -> None:
-    """Add a line: whether an attempt ended in an error with a word within 4 s."""
-    began = time.monotonic()
-    try:
-        attempt()
-        said = "nothing was raised"
-    except kind as error:
-        said = str(error).partition("\n")[0]
-    seconds = time.monotonic() - began
-    rows.append((f"{what}: {kind.__name__} in {seconds:.1f} s", said, word in said and seconds < 4))
+def actions(bus: Any, rows: Rows) -> None:
+    """Run goals of actionlib's client, and send goals to actionlib's server: one ends, one is canceled."""
+
+    def run(goal: Goal) -> Outcome:
+        number = cast(TestGoal, goal.message).goal
+        goal.feedback(TestFeedback(2 * number))
+        if number < 0:
+            goal.canceled.wait(10)
+        return Outcome(GOAL_CANCELED if number < 0 else GOAL_SUCCEEDED, TestResult(3 * number))
+
+    bus.serve_action("/our_action", TEST, run)
+    with Peer("action_client") as peer:
+        found = peer.read()
+    rows.append(("actionlib's client of our action", str(found), found == [[3, 21, [14]], [2, -21]]))
+    said: list[Any] = []
+    with Peer("action_server") as peer:
+        peer.read()
+        ended = bus.send_goal("/peer_action", TEST, TestGoal(7), said.append).result(10)
+        sent = bus.send_goal("/peer_action", TEST, TestGoal(-7), said.append)
+        time.sleep(0.3)
+        sent.cancel()
+        canceled = sent.result(10)
+    told = [(each.status, each.result.result) for each in (ended, canceled)], [each.feedback for each in said]
+    right = told == ([(GOAL_SUCCEEDED, 21), (GOAL_CANCELED, -21)], [14, -14])
+    rows.append(("our client of actionlib's server", str(told), right))
 
 
 def topics_and_types(bus: Any, rows: Rows) -> None:
@@ -171,112 +185,9 @@ def topics_and_types(bus: Any, rows: Rows) -> None:
         until = time.monotonic() + 5
         while not junk and time.monotonic() < until:
             time.sleep(0.02)
-    said = f"{bus.malformed.get('/junk', 0)} left out, then {junk}"
+    left_out = sum(fault.count for fault in bus.faults() if fault.topic == "/junk")
+    said = f"{left_out} left out, then {junk}"
     rows.append(("10 malformed messages, then a right one", said, said == "10 left out, then [0.5]"))
-
-
-def without_a_master(rows: Rows) -> None:
-    """Open the bus where nobody, something mute, or something else listens."""
-    refused(
-        rows, "no master", BusError, "No ROS 1 master answers", lambda: open_bus(f"ros1:127.0.0.1:{free_port()}", "n")
-    )
-    with socket.create_server(("127.0.0.1", 0)) as mute:
-        port = mute.getsockname()[1]
-        refused(
-            rows,
-            "a mute master",
-            BusError,
-            "nobody answered within 3 s",
-            lambda: open_bus(f"ros1:127.0.0.1:{port}", "n"),
-        )
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        threading.Thread(target=talk, args=(other,), daemon=True).start()
-        port = other.getsockname()[1]
-        refused(rows, "an SSH server", BusError, "127.0.0.1", lambda: open_bus(f"ros1:127.0.0.1:{port}", "n"))
-    refused(rows, "an impossible address", VlatoolError, "not the address", lambda: open_bus("ros1:11311", "n"))
-
-
-def talk(server: socket.socket) -> None:
-    """Say what an SSH server says."""
-    with contextlib.suppress(OSError):
-        while True:
-            connection, _ = server.accept()
-            connection.sendall(b"SSH-2.0-OpenSSH_9.2\r\n")
-            connection.close()
-
-
-def kill_of_the_master(bus: Any, master: Master, folder: Path, rows: Rows) -> Master:
-    """Kill the master: what is connected goes on; then start another one on its port."""
-    got: list[float] = []
-    bus.subscribe("/alive", Twist, lambda each: got.append(each.received_s), QoS())
-    with Peer("publish", "/alive") as peer:
-        peer.read()
-        bus.wait_for_peers(("/alive",), 5.0)
-        master.kill()
-        before = len(got)
-        time.sleep(1.0)
-        rows.append(
-            ("messages in the second after kill -9 of the master", str(len(got) - before), len(got) - before >= 5)
-        )
-        refused(rows, "topics() meanwhile", BusError, "No ROS 1 master answers", bus.topics)
-        refused(rows, "a new publisher meanwhile", BusError, "No ROS 1 master",
-                lambda: bus.publisher("/later", Twist, QoS()))  # fmt: skip
-    again = Master(folder, dict(os.environ), master.port)
-    began = time.monotonic()
-    while "/there" not in {info.topic for info in bus.topics()} and time.monotonic() < began + 10:
-        time.sleep(0.05)
-    seconds = time.monotonic() - began
-    rows.append(("registered at the next master after", f"{seconds:.1f} s", seconds < 5))
-    with Peer("publish", "/alive") as peer:
-        peer.read()
-        before, until = len(got), time.monotonic() + 5
-        while len(got) == before and time.monotonic() < until:
-            time.sleep(0.02)
-    rows.append(("a node that comes then is heard", "", len(got) > before))
-    answer = bus.call("/our_set", SetBoolRequest(True), SetBoolResponse, 5.0)
-    rows.append(("our service is found then", "", answer.success))
-    return again
-
-
-def ends(master: Master, rows: Rows) -> None:
-    """A process that forgets to close ends; one that sends and closes at once has sent; a namesake is refused."""
-    begin = f"from vlatool.buses import open_bus, QoS\nfrom vlatool.messages.geometry_msgs import Twist, Vector3\n" \
-            f"bus = open_bus('ros1:{master.uri}', 'other')\nsend = bus.publisher('/last', Twist, QoS())\n"  # fmt: skip
-    with Peer("subscribe", "/last") as peer:
-        peer.read()
-        began = time.monotonic()
-        forgets = subprocess.run(
-            [sys.executable, "-c", f"{begin}bus.wait_for_peers(('/last',), 5)\n"], timeout=20, check=False
-        )
-        rows.append(
-            (
-                "a process that does not close the bus ends in",
-                f"{time.monotonic() - began:.1f} s",
-                not forgets.returncode,
-            )
-        )
-        sends = "bus.wait_for_peers(('/last',), 5)\nsend(Twist(Vector3(0.25)))\nbus.close()\nbus.close()\n"
-        subprocess.run([sys.executable, "-c", begin + sends], timeout=20, check=True)
-        rows.append(
-            ("what was sent just before close() arrived", "", peer.read() == encode(Twist(Vector3(0.25))).hex())
-        )
-        for name, attempt in (
-            ("a second bus in a process", "open_bus(f'ros1', 'third')"),
-            ("publishing after close()", "bus.close(); send(Twist())"),
-        ):
-            caught = f"try:\n    {attempt}\nexcept BusError as error:\n    print(error.message)\n"
-            code = f"{begin}from vlatool.errors import BusError\n{caught}"
-            said = subprocess.run(
-                [sys.executable, "-c", code], timeout=20, check=True, capture_output=True, text=True
-            ).stdout
-            rows.append((name, said.strip().splitlines()[-1], "process" in said or "it was closed" in said))
-    script = f"from vlatool.buses import open_bus\nopen_bus('ros1:{master.uri}', 'vlatool_check')"
-    said = subprocess.run(
-        [sys.executable, "-c", script], timeout=20, check=False, capture_output=True, text=True
-    ).stderr
-    rows.append(
-        ("a second node of the same name", said.strip().splitlines()[-2][:90], "runs on this master already" in said)
-    )
 
 
 def inside(folder: Path) -> int:
@@ -292,9 +203,10 @@ def inside(folder: Path) -> int:
             began = time.monotonic()
             bus = open_bus(f"ros1:{master.uri}", "vlatool_check")
             rows.append(("opened in", f"{time.monotonic() - began:.2f} s", time.monotonic() - began < 5))
+            rows.append(("the address that other nodes are told", os.environ["ROS_IP"], True))
             now = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
             rows.append(("signals are left alone", "", now == handlers))
-            for check in (both_directions, one_direction, image_to_twist, services, topics_and_types):
+            for check in (both_directions, one_direction, image_to_twist, services, actions, topics_and_types):
                 check(bus, rows)
         ends(master, rows)
         rows.append(("stamp is now", "", abs(bus.stamp().seconds - time.time_ns() * 1e-9) < 0.1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 from vlatool.render._format import fixed_decimals, tick
 from vlatool.render.charts.svg import SERIES, Axis, Canvas, axis_for, shorten
@@ -22,7 +23,7 @@ def path_from_above(points: Points, marks: Sequence[tuple[float, float, str]], w
         marks: x, y and what happened there.
         width: Width in pixels.
     """
-    length = sum(((a - c) ** 2 + (b - d) ** 2) ** 0.5 for (a, b), (c, d) in zip(points, points[1:], strict=False))
+    length = sum(((a - c) ** 2 + (b - d) ** 2) ** 0.5 for (a, b), (c, d) in pairwise(points))
     words = f"{fixed_decimals(length, 2)} m from ({_place(points[0])}) to ({_place(points[-1])})."
     canvas = Canvas(f"path-{width}", width, round(PATH), "Path from above", words)
     every = [*points, *((x, y) for x, y, _ in marks)]
