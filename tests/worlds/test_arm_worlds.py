@@ -151,8 +151,8 @@ def test_joints_of_a_command_are_told_apart_by_name(models: str) -> None:
     [
         (lambda world: JointTrajectory(Header(), tuple(world.SETUP.joints), ()), "without points"),
         (lambda world: JointState(Header(), ("left_shoulder",), np.zeros(1)), "without the joint 'left_elbow'"),
-        (lambda world: goal(world, [math.nan, 0, 0, 0, 0, 0]), "no number"),
-        (lambda world: trajectory(world, [0.0] * 6, -1.0), "no number"),
+        (lambda world: goal(world, [math.nan, 0, 0, 0, 0, 0]), "not a number"),
+        (lambda world: trajectory(world, [0.0] * 6, -1.0), "not a number"),
         (lambda world: trajectory(world, [0.0] * 5, 1.0), "6 names and 5 values"),
     ],
 )

@@ -15,7 +15,7 @@ from vlatool.controllers._arm_messages import OUTPUTS, command_messages
 from vlatool.controllers._arm_policy import ArmPolicy, policy_of
 from vlatool.controllers._arm_return import plan_return
 from vlatool.controllers._arm_robot import ArmRobot, driver_names, finite, start_pose
-from vlatool.controllers._arm_state import ACTING, RETURNING, STOPPED, WAITING, ArmState
+from vlatool.controllers._arm_state import ACTING, HALT, RETURNING, WAITING, ArmState
 from vlatool.controllers._freshness import age_s, note_changes
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
 from vlatool.controllers._settings import check_range, check_rate
@@ -229,7 +229,7 @@ class ArmController:
             return None, state._replace(way=None, detail=late)
         if state.phase == RETURNING:
             return self._return(snapshot, state)
-        if state.phase == STOPPED:
+        if state.phase == HALT:
             return None, state
         return self._act(snapshot, state, measured)
 
@@ -282,9 +282,7 @@ class ArmController:
         state = state._replace(last_s=snapshot.time_s)
         if state.way is not None and wanted is not None and result.level >= Level.CRITICAL:
             attempts = state.attempts + 1
-            phase, detail = (
-                (RETURNING, "stopped on the way") if attempts < ATTEMPTS else (STOPPED, "the way is not free")
-            )
+            phase, detail = (RETURNING, "stopped on the way") if attempts < ATTEMPTS else (HALT, "the way is not free")
             state = state._replace(phase=phase, way=None, attempts=attempts, detail=detail)
         answers, state = self._answers(state)
         checks = ",".join(result.checks)

@@ -159,10 +159,10 @@ def _places(tensor: TensorSpec, robot: ArmRobot) -> tuple[int, ...]:
 
 def _check_units(tensor: TensorSpec, wanted: Sequence[str], places: Sequence[int]) -> None:
     units = tensor.units()
-    for unit, place in zip(wanted, places, strict=True):
-        if units[place] not in ("", unit):
+    for unit, index in zip(wanted, places, strict=True):
+        if units[index] not in ("", unit):
             raise UsageError(
-                f"'{tensor.name}' has {tensor.labels[place]} in {units[place]}; the robot takes {unit}.",
+                f"'{tensor.name}' has {tensor.labels[index]} in {units[index]}; the robot takes {unit}.",
                 "convert it in policy.yaml",
             )
 

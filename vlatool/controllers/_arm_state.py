@@ -8,7 +8,7 @@ from vlatool.controllers._arm_return import Return
 from vlatool.controllers._freshness import Changes
 from vlatool.runtime.envelope import Envelope
 
-WAITING, RETURNING, ACTING, STOPPED = "waiting", "returning", "acting", "stopped"
+WAITING, RETURNING, ACTING, HALT = "waiting", "returning", "acting", "stopped"
 """No joint state yet; on the way to the start pose; with the policy; until the service is called."""
 
 

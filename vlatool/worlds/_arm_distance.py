@@ -24,7 +24,7 @@ class ArmDistance:
         self._one, self._two = _geometries(model, one), _geometries(model, two)
         self._sizes = model.geom_rbound[self._one][:, None] + model.geom_rbound[self._two][None, :]
 
-    def now(self, data: Any) -> float:
+    def measure(self, data: Any) -> float:
         """Return the distance in metres, at most ``FAR_M``."""
         places = data.geom_xpos
         gaps = np.linalg.norm(places[self._one][:, None] - places[self._two][None, :], axis=-1) - self._sizes

@@ -60,7 +60,7 @@ def _distributions(name: str, folders: Sequence[str] | None) -> list[metadata.Di
 
 
 @functools.cache
-def compiled(path: Path, contacts: bool) -> Any:
+def compile_model(path: Path, contacts: bool) -> Any:
     """Return the compiled model of a file; worlds share it and do not change it.
 
     Args:

@@ -16,7 +16,7 @@ from vlatool.messages.sensor_msgs import JointState
 from vlatool.messages.std_msgs import Header
 from vlatool.messages.trajectory_msgs import JointTrajectory
 from vlatool.worlds._arm_distance import ArmDistance
-from vlatool.worlds._arm_model import ModelFile, compiled
+from vlatool.worlds._arm_model import ModelFile, compile_model
 from vlatool.worlds._arm_servos import PositionServos, Setpoint, TorqueServos
 from vlatool.worlds._faults import Outbox, read_knob, time_of
 from vlatool.worlds._interface import Channel
@@ -104,7 +104,7 @@ class ArmWorld:
         if not 0.0 <= self.spread <= 1.0:
             raise UsageError(f"spread is {self.spread!r}; allowed: 0 to 1 rad.", "change spread")
         self._mujoco = require("mujoco", "worlds")
-        self._model = compiled(self.SETUP.file.find(self.models), self.contacts)
+        self._model = compile_model(self.SETUP.file.find(self.models), self.contacts)
         self._names = tuple(self.SETUP.joints)
         self._joints = [self._joint(name) for name in self.SETUP.joints.values()]
         self._mirrors = [(self._joint(m.joint), self._names.index(m.of), m.factor) for m in self.SETUP.mirrors]
@@ -150,7 +150,7 @@ class ArmWorld:
         self._mujoco.mj_forward(self._model, self._data)
         self._lowest, self._highest = positions.copy(), positions.copy()
         self._fastest = np.zeros(len(positions))
-        self._least = self._distance.now(self._data) if self._distance else float("inf")
+        self._least = self._distance.measure(self._data) if self._distance else float("inf")
 
     def advance(self, seconds: float) -> None:
         """Simulate this much time, in steps of the model."""
@@ -177,7 +177,7 @@ class ArmWorld:
     def _report(self) -> None:
         data = self._data
         if self._distance is not None:
-            self._least = min(self._least, self._distance.now(data))
+            self._least = min(self._least, self._distance.measure(data))
         noise = self._knobs["noise"].get("joints", 0.0)
         positions = data.qpos[self._places] + (noise * self._random.standard_normal(len(self._names)) if noise else 0.0)
         message = JointState(
@@ -193,7 +193,7 @@ class ArmWorld:
     def obey(self, topic: str, message: Message) -> None:
         """Go where a command says: to the last point of a trajectory, in its time, or at once.
 
-        A command for other joints, or with a position that is no number, is refused, as the driver does;
+        A command for other joints, or with a position that is not a number, is refused, as the driver does;
         ``truth()["refused"]`` says why.
 
         Raises:
@@ -222,7 +222,7 @@ class ArmWorld:
             self._refused = error.message
             return
         if not np.isfinite(positions).all() or not 0.0 <= seconds < 3600.0:
-            self._refused = "a position or a time that is no number"
+            self._refused = "a position or a time that is not a number"
             return
         self._setpoint.aim(positions, self.time_s, seconds)
 
@@ -240,11 +240,11 @@ class ArmWorld:
             "refused": self._refused,
         }  # fmt: skip
         if self._distance is not None:
-            values["distance_m"] = self._distance.now(data)
+            values["distance_m"] = self._distance.measure(data)
             values["least_distance_m"] = min(self._least, values["distance_m"])
         return values
 
     def _tip(self, tip: Tip) -> Array:
         body = self._data.body(tip.body)
-        place: Array = body.xpos + body.xmat.reshape(3, 3) @ np.array(tip.offset)
-        return place
+        position: Array = body.xpos + body.xmat.reshape(3, 3) @ np.array(tip.offset)
+        return position

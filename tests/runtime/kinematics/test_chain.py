@@ -11,7 +11,7 @@ from _full import small_or_full
 from vlatool.errors import MissingExtra, UsageError
 from vlatool.runtime.kinematics import ARMS, Chain, Link, Pose, arm, from_modified_dh, from_standard_dh
 from vlatool.worlds import aloha, franka_panda, so101, ur5e
-from vlatool.worlds._arm_model import compiled
+from vlatool.worlds._arm_model import compile_model
 
 POSES = small_or_full(200, 100_000)
 UR_DH = (
@@ -73,7 +73,7 @@ def compare(
 def test_arms_are_where_mujoco_has_them(name: str) -> None:
     world, body, base = MODELS[name]
     try:
-        model = compiled(world.SETUP.file.find(), True)
+        model = compile_model(world.SETUP.file.find(), True)
     except MissingExtra as error:
         pytest.skip(f"{error.message} (test_tables_are_those_of_dh_models covers the computation)")
     poses, columns = compare(arm(name), model, body, POSES, base, end=False)

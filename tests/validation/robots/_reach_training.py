@@ -16,7 +16,7 @@ from vlatool.runtime.kinematics import Chain, arm
 GAIN, STEP_RAD = 0.12, 0.02
 """Share of the way to the goal in a step, and the longest step of a joint."""
 DAMPING = 0.05
-MAX_STEPS = 4000
+MAX_STEPS, BATCH = 24000, 128
 BOXES = {
     "franka": {"": ((0.3, -0.3, 0.2), (0.6, 0.3, 0.7))},
     "ur5e": {"": ((-0.6, -0.35, 0.2), (-0.3, 0.15, 0.6))},
@@ -170,16 +170,12 @@ def train(task: Task, folder: Path, seconds: float) -> dict[str, float]:
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total)
     moving = [place for own in task.places for place in own]
     while steps < total and time.process_time() - begin < seconds:
-        rows = torch.randint(0, len(targets), (512,))
-        spread = 10.0 ** (-2.5 * torch.rand(512, 1))
-        states = goals[rows] + spread * torch.randn(512, goals.shape[1])
-        expert = STEP_RAD * torch.tanh(GAIN / STEP_RAD * (goals[rows] - states))
-        error = (policy(states, targets[rows])[:, 0] - expert)[:, moving] / STEP_RAD
-        near = (
-            torch.cat([policy.goal(targets[rows], arm) for arm in range(len(task.places))], dim=1)
-            - goals[rows][:, moving]
-        )
-        loss = (error**2).mean() + (near**2).mean()
+        rows = torch.randint(0, len(targets), (BATCH,))
+        spread = 10.0 ** (-2.5 * torch.rand(BATCH, 1))
+        states = goals[rows][:, moving] + spread * torch.randn(BATCH, len(moving))
+        found = torch.cat([policy.goal(targets[rows], arm) for arm in range(len(task.places))], dim=1)
+        action, expert = (torch.tanh(GAIN / STEP_RAD * (goal - states)) for goal in (found, goals[rows][:, moving]))
+        loss = ((action - expert) ** 2).mean() + ((found - goals[rows][:, moving]) ** 2).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

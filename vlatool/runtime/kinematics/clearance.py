@@ -71,9 +71,8 @@ def _segments(frames: Array, capsules: Sequence[Capsule]) -> tuple[Array, Array]
     """Return begin and end of each capsule's segment in the world, (..., C, 3) each; the base is the last frame."""
     own = frames[..., [capsule.link for capsule in capsules], :, :]
     begin, end = (np.array([getattr(capsule, side) for capsule in capsules]) for side in ("begin", "end"))
-    place = own[..., :3, 3]
-    turned = own[..., :3, :3]
-    return place + (turned @ begin[..., None])[..., 0], place + (turned @ end[..., None])[..., 0]
+    origins, rotations = own[..., :3, 3], own[..., :3, :3]
+    return origins + (rotations @ begin[..., None])[..., 0], origins + (rotations @ end[..., None])[..., 0]
 
 
 def segment_distances(one_begin: Array, one_end: Array, two_begin: Array, two_end: Array) -> Array:
