@@ -11,7 +11,8 @@ from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.geometry_msgs import Point, Pose, PoseWithCovariance, Quaternion, Twist, Vector3
 from vlatool.messages.nav_msgs import Odometry
-from vlatool.messages.sensor_msgs import CameraInfo, Image, PointCloud2, PointField
+from vlatool.messages.pixels import image_message
+from vlatool.messages.sensor_msgs import CameraInfo, Image
 from vlatool.messages.std_msgs import Header
 
 
@@ -21,7 +22,9 @@ class Feed:
     def __init__(self) -> None:
         self.newest: dict[str, Reading] = {}
 
-    def snapshot(self, time_s: float, stamp_s: float | None = None, requests: Any = (), **messages: Message) -> Snapshot:
+    def snapshot(
+        self, time_s: float, stamp_s: float | None = None, requests: Any = (), **messages: Message
+    ) -> Snapshot:
         for name, message in messages.items():
             count = self.newest[name].sequence + 1 if name in self.newest else 0
             self.newest[name] = Reading(message, time_s, count)
@@ -39,20 +42,7 @@ def camera_info(width: int = 64, height: int = 48) -> CameraInfo:
 
 
 def depth_image(metres: np.ndarray, stamp_s: float = 0.0) -> Image:
-    data = np.ascontiguousarray(metres, "<f4").reshape(-1).view(np.uint8)
-    rows, columns = metres.shape
-    return Image(header(stamp_s), rows, columns, "32FC1", 0, 4 * columns, data)
-
-
-def colour_image(pixels: np.ndarray, stamp_s: float = 0.0) -> Image:
-    rows, columns = pixels.shape[:2]
-    return Image(header(stamp_s), rows, columns, "rgb8", 0, 3 * columns, np.ascontiguousarray(pixels).reshape(-1))
-
-
-def cloud(points: np.ndarray) -> PointCloud2:
-    fields = tuple(PointField(name, 4 * place, 7, 1) for place, name in enumerate("xyz"))
-    data = np.ascontiguousarray(points, "<f4").reshape(-1).view(np.uint8)
-    return PointCloud2(Header(), 1, len(points), fields, False, 12, 12 * len(points), data, False)
+    return image_message(metres.astype(np.float32), "32FC1", header(stamp_s))
 
 
 def odometry(x: float, y: float, yaw: float, stamp_s: float = 0.0) -> Odometry:

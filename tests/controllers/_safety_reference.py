@@ -1,6 +1,6 @@
 """A second model of the safety monitor, written from its documentation in plain loops, and random events for both.
 
-An event is a dict of what came at a step; numbers and lists, no messages. ``to_messages`` makes messages of it.
+An event is a dict of what came at a step, as numbers and arrays, not as messages. ``to_messages`` makes messages of it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from _mobile_feed import depth_image, header, odometry, velocity
 from vlatool.messages.sensor_msgs import BatteryState, JointState, LaserScan
 from vlatool.messages.std_msgs import Bool, String
 
-RAYS, ROWS, COLUMNS = 36, 12, 16
+RAYS, ROWS, COLUMNS = 36, 24, 32
 FENCE = (-3.0, -3.0, 3.0, 3.0)
-HFOV = math.radians(69.0)
+HFOV, TASK_S = math.radians(69.0), 3.0
 FOLLOWS = {
     "idle": ["running"], "running": ["idle", "paused", "arrived", "failed"], "paused": ["idle", "running", "failed"],
     "arrived": ["idle", "running"], "failed": ["idle", "running"],
@@ -76,7 +76,7 @@ class Reference:
         gap, near, cliff = self.look(way, event)
         if gap:
             out.add("scan")
-        if "depth" in self.last and not any(math.isfinite(v) for row in self.last["depth"] for v in row):
+        if "depth" in self.last and not np.isfinite(self.last["depth"]).any():
             out.add("depth")
         asked += [1] if near <= 0.6 else []
         asked += [2] if near <= 0.4 else []
@@ -96,7 +96,7 @@ class Reference:
             asked += [1] if inside < 0.3 else []
             asked += [3] if inside < 0.0 else []
         asked += [2] if self.tasked(time, event) else []
-        asked += [2] if self.since is not None and time - self.since > 20.0 else []
+        asked += [2] if self.since is not None and time - self.since > TASK_S else []
         asked += [2] if self.last.get("person") else []
         asked += [1] if "command" in self.last and time - self.came["command"] > 1.0 else []
         asked += [2] if not finite else []
@@ -133,9 +133,10 @@ class Reference:
                 age = max(age, time - stamp)
             if name != "odometry":
                 value = self.last[name]
-                empty = name == "scan" and not any(math.isfinite(v) for v in value)
-                if name in event and (name not in self.content or empty or repr(value) != self.content[name][0]):
-                    self.content[name] = (repr(value), time)
+                empty = name == "scan" and not np.isfinite(value).any()
+                same = name in self.content and np.array_equal(value, self.content[name][0], equal_nan=True)
+                if name in event and (empty or not same):
+                    self.content[name] = (value, time)
                 age = max(age, time - self.content[name][1])
             if age > 0.6:
                 out.add(name)
@@ -147,7 +148,7 @@ class Reference:
         if "scan" in self.last:
             unknown = rays = 0
             ahead = math.atan2(way[4][1], way[4][0]) if way else 0.0
-            for index, value in enumerate(self.last["scan"]):
+            for index, value in enumerate(self.last["scan"].tolist()):
                 angle = -math.pi + index * 2 * math.pi / RAYS
                 if way and abs(math.remainder(angle - ahead, 2 * math.pi)) < math.radians(20):
                     rays, unknown = rays + 1, unknown + math.isnan(value)
@@ -157,7 +158,7 @@ class Reference:
         focal = COLUMNS / (2 * math.tan(HFOV / 2))
         for row in range(2, ROWS, 4):
             for column in range(2, COLUMNS, 4):
-                z = self.last["depth"][row][column] if "depth" in self.last else math.nan
+                z = float(self.last["depth"][row, column]) if "depth" in self.last else math.nan
                 if not math.isfinite(z) or z <= 0:
                     continue
                 side, height = -z * (column + 0.5 - COLUMNS / 2) / focal, 0.244 - z * (row + 0.5 - ROWS / 2) / focal
@@ -167,12 +168,10 @@ class Reference:
                     share = 0.244 / (0.244 - height)
                     low.append((z * share, side * share))
         near = math.inf
+        points = [(px, py) for px, py in points if math.hypot(px, py) < 1.3]
         for count, (x, y) in enumerate(way):
-            hit = any(
-                math.hypot(px - x, py - y) < 0.21 and math.hypot(px - x, py - y) < math.hypot(px, py)
-                for px, py in points
-            )
-            if hit:
+            apart = [(math.hypot(px - x, py - y), math.hypot(px, py)) for px, py in points]
+            if any(now < 0.21 and now < before for now, before in apart):
                 near = count * 0.05
                 break
         holes = sum(any(math.hypot(px - x, py - y) < 0.21 for x, y in way) for px, py in low)
@@ -210,10 +209,10 @@ class Events:
 
     def __init__(self, seed: int) -> None:
         self.random = np.random.default_rng(seed)
-        self.time, self.pose = 0.0, [0.0, 0.0, 0.0]
+        self.time, self.pose = 0.0, [2.5, 0.0, 0.0]
         self.trouble, self.until = "", 0.0
         self.kept: dict[str, Any] = {}
-        self.task = "idle"
+        self.task, self.order = "idle", []
 
     KINDS = (
         "obstacle far", "obstacle near", "obstacle close", "scan late", "depth late", "odometry late", "scan frozen",
@@ -224,12 +223,14 @@ class Events:
 
     def next(self) -> tuple[float, dict[str, Any]]:
         random = self.random
-        self.time += float(random.choice([0.05, 0.05, 0.1, 0.3]))
+        self.time += (0.05, 0.05, 0.1, 0.3)[int(random.integers(4))]
         if self.time >= self.until:
-            self.trouble = str(random.choice(self.KINDS)) if random.random() < 0.5 else ""
-            self.until = self.time + float(random.uniform(0.2, 2.5))
+            if not self.order:
+                self.order = [self.KINDS[place] for place in random.permutation(len(self.KINDS))]
+            self.trouble = self.order.pop() if random.random() < 0.7 else ""
+            self.until = self.time + float(random.uniform(0.2, 2.0))
             if self.trouble == "long task":
-                self.until = self.time + 25.0
+                self.until = self.time + TASK_S + 1.0
         t, event = self.trouble, {"stamp": {}}
         self.command(t, event)
         self.ranges(t, event)
@@ -240,8 +241,8 @@ class Events:
     def command(self, t: str, event: dict[str, Any]) -> None:
         random = self.random
         if t != "silent" and random.random() < 0.8:
-            linear = float(random.choice([0.3, 0.3, 0.2, -0.2, 0.0, 0.5]))
-            event["command"] = (linear, float(random.choice([0.0, random.normal(0, 0.5)])))
+            linear = (0.3, 0.3, 0.2, -0.2, 0.0, 0.5)[int(random.integers(6))]
+            event["command"] = (linear, float(random.normal(0, 0.5)) if random.random() < 0.5 else 0.0)
             if t == "nan command":
                 event["command"] = (math.nan, 0.0) if random.random() < 0.5 else (0.1, math.inf)
 
@@ -257,7 +258,7 @@ class Events:
                 scan[RAYS // 2 - 2 : RAYS // 2 + 3] = math.nan
             if random.random() < 0.01:
                 scan[:] = math.inf
-            self.put("scan", scan.astype(np.float32).tolist(), t == "scan frozen", t, event)
+            self.put("scan", scan.astype(np.float32), t == "scan frozen", t, event)
         if t not in ("depth late", "both late") or not self.kept:
             depth = self.floor(0.6 if t == "cliff" else 0.0) * random.normal(1, 0.005, (ROWS, COLUMNS))
             if t.startswith("obstacle"):
@@ -265,7 +266,7 @@ class Events:
                 depth = np.minimum(depth, wall) if random.random() < 0.5 else depth
             if t == "nan depth":
                 depth[:] = math.nan
-            self.put("depth", depth.astype(np.float32).tolist(), t == "depth frozen", t, event)
+            self.put("depth", depth.astype(np.float32), t == "depth frozen", t, event)
 
     def put(self, name: str, value: Any, same: bool, t: str, event: dict[str, Any]) -> None:
         """Send a value, the one before, or the one before with its stamp."""
@@ -286,12 +287,13 @@ class Events:
         random = self.random
         if t in ("odometry late", "both late") and self.random.random() < 0.99 and "odometry" in self.kept:
             return
+        x = self.pose[0]
         if t == "jump" and random.random() < 0.3:
-            self.pose = [*random.uniform(-2, 2, 2), random.uniform(-3, 3)]
+            self.pose = [random.uniform(-2, 2), 0.0, random.uniform(-3, 3)]
         elif t in ("fence", "outside"):
-            self.pose[0] += 0.1 if self.pose[0] < (2.85 if t == "fence" else 3.2) else 0.0
-        elif abs(self.pose[0]) > 2.5:
-            self.pose[0] -= math.copysign(0.1, self.pose[0])
+            self.pose[0] += 0.1 if x < (2.85 if t == "fence" else 3.2) else 0.0
+        elif t != "jump" and not 2.3 < x < 2.65:
+            self.pose = [x - 0.1 if x > 2.6 else 2.5, 0.0, 0.0]
         pose = [float(v) for v in self.pose]
         value = (math.nan, 0.0, 0.0) if t == "nan pose" else tuple(pose)
         self.put("odometry", value, False, t, event)
@@ -311,8 +313,8 @@ class Events:
         if t in ("illegal", "unknown task") and random.random() < 0.3:
             wrong = [word for word in FOLLOWS if word != self.task and word not in FOLLOWS.get(self.task, [])]
             self.task = event["task"] = "flying" if t == "unknown task" or not wrong else str(random.choice(wrong))
-        if random.random() < (0.3 if t == "call" else 0.05):
-            event["calls"] = [bool(random.random() < 0.2)]
+        if random.random() < (0.6 if t == "call" else 0.2):
+            event["calls"] = [bool(random.random() < 0.05)]
 
 
 def to_messages(event: dict[str, Any]) -> dict[str, Any]:
@@ -323,10 +325,10 @@ def to_messages(event: dict[str, Any]) -> dict[str, Any]:
         made["cmd_vel"] = velocity(*event["command"])
     if "scan" in event:
         step = 2 * math.pi / RAYS
-        ranges = np.array(event["scan"], np.float32)
+        ranges = event["scan"]
         made["scan"] = LaserScan(header(stamp["scan"]), -math.pi, math.pi, step, 0.0, 0.1, 0.1, 12.0, ranges)
     if "depth" in event:
-        made["depth"] = depth_image(np.array(event["depth"], np.float32), stamp["depth"])
+        made["depth"] = depth_image(event["depth"], stamp["depth"])
     if "odometry" in event:
         made["odometry"] = odometry(*event["odometry"], stamp_s=stamp["odometry"])
     if "battery" in event:

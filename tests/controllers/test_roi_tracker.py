@@ -3,11 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from _full import small_or_full
-from _mobile_feed import Feed, camera_info, colour_image, speeds
+from _mobile_feed import Feed, camera_info, speeds
 from _tutorial_laws import turn
 
 from vlatool.controllers.roi_tracker import RoiTracker
 from vlatool.errors import UsageError
+from vlatool.messages.pixels import image_message
 from vlatool.messages.sensor_msgs import Image, RegionOfInterest
 
 MESSAGES = small_or_full(1_000, 100_000)
@@ -75,14 +76,14 @@ def test_a_correlation_filter_follows_a_first_region(first: str):
         pixels = background.copy()
         pixels[18:30, 26 + step : 38 + step] = patch
         messages = {"roi": region(26, 18, 12, 12)} if first == "topic" and step == 0 else {}
-        image = colour_image(pixels.astype(np.uint8))
+        image = image_message(pixels.astype(np.uint8), "rgb8")
         snapshot = feed.snapshot(step * 0.1, camera_info=camera_info(64, 48), image=image, **messages)
         command, state = controller.step(snapshot, state)
         assert command.status == "tracking"
         offsets.append(command.notes["offset"])
     assert offsets == pytest.approx([step / 32 for step in range(15)], abs=2 / 32)
     assert speeds(command)[1] == pytest.approx(-2 * offsets[-1])
-    command, _ = controller.step(feed.snapshot(1.5, image=colour_image(background.astype(np.uint8))), state)
+    command, _ = controller.step(feed.snapshot(1.5, image=image_message(background.astype(np.uint8), "rgb8")), state)
     assert command.status == "standing: target lost"
     assert speeds(command) == (0.0, 0.0)
 

@@ -45,8 +45,8 @@ def observed_by(spec: PolicySpec) -> Observed:
     labels = spec.action.labels
     if spec.action.kind != "discrete" or not labels:
         raise UsageError(
-            f"The action '{spec.action.name}' of the policy is of the kind '{spec.action.kind}'; allowed: discrete, with "
-            "labels.",
+            f"The action '{spec.action.name}' of the policy is of the kind '{spec.action.kind}'; allowed: discrete, "
+            "with labels.",
             "use a policy that chooses between motions, or run it with: vlatool run policy",
         )
     texts = [tensor for tensor in spec.inputs if tensor.kind == "text"]
@@ -56,7 +56,8 @@ def observed_by(spec: PolicySpec) -> Observed:
     if len(images) != 1 or len(texts) > 1 or len(past) != len(others) or len(past) > 1:
         known = ", ".join(f"{tensor.name} {tensor.dtype} {list(tensor.shape)}" for tensor in spec.inputs)
         raise UsageError(
-            f"The inputs of the policy are {known}; allowed: one camera, at most one text, at most one of past actions.",
+            f"The inputs of the policy are {known}; allowed: one camera, at most one text, at most one of past "
+            "actions.",
             "wrap the policy so that it has these inputs alone",
         )
     camera = images[0]

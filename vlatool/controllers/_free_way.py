@@ -32,7 +32,7 @@ class Mount(NamedTuple):
 
 
 def path(linear: float, angular: float) -> Array:
-    """Return the points (20, 2) in metres where the centre of a base will be: x forward, y to the left; one if it stands."""
+    """Return where the centre of a base will be, (20, 2) in metres, x forward, y to the left; (1, 2) if it stands."""
     if abs(linear) < STANDING:
         return np.zeros((1, 2))
     length = np.arange(STEP_M, REACH_M + STEP_M / 2, STEP_M)

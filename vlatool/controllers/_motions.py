@@ -18,8 +18,8 @@ WORDS = {
 }  # fmt: skip
 """Motion -> words of a label that ask for it."""
 TURN_GAIN, DRIVE_GAIN, SIDE_GAIN = 2.0, 1.5, 3.0
-"""Rotation speed for an angle that is left and speed for a distance that is left, in 1/s; rotation for a distance to the
-side, in rad/s for a metre."""
+"""Rotation speed for an angle that is left and speed for a distance that is left, in 1/s; rotation for a distance to
+the side, in rad/s for a metre."""
 
 
 def motions_of(labels: Sequence[str], mapping: str = "") -> tuple[str, ...]:

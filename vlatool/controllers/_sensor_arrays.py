@@ -19,14 +19,9 @@ def colours_of(message: Image | None) -> tuple[Array | None, str]:
     if message is None:
         return None, "no image"
     try:
-        array = pixels.image(message)
+        return pixels.rgb(message), ""
     except BusError as error:
         return None, error.message
-    channels = {"rgb8": (0, 1, 2), "rgba8": (0, 1, 2), "bgr8": (2, 1, 0), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
-    if message.encoding not in channels:
-        return None, f"encoding '{message.encoding}' of the image; allowed: {', '.join(channels)}"
-    array = array if array.ndim == 3 else array[..., None]
-    return array[..., list(channels[message.encoding])], ""
 
 
 def depth_of(message: Image | None) -> tuple[Array | None, str]:
@@ -44,10 +39,9 @@ def points_of(message: PointCloud2 | None) -> tuple[Array | None, str]:
     if message is None:
         return None, "no cloud"
     try:
-        points = clouds.points(message).astype(np.float64)
+        return clouds.points(message).astype(np.float64), ""
     except BusError as error:
         return None, error.message
-    return points[np.isfinite(points).all(axis=1)], ""
 
 
 def rays_of(message: LaserScan | None) -> tuple[Array, Array]:

@@ -114,9 +114,7 @@ class CloudFollower:
     def centroid(self, points: NDArray[Any]) -> tuple[float, float] | None:
         """Return the mean (x, z) of the points in the box, in metres; None without one."""
         x, up, z = points[:, 0], -points[:, 1], points[:, 2]
-        inside = points[
-            (up > self.min_y) & (up < self.max_y) & (x > self.min_x) & (x < self.max_x) & (z < self.max_z)
-        ]
+        inside = points[(up > self.min_y) & (up < self.max_y) & (x > self.min_x) & (x < self.max_x) & (z < self.max_z)]
         return (float(inside[:, 0].mean()), float(inside[:, 2].mean())) if len(inside) else None
 
     def linear(self, z: float, last: float) -> float:

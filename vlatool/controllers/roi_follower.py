@@ -25,10 +25,10 @@ class RoiFollower:
 
     The law is that of ``object_follower.py`` of Goebel, "ROS by Example". It turns as ``roi-tracker``, at ``x_scale``.
     The distance is the mean depth of the middle ``scale_roi`` of the region, without what is unknown or beyond
-    ``max_z``. Where it is more than ``z_threshold`` away from ``goal_z``, and between ``min_z`` and ``max_z``, the robot
-    drives at ``z_scale`` times the difference, at least ``min_linear_speed`` and at most ``max_linear_speed``; otherwise
-    its speed falls to ``slow_down_factor`` of itself at each step. Without a new region both speeds fall in this
-    way; ``lost_s`` after the last one, which the tutorial does not know, the robot stands.
+    ``max_z``. Where it is more than ``z_threshold`` away from ``goal_z``, and between ``min_z`` and ``max_z``, the
+    robot drives at ``z_scale`` times the difference, at least ``min_linear_speed`` and at most ``max_linear_speed``;
+    otherwise its speed falls to ``slow_down_factor`` of itself at each step. Without a new region both speeds fall in
+    this way; ``lost_s`` after the last one, which the tutorial does not know, the robot stands.
 
     Args:
         rate: Steps in a second.
@@ -116,11 +116,13 @@ class RoiFollower:
         depth, problem = depth_of(snapshot.message("depth", Image))
         distance = self.distance(depth, region) if depth is not None else None
         offset = offset_of(region, camera.width)
-        state = Motion(
-            self.linear(distance, state.linear), self.rotation(offset), snapshot.time_s, target
+        state = Motion(self.linear(distance, state.linear), self.rotation(offset), snapshot.time_s, target)
+        notes: dict[str, float | str] = (
+            {"offset": offset} if distance is None else {"offset": offset, "distance_m": distance}
         )
-        notes = {"offset": offset} if distance is None else {"offset": offset, "distance_m": distance}
-        return self._command(state, "following" if distance is not None else f"turning: {problem or 'no depth'}", notes), state
+        return self._command(
+            state, "following" if distance is not None else f"turning: {problem or 'no depth'}", notes
+        ), state
 
     def distance(self, depth: NDArray[Any], roi: RegionOfInterest) -> float | None:
         """Return the mean depth of the middle of a region, in metres; None where nothing of it is known."""

@@ -110,8 +110,8 @@ class SafetyMonitor:
             check_range(name, getattr(self, name), 0.0)
         if not 0.0 <= self.emergency_m <= self.critical_m <= self.warning_m:
             raise UsageError(
-                f"The bands are {self.emergency_m:g}, {self.critical_m:g} and {self.warning_m:g} m; allowed: emergency_m "
-                "<= critical_m <= warning_m.",
+                f"The bands are {self.emergency_m:g}, {self.critical_m:g} and {self.warning_m:g} m; allowed: "
+                "emergency_m <= critical_m <= warning_m.",
                 "change the one that is out of order",
             )
         object.__setattr__(self, "_robot", self._describe())
@@ -172,7 +172,7 @@ class SafetyMonitor:
 
     @property
     def _known(self) -> Robot:
-        assert self._robot is not None  # noqa: S101 - set when it was made
+        assert self._robot is not None
         return self._robot
 
     def _judge(self, snapshot: Snapshot, facts: Facts, state: _State, failure: str = "") -> tuple[Command, _State]:

@@ -92,7 +92,9 @@ class Vln:
     @cached_property
     def _observed(self) -> Observed:
         if self.policy is None:
-            raise UsageError("vln has no policy; allowed: one that vlatool.load returned.", "name a bundle: --bundle DIR")
+            raise UsageError(
+                "vln has no policy; allowed: one that vlatool.load returned.", "name a bundle: --bundle DIR"
+            )
         return observed_by(self.policy.spec)
 
     @cached_property
@@ -178,7 +180,7 @@ class Vln:
 
     def _move(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose) -> tuple[Command, VlnState]:
         """Go on with a motion, or end it."""
-        assert state.motion is not None  # noqa: S101 - the caller asked
+        assert state.motion is not None
         motion = state.motion
         speeds = Speeds(self.max_linear_speed, self.max_angular_speed, self.position_m, math.radians(self.angle_deg))
         linear, angular, over = drive(motion, pose, speeds)
@@ -214,14 +216,14 @@ class Vln:
 
     def _begin(self, snapshot: Snapshot, state: VlnState, kind: str) -> tuple[Command, VlnState]:
         """Begin the motion of an action; nothing is driven at this step."""
-        ended = {"ended_s": snapshot.time_s, "ended_stamp": self._odometry_stamp(snapshot)}
+        over = state._replace(ended_s=snapshot.time_s, ended_stamp=self._odometry_stamp(snapshot))
         if kind == STOP:
             return self._stand(state._replace(phase=ARRIVED, detail="by its stop label"))
         if kind == WAIT:
-            return self._stand(state._replace(detail=WAIT, **ended))
+            return self._stand(over._replace(detail=WAIT))
         if kind == FORWARD and self._ahead(snapshot) < self.forward_m + self.clearance_m:
-            return self._stand(state._replace(detail="blocked", **ended))
-        assert state.place is not None  # noqa: S101 - set with the action
+            return self._stand(over._replace(detail="blocked"))
+        assert state.place is not None
         motion = plan(kind, state.place, math.radians(self.turn_deg), self.forward_m, snapshot.time_s)
         return self._stand(state._replace(motion=motion, detail=kind if kind != BACKWARD else "backward"))
 

@@ -49,12 +49,16 @@ class DifferentialDrive:
         linear, angular = (0.0, 0.0) if now_s - self._commanded_s >= self.silence_s else self._target
         self.linear += _cut(linear - self.linear, self.linear_rate * seconds)
         self.angular += _cut(angular - self.angular, self.angular_rate * seconds)
-        noise = self.random.normal(0.0, self.slip, 2) if self.slip else (0.0, 0.0)
+        noise = [float(value) for value in self.random.normal(0.0, self.slip, 2)]
         x, y, yaw = self.odometry
         way = self.linear * seconds * (1.0 + self._bias[0] + noise[0])
         turn = self.angular * seconds * (1.0 + self._bias[1] + noise[1])
         middle = yaw + turn / 2.0
-        self.odometry = (x + way * math.cos(middle), y + way * math.sin(middle), math.remainder(yaw + turn, 2 * math.pi))
+        self.odometry = (
+            x + way * math.cos(middle),
+            y + way * math.sin(middle),
+            math.remainder(yaw + turn, 2 * math.pi),
+        )
 
 
 def _cut(value: float, limit: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -59,7 +60,11 @@ def draw_scene(size_m: float, counts: dict[str, int], random: np.random.Generato
         if place is not None:
             scene.pits.append(Pit(place[0] - 0.3, place[1] - 0.3, place[0] + 0.3, place[1] + 0.3))
         del index
-    kinds = (("pillar", "pillars", scene.pillars), ("mover", "movers", scene.movers), ("person", "people", scene.movers))
+    kinds = (
+        ("pillar", "pillars", scene.pillars),
+        ("mover", "movers", scene.movers),
+        ("person", "people", scene.movers),
+    )
     for kind, key, group in kinds:
         for index in range(counts[key]):
             radius = {"pillar": random.uniform(0.06, 0.25), "mover": 0.15, "person": 0.2}[kind]
@@ -130,8 +135,8 @@ def _floor(scene: Scene) -> str:
     xs = sorted({-half, half, *(x for pit in scene.pits for x in (pit.left, pit.right))})
     ys = sorted({-half, half, *(y for pit in scene.pits for y in (pit.low, pit.high))})
     tiles = ""
-    for left, right in zip(xs, xs[1:], strict=False):
-        for low, high in zip(ys, ys[1:], strict=False):
+    for left, right in pairwise(xs):
+        for low, high in pairwise(ys):
             x, y = (left + right) / 2, (low + high) / 2
             if not any(pit.left < x < pit.right and pit.low < y < pit.high for pit in scene.pits):
                 tiles += _slab(x, y, -0.01, (right - left) / 2, (high - low) / 2, "0.45 0.4 0.35 1")

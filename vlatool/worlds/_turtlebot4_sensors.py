@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
+from vlatool.messages.clouds import points_message
 from vlatool.messages.geometry_msgs import Vector3
 from vlatool.messages.nav_msgs import Odometry
+from vlatool.messages.pixels import image_message
 from vlatool.messages.sensor_msgs import (
     BatteryState,
     CameraInfo,
@@ -115,11 +117,11 @@ class Sensors:
         rows, columns = self._size
         optical = "camera_color_optical_frame"
         if name == "color" and self._camera is not None:
-            return build.colour_image(self._colours(self._camera, data), stamp, optical)
+            return image_message(self._colours(self._camera, data), "rgb8", Header(stamp, optical))
         if name == "depth" and depth is not None:
-            return build.depth_image(depth, stamp, optical)
+            return image_message(depth, "32FC1", Header(stamp, optical))
         if name == "cloud" and depth is not None:
-            return build.cloud(points_of(depth), stamp, optical)
+            return points_message(points_of(depth), Header(stamp, optical))
         if name == "info":
             return build.camera_info(rows, columns, HFOV_RAD, stamp, optical)
         if name == "roi":
@@ -142,7 +144,7 @@ class Sensors:
     def _colours(self, camera: Camera, data: Any) -> Array:
         pixels = camera.colours(data)
         noisy = pixels + self._deviation("color", pixels.shape[:2])[..., None]
-        return np.clip(noisy, 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(noisy, 0, 255), np.uint8)
 
     def _depth(self, camera: Camera, data: Any) -> Array:
         depth = camera.depth(data)
@@ -175,7 +177,7 @@ class Sensors:
         base, radius = 0.233, 0.036  # metres between the wheels of a Create 3, and of their radius
         speeds = np.array([drive.linear - drive.angular * base / 2.0, drive.linear + drive.angular * base / 2.0])
         pushes = contact and abs(drive.linear) > 0.01
-        currents = 0.1 + 0.5 * abs(speeds) + 0.5 * abs(acceleration) + (4.0 if pushes else 0.0)
+        currents = np.asarray(0.1 + 0.5 * abs(speeds) + 0.5 * abs(acceleration) + (4.0 if pushes else 0.0), np.float64)
         names = ("left_wheel_joint", "right_wheel_joint")
         return JointState(Header(stamp, "base_link"), names, np.zeros(2), speeds / radius, currents)
 
@@ -210,6 +212,8 @@ def region_of(
     lower = rows / 2.0 + focal * CAMERA_HEIGHT_M / (ahead + radius)
     x, y = max(0, round(left)), max(0, round(upper))
     width, height = min(columns, round(right)) - x, min(rows, round(lower)) - y
-    return RegionOfInterest(x_offset=x, y_offset=y, width=width, height=height) if min(width, height) > 2 else (
-        RegionOfInterest()
+    return (
+        RegionOfInterest(x_offset=x, y_offset=y, width=width, height=height)
+        if min(width, height) > 2
+        else (RegionOfInterest())
     )

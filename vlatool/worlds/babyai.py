@@ -16,8 +16,9 @@ from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.nav_msgs import Odometry
+from vlatool.messages.pixels import image_message
 from vlatool.messages.sensor_msgs import Image
-from vlatool.messages.std_msgs import Bool, String
+from vlatool.messages.std_msgs import Bool, Header, String
 from vlatool.worlds import _mobile_messages as build
 from vlatool.worlds._differential_drive import DifferentialDrive
 from vlatool.worlds._faults import Outbox, read_knob
@@ -116,7 +117,8 @@ class BabyAI:
         self._drive = DifferentialDrive(
             MAX_LINEAR, MAX_ANGULAR, LINEAR_RATE, ANGULAR_RATE, SILENCE_S, self.slip, np.random.default_rng([seed, 1])
         )
-        self._outbox = Outbox(*self._faults, np.random.default_rng([seed, 3]))
+        delay, drop, freeze = self._faults
+        self._outbox = Outbox(delay, drop, freeze, np.random.default_rng([seed, 3]))
         self._outbox.put("instruction", SENSORS["instruction"].topic, String(self._level.mission), 0.0)
 
     def advance(self, seconds: float) -> None:
@@ -171,9 +173,10 @@ class BabyAI:
         if name == "color":
             self._place_agent()
             pixels = self._level.get_frame(tile_size=TILE, agent_pov=True)
-            return build.colour_image(pixels, stamp, "camera")
+            return image_message(np.asarray(pixels, np.uint8), "rgb8", Header(stamp, "camera"))
         if name == "depth":
-            return build.depth_image(np.full((DEPTH_PIXELS, DEPTH_PIXELS), self._ahead(), np.float32), stamp, "camera")
+            depth = np.full((DEPTH_PIXELS, DEPTH_PIXELS), self._ahead(), np.float32)
+            return image_message(depth, "32FC1", Header(stamp, "camera"))
         if name == "odom":
             return build.odometry(self._drive.odometry, self._drive.linear, self._drive.angular, stamp)
         return Bool(self._has_arrived())
@@ -208,7 +211,7 @@ class BabyAI:
         """Return ``pose`` (x, y, yaw), ``velocity``, ``collisions``, ``success`` (ever) and ``arrived`` (now)."""
         return {
             "pose": self._pose,
-            "velocity": (self._drive.linear, self._drive.angular),
+            "velocity": (float(self._drive.linear), float(self._drive.angular)),
             "collisions": self._collisions,
             "success": self._success,
             "arrived": self._has_arrived(),

@@ -159,7 +159,7 @@ class TurtleBot4:
 
     def advance(self, seconds: float) -> None:
         """Simulate this much time, in steps of 10 ms."""
-        assert self._sensors is not None  # noqa: S101 - set by reset
+        assert self._sensors is not None
         for _ in range(round(seconds / TICK_S)):
             self._step()
             self._sensors.sense(self._tick, self._data, self._drive, self._target, self._people_near(), self._contact)
@@ -204,7 +204,7 @@ class TurtleBot4:
 
     def reports(self) -> list[tuple[str, Message]]:
         """Return the messages that arrived since the last call, with their topics, in the order of their sending."""
-        assert self._sensors is not None  # noqa: S101 - set by reset
+        assert self._sensors is not None
         return self._sensors.outbox.take(self.time_s)
 
     def obey(self, topic: str, message: Message) -> None:
@@ -215,7 +215,8 @@ class TurtleBot4:
         """
         if topic != self.command_topic or not isinstance(message, Twist):
             raise UsageError(
-                f"turtlebot4 does not obey {type(message).__name__} on {topic}; allowed: Twist on {self.command_topic}.",
+                f"turtlebot4 does not obey {type(message).__name__} on {topic}; allowed: Twist on "
+                f"{self.command_topic}.",
                 "map the topic of the controller, or set command_topic",
             )
         self._drive.obey(message.linear.x, message.angular.z, self.time_s)

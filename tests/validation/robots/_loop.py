@@ -51,7 +51,9 @@ class Loop:
         alter: Changes or drops a message on its way from the world: (topic, message) -> message or None.
     """
 
-    def __init__(self, world: World, controllers: Iterable[RobotController[Any]], alter: Callable[..., Any] | None = None):
+    def __init__(
+        self, world: World, controllers: Iterable[RobotController[Any]], alter: Callable[..., Any] | None = None
+    ):
         self.world, self.nodes, self.alter, self.tick = world, [Node(one) for one in controllers], alter, 0
         self.obeys = {channel.topic for channel in world.commands}
 

@@ -7,9 +7,9 @@
 ``steps``: a target appears beside and before or behind its place; 3 s later heading and distance are judged, and 1 s
 after it is gone, whether the robot stands. ``collisions``: a room with pillars, a cliff, moving things and people, the
 safety monitor on, its emergencies released every two seconds; ``--hostile`` adds, in turns, things that step in 0.5 m
-ahead, a frozen depth camera, lidar gaps, a delay of 300 ms, and a policy (or target) of noise, and all of them. ``vln``:
-the sample policy through continuous motion beside the same seeds in its discrete environment. BUNDLE is the int8 bundle
-of ``sample_models/vln-babyai``. Ends with 1 where a collision or a fall happened, or a step failed.
+ahead, a frozen depth camera, lidar gaps, a delay of 300 ms, a policy (or target) of noise, and all of them. ``vln``:
+the sample policy through continuous motion beside the same seeds in its discrete environment. BUNDLE is the int8
+bundle of ``sample_models/vln-babyai``. Ends with 1 where a collision or a fall happened, or a step failed.
 """
 
 from __future__ import annotations
@@ -149,7 +149,12 @@ def collision_episode(name: str, seed: int, hostile: bool, policy: Any, seconds:
             emergencies += 1
             node.requests.append(Request("emergency", SetBoolRequest(False), tick))
     truth = world.truth()
-    return {"collisions": truth["collisions"], "falls": int(truth["fell"]), "metres": driven, "emergencies": emergencies}
+    return {
+        "collisions": truth["collisions"],
+        "falls": int(truth["fell"]),
+        "metres": driven,
+        "emergencies": emergencies,
+    }
 
 
 class Lead:
