@@ -10,9 +10,9 @@ from typing import NamedTuple
 from vlatool.controllers._geometry import PlanarPose, clamp, wrap
 from vlatool.errors import UsageError
 
-LEFT, RIGHT, FORWARD, BACKWARD, WAIT, STOP = "left", "right", "forward", "backward", "wait", "stop"
+TURN_LEFT, TURN_RIGHT, FORWARD, BACKWARD, WAIT, STOP = "left", "right", "forward", "backward", "wait", "stop"
 WORDS = {
-    LEFT: ("left",), RIGHT: ("right",), FORWARD: ("forward", "forwards", "ahead", "straight"),
+    TURN_LEFT: ("left",), TURN_RIGHT: ("right",), FORWARD: ("forward", "forwards", "ahead", "straight"),
     BACKWARD: ("back", "backward", "backwards", "reverse"), WAIT: ("wait", "none", "noop", "idle", "hold"),
     STOP: ("stop", "done", "end", "arrived"),
 }  # fmt: skip
@@ -71,8 +71,8 @@ class Motion(NamedTuple):
 
 def plan(kind: str, start: PlanarPose, turn_rad: float, forward_m: float, time_s: float) -> Motion:
     """Return a motion from a pose."""
-    if kind in (LEFT, RIGHT):
-        yaw = wrap(start.yaw + (turn_rad if kind == LEFT else -turn_rad))
+    if kind in (TURN_LEFT, TURN_RIGHT):
+        yaw = wrap(start.yaw + (turn_rad if kind == TURN_LEFT else -turn_rad))
         return Motion(kind, start._replace(yaw=yaw), time_s)
     distance = forward_m if kind == FORWARD else -forward_m
     x, y = start.x + distance * math.cos(start.yaw), start.y + distance * math.sin(start.yaw)
@@ -99,7 +99,7 @@ def drive(motion: Motion, pose: PlanarPose, speeds: Speeds) -> tuple[float, floa
     """Return the speed in m/s, the rotation speed in rad/s, and whether the motion is at its end."""
     goal = motion.goal
     turn = wrap(goal.yaw - pose.yaw)
-    if motion.kind in (LEFT, RIGHT):
+    if motion.kind in (TURN_LEFT, TURN_RIGHT):
         if abs(turn) <= speeds.angle_rad:
             return 0.0, 0.0, True
         return 0.0, clamp(_at_least(TURN_GAIN * turn, 0.1 * speeds.angular), speeds.angular), False

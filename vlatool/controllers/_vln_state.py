@@ -11,7 +11,7 @@ from vlatool.controllers._freshness import Change
 from vlatool.controllers._geometry import PlanarPose
 from vlatool.controllers._motions import Motion
 
-IDLE, RUNNING, PAUSED, ARRIVED, FAILED = "idle", "running", "paused", "arrived", "failed"
+IDLE_PHASE, RUNNING_PHASE, PAUSED_PHASE, ARRIVED_PHASE, FAILED_PHASE = "idle", "running", "paused", "arrived", "failed"
 """First word of the status."""
 
 
@@ -24,7 +24,7 @@ class VlnState(NamedTuple):
         instruction: What the policy is asked to do.
         heard: Number of the message with the instruction; -1 before the first.
         motion: The motion under way.
-        place: Pose at which the last motion was to end, in the frame of the odometry; None before the first.
+        waypoint: Pose at which the last motion was to end, in the frame of the odometry; None before the first.
         ended_s: When the last motion ended, in seconds of ``Snapshot.time_s``.
         ended_stamp: Stamp of the odometry that ended it, in seconds.
         frames: Last frames that the policy saw, uint8 (H, W, 3) each.
@@ -32,12 +32,12 @@ class VlnState(NamedTuple):
         changes: When camera and odometry last changed.
     """
 
-    phase: str = IDLE
+    phase: str = IDLE_PHASE
     detail: str = ""
     instruction: str = ""
     heard: int = -1
     motion: Motion | None = None
-    place: PlanarPose | None = None
+    waypoint: PlanarPose | None = None
     ended_s: float | None = None
     ended_stamp: float = 0.0
     frames: tuple[NDArray[Any], ...] = ()

@@ -117,12 +117,10 @@ class RoiFollower:
         distance = self.distance(depth, region) if depth is not None else None
         offset = offset_of(region, camera.width)
         state = Motion(self.linear(distance, state.linear), self.rotation(offset), snapshot.time_s, target)
-        notes: dict[str, float | str] = (
-            {"offset": offset} if distance is None else {"offset": offset, "distance_m": distance}
-        )
-        return self._command(
-            state, "following" if distance is not None else f"turning: {problem or 'no depth'}", notes
-        ), state
+        notes: dict[str, float | str] = {"offset": offset}
+        if distance is None:
+            return self._command(state, f"turning: {problem or 'no depth'}", notes), state
+        return self._command(state, "following", {**notes, "distance_m": distance}), state
 
     def distance(self, depth: NDArray[Any], roi: RegionOfInterest) -> float | None:
         """Return the mean depth of the middle of a region, in metres; None where nothing of it is known."""

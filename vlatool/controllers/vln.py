@@ -16,8 +16,15 @@ from vlatool.controllers._interface import Command, Input, Output, Service, Snap
 from vlatool.controllers._motions import BACKWARD, FORWARD, STOP, WAIT, Speeds, drive, motions_of, plan
 from vlatool.controllers._sensor_arrays import colours_of, depth_of
 from vlatool.controllers._settings import check_range, check_rate
-from vlatool.controllers._vln_state import ARRIVED, FAILED, IDLE, PAUSED, RUNNING, VlnState
-from vlatool.errors import UsageError, VlatoolError
+from vlatool.controllers._vln_state import (
+    ARRIVED_PHASE,
+    FAILED_PHASE,
+    IDLE_PHASE,
+    PAUSED_PHASE,
+    RUNNING_PHASE,
+    VlnState,
+)
+from vlatool.errors import DeadlineMissed, UsageError, VlatoolError
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.nav_msgs import Odometry
 from vlatool.messages.sensor_msgs import Image
@@ -142,20 +149,20 @@ class Vln:
         state = self._listen(snapshot, state)
         changes = note_changes(snapshot, ("image", "odometry"), state.changes)
         state = state._replace(changes=changes)
-        if state.phase in (IDLE, ARRIVED, FAILED):
+        if state.phase in (IDLE_PHASE, ARRIVED_PHASE, FAILED_PHASE):
             return self._stand(state)
         pose = pose_of(snapshot.message("odometry", Odometry))
         trouble = self._trouble(snapshot, state, pose)
         if trouble or pose is None:
-            return self._stand(state._replace(phase=PAUSED, detail=trouble))
-        state = state._replace(phase=RUNNING)
+            return self._stand(state._replace(phase=PAUSED_PHASE, detail=trouble))
+        state = state._replace(phase=RUNNING_PHASE)
         if state.motion is not None:
             return self._move(snapshot, state, pose)
         return self._decide(snapshot, state, pose)
 
     def rest(self) -> Command:
         """Stand."""
-        return Command({"cmd_vel": (twist(),), "status": (String(IDLE),)}, status="stopped")
+        return Command({"cmd_vel": (twist(),), "status": (String(IDLE_PHASE),)}, status="stopped")
 
     def _listen(self, snapshot: Snapshot, state: VlnState) -> VlnState:
         """Return the state after what came on the instruction and on the word that the robot arrived."""
@@ -163,11 +170,15 @@ class Vln:
         if reading is not None and reading.sequence != state.heard:
             text = reading.message.data.strip() if isinstance(reading.message, String) else ""
             self.policy.reset()
-            phase = RUNNING if text else IDLE
+            phase = RUNNING_PHASE if text else IDLE_PHASE
             return VlnState(phase=phase, instruction=text, heard=reading.sequence, changes=state.changes)
         arrived = snapshot.readings.get("arrived", ())
-        if state.phase in (RUNNING, PAUSED) and any(getattr(item.message, "data", False) for item in arrived):
-            return state._replace(phase=ARRIVED if state.phase == RUNNING else state.phase, motion=None, detail="")
+        if state.phase in (RUNNING_PHASE, PAUSED_PHASE) and any(
+            getattr(item.message, "data", False) for item in arrived
+        ):
+            return state._replace(
+                phase=ARRIVED_PHASE if state.phase == RUNNING_PHASE else state.phase, motion=None, detail=""
+            )
         return state
 
     def _trouble(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose | None) -> str:
@@ -184,14 +195,14 @@ class Vln:
         motion = state.motion
         speeds = Speeds(self.max_linear_speed, self.max_angular_speed, self.position_m, math.radians(self.angle_deg))
         linear, angular, over = drive(motion, pose, speeds)
-        place = motion.goal
+        waypoint = motion.goal
         late = snapshot.time_s - motion.began_s > self.motion_s
         hit = motion.kind == FORWARD and self._ahead(snapshot) < self.clearance_m
         if not over and (late or hit):
-            over, place, linear, angular = True, pose, 0.0, 0.0
+            over, waypoint, linear, angular = True, pose, 0.0, 0.0
         if over:
             stamp = self._odometry_stamp(snapshot)
-            state = state._replace(motion=None, place=place, ended_s=snapshot.time_s, ended_stamp=stamp)
+            state = state._replace(motion=None, waypoint=waypoint, ended_s=snapshot.time_s, ended_stamp=stamp)
             return self._stand(state._replace(detail="blocked on the way" if hit else "looking"))
         return self._command(state._replace(detail=motion.kind), linear, angular), state
 
@@ -200,31 +211,33 @@ class Vln:
         if not self._has_settled(snapshot, state):
             return self._stand(state._replace(detail="looking"))
         if self.max_actions and len(state.actions) >= self.max_actions:
-            return self._stand(state._replace(phase=FAILED, detail=f"no arrival in {self.max_actions} actions"))
+            return self._stand(state._replace(phase=FAILED_PHASE, detail=f"no arrival in {self.max_actions} actions"))
         image, problem = colours_of(snapshot.message("image", Image))
         if image is None:
-            return self._stand(state._replace(phase=PAUSED, detail=problem))
+            return self._stand(state._replace(phase=PAUSED_PHASE, detail=problem))
         frames = (*state.frames, image)[-self._observed.frames :]
         try:
             index = choose(self.policy, observation(self._observed, frames, state.actions, state.instruction))
             kind = self._motions[index]
+        except DeadlineMissed:
+            return self._stand(state._replace(detail="the policy is late"))
         except (VlatoolError, IndexError) as error:
             detail = error.message if isinstance(error, VlatoolError) else "the policy chose an action without a label"
-            return self._stand(state._replace(phase=FAILED, detail=detail))
-        state = state._replace(frames=frames, actions=(*state.actions, index), place=state.place or pose)
+            return self._stand(state._replace(phase=FAILED_PHASE, detail=detail))
+        state = state._replace(frames=frames, actions=(*state.actions, index), waypoint=state.waypoint or pose)
         return self._begin(snapshot, state, kind)
 
     def _begin(self, snapshot: Snapshot, state: VlnState, kind: str) -> tuple[Command, VlnState]:
         """Begin the motion of an action; nothing is driven at this step."""
         over = state._replace(ended_s=snapshot.time_s, ended_stamp=self._odometry_stamp(snapshot))
         if kind == STOP:
-            return self._stand(state._replace(phase=ARRIVED, detail="by its stop label"))
+            return self._stand(state._replace(phase=ARRIVED_PHASE, detail="by its stop label"))
         if kind == WAIT:
             return self._stand(over._replace(detail=WAIT))
         if kind == FORWARD and self._ahead(snapshot) < self.forward_m + self.clearance_m:
             return self._stand(over._replace(detail="blocked"))
-        assert state.place is not None
-        motion = plan(kind, state.place, math.radians(self.turn_deg), self.forward_m, snapshot.time_s)
+        assert state.waypoint is not None
+        motion = plan(kind, state.waypoint, math.radians(self.turn_deg), self.forward_m, snapshot.time_s)
         return self._stand(state._replace(motion=motion, detail=kind if kind != BACKWARD else "backward"))
 
     def _has_settled(self, snapshot: Snapshot, state: VlnState) -> bool:

@@ -56,9 +56,9 @@ def draw_scene(size_m: float, counts: dict[str, int], random: np.random.Generato
     """Return a room with so many ``pillars``, ``cliffs``, ``movers`` and ``people``, at random places."""
     scene = Scene(size_m)
     for index in range(counts["cliffs"]):
-        place = _free_place(scene, 0.4, 1.1, random)
-        if place is not None:
-            scene.pits.append(Pit(place[0] - 0.3, place[1] - 0.3, place[0] + 0.3, place[1] + 0.3))
+        position = _free_place(scene, 0.4, 1.1, random)
+        if position is not None:
+            scene.pits.append(Pit(position[0] - 0.3, position[1] - 0.3, position[0] + 0.3, position[1] + 0.3))
         del index
     kinds = (
         ("pillar", "pillars", scene.pillars),
@@ -68,11 +68,11 @@ def draw_scene(size_m: float, counts: dict[str, int], random: np.random.Generato
     for kind, key, group in kinds:
         for index in range(counts[key]):
             radius = {"pillar": random.uniform(0.06, 0.25), "mover": 0.15, "person": 0.2}[kind]
-            place = _free_place(scene, radius, 0.7, random)
-            if place is not None:
+            position = _free_place(scene, radius, 0.7, random)
+            if position is not None:
                 height = {"pillar": 0.8, "mover": 0.5, "person": 1.7}[kind]
                 speed = {"pillar": 0.0, "mover": 0.25, "person": 0.8}[kind]
-                group.append(Thing(f"{kind}{index}", *place, radius, height, speed))
+                group.append(Thing(f"{kind}{index}", *position, radius, height, speed))
     scene.colours = random.uniform(0.2, 0.9, (len(scene.pillars), 3))
     return scene
 

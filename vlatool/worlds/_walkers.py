@@ -52,12 +52,12 @@ class Walkers:
         x, y = self.random.uniform(-reach, reach, 2)
         return float(x), float(y)
 
-    def _is_blocked(self, thing: Thing, place: tuple[float, float]) -> bool:
+    def _is_blocked(self, thing: Thing, position: tuple[float, float]) -> bool:
         others = [(t.x, t.y, t.radius) for t in self.scene.pillars]
         others += [(*self.places[t.name], t.radius) for t in self.scene.movers if t.name != thing.name]
         old = self.places[thing.name]
         return any(
-            _apart(place, (x, y)) < thing.radius + radius + 0.1 and _apart(place, (x, y)) < _apart(old, (x, y))
+            _apart(position, (x, y)) < thing.radius + radius + 0.1 and _apart(position, (x, y)) < _apart(old, (x, y))
             for x, y, radius in others
         )
 

@@ -136,11 +136,11 @@ class BabyAI:
         x, y, yaw = self._pose
         middle = yaw + self._drive.angular * TICK_S / 2.0
         way = self._drive.linear * TICK_S
-        place = (x + way * math.cos(middle), y + way * math.sin(middle))
-        blocked = self._is_blocked(self._cell(*place))
+        position = (x + way * math.cos(middle), y + way * math.sin(middle))
+        blocked = self._is_blocked(self._cell(*position))
         self._collisions += blocked and not self._contact
         self._contact = blocked
-        x, y = (x, y) if blocked else place
+        x, y = (x, y) if blocked else position
         self._pose = (x, y, math.remainder(yaw + self._drive.angular * TICK_S, 2.0 * math.pi))
         self._success = self._success or self._has_arrived()
 
