@@ -122,6 +122,14 @@ def test_the_target_is_where_the_region_says_and_hidden_when_it_is_taken_away():
     assert world.truth()["target"] is None
 
 
+def test_a_target_that_walks_waits_for_the_robot():
+    world = open_world("turtlebot4", only="roi", target_m=1.0, target_speed=0.5, **QUIET)
+    world.reset(4)
+    assert world.truth()["target"] == pytest.approx((1.0, 0.0))
+    drive(world, 20.0, 0.0)
+    assert world.truth()["target"][0] == pytest.approx(1.5, abs=0.01)
+
+
 def test_a_collision_counts_once_while_it_drives_and_a_motor_that_pushes_draws_current():
     world = open_world("turtlebot4", only="joints", size_m=2.0, **QUIET)
     world.reset(0)

@@ -215,7 +215,8 @@ class Vln:
         image, problem = colours_of(snapshot.message("image", Image))
         if image is None:
             return self._stand(state._replace(phase=PAUSED_PHASE, detail=problem))
-        frames = (*state.frames, image)[-self._observed.frames :]
+        known = tuple(frame for frame in state.frames if frame.shape == image.shape)
+        frames = (*known, image)[-self._observed.frames :]
         try:
             index = choose(self.policy, observation(self._observed, frames, state.actions, state.instruction))
             kind = self._motions[index]

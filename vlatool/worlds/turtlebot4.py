@@ -49,6 +49,8 @@ class TurtleBot4:
         yield_m: Distance from the robot's edge within which moving things come no nearer, in metres.
         intruder_s: Every how many seconds, on average, something steps in 0.5 m in front of the robot's centre, for
             three seconds; 0 for never.
+        target_m: Distance ahead of the robot at which a red target stands at the start, in metres; 0 for none.
+        target_speed: Speed at which it walks through the room while the robot is within 1.5 m of it, in m/s.
         command_topic: Topic of commands; ``/safe_cmd_vel`` behind a safety monitor.
         only: Sensors that are simulated, separated by commas; all when empty. Cameras are rendered when asked for.
         width, height: Pixels of the camera.
@@ -73,6 +75,8 @@ class TurtleBot4:
     people: int = 0
     yield_m: float = 0.4
     intruder_s: float = 0.0
+    target_m: float = 0.0
+    target_speed: float = 0.0
     command_topic: str = "/cmd_vel"
     only: str = ""
     width: int = 160
@@ -88,7 +92,17 @@ class TurtleBot4:
     def __post_init__(self) -> None:
         for name in ("delay", "drop", "freeze", "noise"):
             self._knobs[name] = read_knob(name, getattr(self, name), SENSORS)
-        for name in ("pillars", "cliffs", "movers", "people", "intruder_s", "yield_m", "gaps"):
+        for name in (
+            "pillars",
+            "cliffs",
+            "movers",
+            "people",
+            "intruder_s",
+            "yield_m",
+            "gaps",
+            "target_m",
+            "target_speed",
+        ):
             if not 0 <= getattr(self, name) < 1000:
                 raise UsageError(f"{name} is {getattr(self, name)!r}; allowed: 0 or more.", f"change {name}")
         if not 2.0 <= self.size_m <= 50.0:
@@ -141,6 +155,9 @@ class TurtleBot4:
             self._mujoco, self._model, self._names, (self.height, self.width), self._knobs["noise"], self.gaps,
             Outbox(*faults), np.random.default_rng([seed, 4]), self.battery,
         )  # fmt: skip
+        if self.target_m:
+            self.place_target(self.target_m * math.cos(self._yaw), self.target_m * math.sin(self._yaw))
+        self._goal: tuple[float, float] | None = None
         self._mujoco.mj_forward(self._model, self._data)
 
     def place_target(self, x: float, y: float) -> None:
@@ -174,6 +191,7 @@ class TurtleBot4:
         for name, (px, py) in self._walkers.places.items():
             self._place(name, px, py, 0.0)
         self._intrude(x, y, yaw)
+        self._lead(x, y)
         self._mujoco.mj_step(self._model, data)
         touching = data.ncon > 0
         if touching and not self._contact and abs(drive.linear) > 0.01:
@@ -192,6 +210,20 @@ class TurtleBot4:
             self._intruder_until = self.time_s + 3.0
             ahead = math.copysign(0.6, self._drive.linear or 1.0)
             self._place("intruder", x + ahead * math.cos(yaw), y + ahead * math.sin(yaw), 0.0)
+
+    def _lead(self, x: float, y: float) -> None:
+        """Let the target walk on while the robot is near."""
+        if self._target is None or not self.target_speed:
+            return
+        tx, ty = self._target
+        if self._goal is None or math.hypot(self._goal[0] - tx, self._goal[1] - ty) < 0.1:
+            reach = self.size_m / 2.0 - 0.5
+            self._goal = (float(self._random.uniform(-reach, reach)), float(self._random.uniform(-reach, reach)))
+        way = math.hypot(self._goal[0] - tx, self._goal[1] - ty)
+        step = min(self.target_speed * TICK_S, way) / max(way, 1e-9)
+        new = (tx + (self._goal[0] - tx) * step, ty + (self._goal[1] - ty) * step)
+        if math.hypot(tx - x, ty - y) < 1.5 and math.hypot(new[0] - x, new[1] - y) > RADIUS_M + TARGET.radius + 0.1:
+            self.place_target(*new)
 
     def _people_near(self) -> bool:
         """Whether a person is within 1.2 m of the robot's edge."""
