@@ -58,14 +58,13 @@ class CorrelationFilter(NamedTuple):
 
 def begin(image: Array, box: Box) -> CorrelationFilter:
     """Return the filter of a target, in one frame: (H, W) or (H, W, C), of any dtype."""
-    spectrum = _spectrum(_grey(image), box)
+    spectrum = _spectrum(image, box)
     return CorrelationFilter(box, _TARGET * spectrum.conj(), (spectrum * spectrum.conj()).real)
 
 
 def follow(image: Array, known: CorrelationFilter) -> tuple[CorrelationFilter, bool]:
     """Return the filter after a frame, and whether the target was found in it; a lost target leaves it as it was."""
-    grey = _grey(image)
-    spectrum = _spectrum(grey, known.box)
+    spectrum = _spectrum(image, known.box)
     response = np.fft.irfft2(spectrum * known.numerator / (known.denominator + REGULARISATION * SIDE**2), (SIDE, SIDE))
     row, column = np.unravel_index(int(response.argmax()), response.shape)
     if not _ratio(response, int(row), int(column)) >= MIN_RATIO:
@@ -73,24 +72,21 @@ def follow(image: Array, known: CorrelationFilter) -> tuple[CorrelationFilter, b
     box = known.box
     x = box.x + _AXIS[column] * box.width * CONTEXT / SIDE
     y = box.y + _AXIS[row] * box.height * CONTEXT / SIDE
-    if not (0 <= x < grey.shape[1] and 0 <= y < grey.shape[0]):
+    if not (0 <= x < image.shape[1] and 0 <= y < image.shape[0]):
         return known, False
     box = box._replace(x=float(x), y=float(y))
-    spectrum, rate = _spectrum(grey, box), LEARNING_RATE
+    spectrum, rate = _spectrum(image, box), LEARNING_RATE
     numerator = rate * _TARGET * spectrum.conj() + (1.0 - rate) * known.numerator
     denominator = rate * (spectrum * spectrum.conj()).real + (1.0 - rate) * known.denominator
     return CorrelationFilter(box, numerator, denominator), True
 
 
-def _grey(image: Array) -> Array:
-    return image.mean(axis=2) if image.ndim == 3 else np.asarray(image, np.float64)
-
-
-def _spectrum(grey: Array, box: Box) -> Array:
+def _spectrum(image: Array, box: Box) -> Array:
     """Return the transform of the patch around a box, with zero mean and unit variance, below a cosine window."""
-    rows = np.clip(np.rint(box.y + _AXIS * box.height * CONTEXT / SIDE), 0, grey.shape[0] - 1).astype(int)
-    columns = np.clip(np.rint(box.x + _AXIS * box.width * CONTEXT / SIDE), 0, grey.shape[1] - 1).astype(int)
-    patch = np.log1p(grey[rows[:, None], columns])
+    rows = np.clip(np.rint(box.y + _AXIS * box.height * CONTEXT / SIDE), 0, image.shape[0] - 1).astype(int)
+    columns = np.clip(np.rint(box.x + _AXIS * box.width * CONTEXT / SIDE), 0, image.shape[1] - 1).astype(int)
+    patch = image[rows[:, None], columns]
+    patch = np.log1p(patch.sum(axis=2, dtype=np.float64) if patch.ndim == 3 else patch)
     patch = (patch - patch.mean()) / (patch.std() + 1e-5)
     return np.fft.rfft2(patch * _WINDOW)
 

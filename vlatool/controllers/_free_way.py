@@ -51,8 +51,11 @@ def clearance(points: Array, way: Array, radius_m: float) -> float:
     """
     if len(way) < 2 or not len(points):
         return math.inf
-    distance = np.hypot(points[None, :, 0] - way[:, 0, None], points[None, :, 1] - way[:, 1, None])
-    hits = (distance < radius_m) & (distance < np.hypot(points[:, 0], points[:, 1]))
+    square = points[:, 0] ** 2 + points[:, 1] ** 2
+    near = square < (REACH_M + radius_m) ** 2
+    x, y = points[near, 0], points[near, 1]
+    distance = (x[None, :] - way[:, 0, None]) ** 2 + (y[None, :] - way[:, 1, None]) ** 2
+    hits = (distance < radius_m**2) & (distance < square[near])
     found = np.flatnonzero(hits.any(axis=1))
     return float(found[0]) * STEP_M if len(found) else math.inf
 
@@ -72,11 +75,16 @@ def has_gap(angles: Array, ranges: Array, way: Array, share: float = 0.1) -> boo
     return not near.any() or float(np.isnan(ranges[near]).mean()) > share
 
 
-def of_depth(depth: Array, mount: Mount) -> Array:
-    """Return the points (M, 3) that a depth image sees, in metres: x forward, y to the left, z up, on the floor."""
-    rows, columns = depth.shape
+def of_depth(depth: Array, size: tuple[int, int], mount: Mount) -> Array:
+    """Return the points (M, 3) that a depth image sees, in metres: x forward, y to the left, z up from the floor.
+
+    Args:
+        depth: Every ``STRIDE``th row and column, from half a stride on, in metres.
+        size: (H, W) of the whole image.
+    """
+    rows, columns = size
     focal = columns / (2.0 * math.tan(mount.hfov_rad / 2.0))
-    part = np.asarray(depth[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE], np.float64)
+    part = np.asarray(depth, np.float64)
     down = (np.arange(rows)[STRIDE // 2 :: STRIDE] + 0.5 - rows / 2.0) / focal
     right = (np.arange(columns)[STRIDE // 2 :: STRIDE] + 0.5 - columns / 2.0) / focal
     x, y, z = part + mount.forward_m, -part * right[None, :], mount.height_m - part * down[:, None]

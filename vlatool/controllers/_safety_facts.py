@@ -15,7 +15,7 @@ from vlatool.controllers._freshness import Change, age_s, note_changes
 from vlatool.controllers._geometry import PlanarPose, pose_of, wrap
 from vlatool.controllers._interface import Snapshot
 from vlatool.controllers._safety_table import Facts, Limits
-from vlatool.controllers._sensor_arrays import depth_of, rays_of
+from vlatool.controllers._sensor_arrays import rays_of, thin_depth_of
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.nav_msgs import Odometry
 from vlatool.messages.sensor_msgs import BatteryState, Image, JointState, LaserScan
@@ -136,14 +136,14 @@ def _look(snapshot: Snapshot, robot: Robot, way: Array, out: set[str]) -> tuple[
         angles, ranges = rays_of(scan)
         found.append(free_way.of_scan(angles, ranges))
         gap = free_way.has_gap(angles, ranges, way)
-    depth, problem = depth_of(snapshot.message("depth", Image))
-    if depth is not None and depth.ndim == 2 and depth.size:
-        points = free_way.of_depth(depth, robot.mount)
+    depth, size, _ = thin_depth_of(snapshot.message("depth", Image), free_way.STRIDE)
+    if depth is not None and min(size) > free_way.STRIDE // 2:
+        points = free_way.of_depth(depth, size, robot.mount)
         found.append(free_way.obstacles(points, robot.cliff_m, robot.top_m))
         cliff = free_way.is_cliff(points, way, robot.mount, radius, robot.cliff_m)
         if not np.isfinite(depth).any():
             out.add("depth")
-    elif problem:
+    else:
         out.add("depth")
     return free_way.clearance(np.concatenate(found), way, radius), cliff, gap
 

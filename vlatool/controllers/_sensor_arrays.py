@@ -34,6 +34,23 @@ def depth_of(message: Image | None) -> tuple[Array | None, str]:
         return None, error.message
 
 
+def thin_depth_of(message: Image | None, stride: int) -> tuple[Array | None, tuple[int, int], str]:
+    """Return depths of every so many rows and columns, the size (H, W) of the whole image, and what is wrong with it.
+
+    The first is that at half a stride; otherwise as ``depth_of``.
+    """
+    if message is None:
+        return None, (0, 0), "no depth image"
+    try:
+        whole = pixels.image(message)
+        part = whole[stride // 2 :: stride, stride // 2 :: stride]
+        if message.encoding in pixels.DEPTHS and part.size:
+            message = pixels.image_message(part, message.encoding)
+        return pixels.depth_m(message), whole.shape[:2], ""
+    except BusError as error:
+        return None, (0, 0), error.message
+
+
 def points_of(message: PointCloud2 | None) -> tuple[Array | None, str]:
     """Return the finite points of a cloud, float64 (N, 3) in metres, or None and what is wrong with the message."""
     if message is None:
