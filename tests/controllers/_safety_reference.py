@@ -212,7 +212,10 @@ class Events:
         self.time, self.pose = 0.0, [2.5, 0.0, 0.0]
         self.trouble, self.until = "", 0.0
         self.kept: dict[str, Any] = {}
-        self.task, self.order = "idle", []
+        self.task, self.order, self.since = "idle", [], 0.0
+
+    MILD = ("obstacle far", "low", "fence", "silent")
+    """Troubles that are a WARNING at most, which a level that still falls would hide."""
 
     KINDS = (
         "obstacle far", "obstacle near", "obstacle close", "scan late", "depth late", "odometry late", "scan frozen",
@@ -223,12 +226,17 @@ class Events:
 
     def next(self) -> tuple[float, dict[str, Any]]:
         random = self.random
-        self.time += (0.05, 0.05, 0.1, 0.3)[int(random.integers(4))]
+        self.time += (0.05, 0.05, 0.1, 0.3)[int(random.integers(4))] * float(random.uniform(0.97, 1.03))
         if self.time >= self.until:
             if not self.order:
                 self.order = [self.KINDS[place] for place in random.permutation(len(self.KINDS))]
-            self.trouble = self.order.pop() if random.random() < 0.7 else ""
+            calm = self.trouble == "" and self.until - self.since > 3.0
+            self.trouble, self.since = self.order[-1] if calm or random.random() < 0.7 else "", self.time
             self.until = self.time + float(random.uniform(0.2, 2.0))
+            if self.trouble in self.MILD and not calm:  # only what comes after a calm time is seen
+                self.trouble, self.until = "", self.time + 3.2
+            elif self.trouble:
+                self.order.pop()
             if self.trouble == "long task":
                 self.until = self.time + TASK_S + 1.0
         t, event = self.trouble, {"stamp": {}}
