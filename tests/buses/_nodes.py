@@ -11,13 +11,26 @@ import numpy as np
 import pytest
 from buses._trials import QUALITY, WAIT_S, Heard, forward, speeds, wait_until
 
-from vlatool.buses import Bus, QoS, TopicInfo
+from vlatool.buses import (
+    GOAL_ABORTED,
+    GOAL_CANCELED,
+    GOAL_SUCCEEDED,
+    ActionBus,
+    ActionType,
+    Bus,
+    Goal,
+    Outcome,
+    QoS,
+    TopicInfo,
+)
 from vlatool.errors import BusError, UsageError
 from vlatool.messages import same
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.sensor_msgs import Image
 from vlatool.messages.std_srvs import SetBoolRequest, SetBoolResponse, TriggerRequest, TriggerResponse
+from vlatool.messages.vlatool_msgs import ACTION, RunInstructionFeedback, RunInstructionGoal, RunInstructionResult
 
+RUN = ActionType(ACTION, RunInstructionGoal, RunInstructionFeedback, RunInstructionResult)
 Open = Callable[[str], Bus]
 
 
@@ -149,6 +162,34 @@ class NetworkBus:
                 caller.call("/stop", SetBoolRequest(True), SetBoolResponse, 0.2)
             assert wait_until(lambda: [(f.topic, f.count) for f in robot.faults()] == [("/stop", 1)])
             assert caller.call("/stop", SetBoolRequest(False), SetBoolResponse, WAIT_S).success
+
+    def test_action_reports_ends_and_is_canceled(self, open_node: Open) -> None:
+        def run(goal: Goal) -> Outcome:
+            goal.feedback(RunInstructionFeedback(goal.message.instruction, 0.5))  # type: ignore[attr-defined]
+            if goal.message.timeout_s and not goal.canceled.wait(WAIT_S):  # type: ignore[attr-defined]
+                return Outcome(GOAL_ABORTED, RunInstructionResult())
+            end = GOAL_CANCELED if goal.canceled.is_set() else GOAL_SUCCEEDED
+            return Outcome(end, RunInstructionResult(end == GOAL_SUCCEEDED, end))
+
+        with opened(open_node, "robot", "client") as (robot, client):
+            assert isinstance(robot, ActionBus)
+            assert isinstance(client, ActionBus)
+            robot.serve_action("/run_instruction", RUN, run)
+            heard: list[Any] = []
+            sent = client.send_goal("/run_instruction", RUN, RunInstructionGoal("go"), heard.append)
+            outcome = sent.result(WAIT_S)
+            assert (outcome.status, outcome.result.success) == (GOAL_SUCCEEDED, True)  # type: ignore[attr-defined]
+            waits = client.send_goal("/run_instruction", RUN, RunInstructionGoal("wait", 1.0), heard.append)
+            with pytest.raises(BusError, match=r"/run_instruction gave no result within 0.1 s"):
+                waits.result(0.1)
+            waits.cancel()
+            assert waits.result(WAIT_S).status == GOAL_CANCELED
+            assert wait_until(lambda: "wait" in [feedback.status for feedback in heard])
+            replaced = client.send_goal("/run_instruction", RUN, RunInstructionGoal("wait", 1.0))
+            newer = client.send_goal("/run_instruction", RUN, RunInstructionGoal("go"))
+            assert replaced.result(WAIT_S).status == GOAL_ABORTED
+            assert newer.result(WAIT_S).status == GOAL_SUCCEEDED
+            assert robot.faults() == client.faults() == []
 
     def test_closed_bus_says_so(self, open_node: Open) -> None:
         with opened(open_node, "robot") as (robot,):

@@ -5,11 +5,22 @@ from __future__ import annotations
 import os
 import re
 
+from vlatool.buses._ros_names import resolve
 from vlatool.errors import UsageError
 
 DDS_TYPE = re.compile(r"(\w+)::(msg|srv|action)::dds_::(\w+)_")
 MAX_DOMAIN = 232
 """Largest domain whose ports are below 65536 (DDSI-RTPS 2.2, section 9.6.1.1)."""
+
+
+def full_name(name: str, node: str) -> str:
+    """Return the full name of a topic or service, those of an action, below ``/_action/``, included.
+
+    Raises:
+        UsageError: for one that ROS does not take.
+    """
+    base, below, part = name.partition("/_action/")
+    return resolve(base, node) + below + part
 
 
 def dds_type(name: str) -> str:
