@@ -3,8 +3,8 @@
     out/robots/zenoh-sdk/venv/bin/python tests/validation/robots/zenoh_sdk_peer.py PORT HASH
 
 It serves SetBool, too. For each topic on its standard input it prints which nodes it sees there; for "call N" it calls
-the SetBool of /vlatool_set N times and prints how many answers were right. Definition and hash of the Twist are those of rosbags, and HASH is that
-of SetBool; without them the sdk would download definitions.
+the SetBool of /vlatool_set N times and prints how many answers were right. Definition and hash of the Twist are those
+of rosbags, and HASH is that of SetBool; without them the sdk would download definitions.
 """
 
 from __future__ import annotations
