@@ -257,7 +257,7 @@ def test_an_action_reports_ends_and_is_canceled(node: Nodes) -> None:
 
 @pytest.mark.parametrize("address", ["233", "-1", "x", "1.5", "٣"])
 def test_an_impossible_domain_is_refused(address: str) -> None:
-    with pytest.raises(UsageError, match="is not a domain of ROS 2, which is a number from 0 to 232"):
+    with pytest.raises(UsageError, match="is not a whole number from 0 to 232"):
         open_bus(f"ros2:{address}", "node")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import ipaddress
 import os
 import socket
 import xmlrpc.client
@@ -43,13 +42,20 @@ def master_uri(address: str) -> str:
     return uri
 
 
-def is_loopback(uri: str) -> bool:
-    """Return whether a master runs on this machine's loopback interface, by its address."""
-    host = urlsplit(uri).hostname or ""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+def own_address(uri: str) -> str:
+    """Return the address at which this machine is reached from a master, an IPv4 address; empty where none is found.
+
+    rospy would tell other nodes this machine's host name, which they often cannot resolve; then no message arrives, and
+    nothing says why.
+    """
+    parts = urlsplit(uri)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
+        try:
+            route.connect((parts.hostname or "", parts.port or 0))  # sends nothing
+        except OSError:
+            return ""
+        address: str = route.getsockname()[0]
+    return address
 
 
 class _Transport(xmlrpc.client.Transport):

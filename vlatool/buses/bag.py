@@ -11,7 +11,7 @@ from vlatool.buses._bag_reader import BagReader, Recorded
 from vlatool.buses._bag_writer import BagWriter
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import Fault, M, QoS, Reception, TopicInfo
-from vlatool.buses._ros_names import check_node, resolve
+from vlatool.buses._names import check_node, resolve
 from vlatool.errors import BusError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -56,6 +56,7 @@ class Bag:
         self._lock = threading.Lock()
         self._closed, self.ended = threading.Event(), threading.Event()
         """``ended`` is set when the recording is over."""
+        self._thread: threading.Thread | None = None
         self._began_s: float | None = None
         self._time_ns: int | None = None
         self._failure: Exception | None = None
@@ -171,8 +172,10 @@ class Bag:
         if self._closed.is_set():
             return
         self._closed.set()
-        if self._began_s is not None and threading.current_thread() is not self._thread:
-            self._thread.join(5.0)
+        with self._lock:
+            thread = self._thread
+        if thread is not None and threading.current_thread() is not thread:
+            thread.join(5.0)
         if self._reader is not None:
             self._reader.close()
         if self._writer is not None:
@@ -214,8 +217,8 @@ class Bag:
             if self._began_s is not None or self._reader is None or self._closed.is_set():
                 return
             self._began_s = time.monotonic()
-        self._thread = threading.Thread(target=self._play_in_time, name="bag", daemon=True)
-        self._thread.start()
+            self._thread = threading.Thread(target=self._play_in_time, name="bag", daemon=True)
+            self._thread.start()
 
     def _play_in_time(self) -> None:
         began = self._began_s or 0.0

@@ -14,8 +14,7 @@ from vlatool.buses._dds_services import Client, serve_requests
 from vlatool.buses._dds_types import describe
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import ActionType, Fault, Goal, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._names import full_name, ros_type
-from vlatool.buses._ros_names import check_node, resolve
+from vlatool.buses._names import check_node, full_name, resolve, ros_type
 from vlatool.buses._service_actions import ServiceActionClient, ServiceActionServer, ServiceGoal
 from vlatool.errors import BusError, require
 from vlatool.messages import Message

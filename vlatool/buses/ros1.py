@@ -12,8 +12,8 @@ from typing import Any
 
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._ros1_master import Master, ask, is_loopback, master_uri
-from vlatool.buses._ros_names import check_node, resolve
+from vlatool.buses._names import check_node, resolve
+from vlatool.buses._ros1_master import Master, ask, master_uri, own_address
 from vlatool.buses._rospy_types import carrier, service_class
 from vlatool.buses._topic_actions import TopicActionClient, TopicActionServer, TopicGoal
 from vlatool.errors import BusError, MissingExtra
@@ -63,8 +63,8 @@ class Ros1:
 
     def _start(self, uri: str, node: str) -> None:
         os.environ["ROS_MASTER_URI"] = uri
-        if is_loopback(uri) and not {"ROS_IP", "ROS_HOSTNAME"} & {*os.environ}:
-            os.environ["ROS_IP"] = "127.0.0.1"
+        if not {"ROS_IP", "ROS_HOSTNAME"} & {*os.environ} and (address := own_address(uri)):
+            os.environ["ROS_IP"] = address
         renamed = self._rospy.names.get_mappings().get("__name", node)
         self._master.caller = f"{self._rospy.get_namespace()}{renamed.lstrip('/')}"
         try:

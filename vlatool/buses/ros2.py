@@ -14,16 +14,15 @@ from typing import Any
 
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
+from vlatool.buses._names import check_node, domain_id, resolve
 from vlatool.buses._rclpy_actions import ClientGoal, serve_action
 from vlatool.buses._rclpy_messages import from_ros, generated_class, to_ros
-from vlatool.buses._ros_names import check_node, resolve
-from vlatool.errors import BusError, MissingExtra, UsageError
+from vlatool.errors import BusError, MissingExtra
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 
 DISCOVERY_S = 0.5
 """Time after which the other nodes of a domain are known, in seconds."""
-MAX_DOMAIN = 232
 
 
 class Ros2:
@@ -36,16 +35,12 @@ class Ros2:
 
     def __init__(self, address: str, node: str) -> None:
         check_node(node)
-        if address and not (address.isascii() and address.isdigit() and int(address) <= MAX_DOMAIN):
-            raise UsageError(
-                f"'{address}' is not a domain of ROS 2, which is a number from 0 to {MAX_DOMAIN}.", "write ros2:0"
-            )
+        domain = domain_id(address)
         rclpy = _rclpy("rclpy")
         self._qos = _rclpy("rclpy.qos")
         self._faults = Faults()
         self._context = _rclpy("rclpy.context").Context()
         signals = _rclpy("rclpy.signals").SignalHandlerOptions.NO
-        domain = int(address) if address else None
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=signals)
         self._node = rclpy.create_node(node, context=self._context)
         self.node: str = self._node.get_name()

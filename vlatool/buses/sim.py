@@ -11,7 +11,7 @@ from typing import Any
 from vlatool.buses._faults import Faults
 from vlatool.buses._goals import Goals
 from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._ros_names import check_node, resolve
+from vlatool.buses._names import check_node, resolve
 from vlatool.buses._sim_space import LocalGoal, Served, ServedAction, Subscription, Topic, join
 from vlatool.errors import BusError
 from vlatool.messages import Message

@@ -16,7 +16,7 @@ import numpy as np
 
 from vlatool.errors import BusError
 from vlatool.messages._members import CODES, SIZES, Member, cache, members
-from vlatool.messages._tails import LENGTH, Malformed, Messages, Numbers, Tail, Text, Texts, Wire
+from vlatool.messages._tails import LENGTH, Malformed, Numbers, Tail, Text, Texts, Wire, check_count
 from vlatool.messages._wrong_values import WrongValue
 from vlatool.messages.schema import Message
 
@@ -125,6 +125,36 @@ class Plan:
             f"A malformed {self.cls.TYPE}, at {where}: {problem}.",
             "check that the publisher sends this type, in the version of its package that is installed there",
         )
+
+
+class Messages:
+    """A sequence of messages of one type."""
+
+    counted, smallest = True, 0
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+
+    def prepare(self, value: Any) -> tuple[int, Any]:
+        """Return the count of the messages, and the messages."""
+        if not isinstance(value, (tuple, list)):
+            raise WrongValue
+        return len(value), value
+
+    def write(self, payload: Any, parts: list[Any], position: int) -> int:
+        """Append the messages."""
+        for message in payload:
+            position = self.plan.write(message, parts, position)
+        return position
+
+    def read(self, data: memoryview, position: int, count: int) -> tuple[Any, int]:
+        """Return a tuple of the messages."""
+        check_count(count, self.plan.smallest, data, position)
+        messages = []
+        for _ in range(count):
+            message, position = self.plan.read(data, position)
+            messages.append(message)
+        return tuple(messages), position
 
 
 def _leaves(cls: type[Message], ros1: bool, prefix: str = "") -> list[Leaf]:

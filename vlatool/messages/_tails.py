@@ -1,4 +1,4 @@
-"""The parts of a message whose length may vary: strings, arrays, and sequences, each written and read at a position.
+"""The parts of a message whose length may vary: strings, arrays of numbers, each written and read at a position.
 
 A tail first prepares what it writes: a count, which the fields before it carry in front of it, and a payload. Positions
 count from the start of the payload, from which CDR aligns; ROS 1 aligns nothing and ends no string with a zero byte.
@@ -6,14 +6,11 @@ count from the start of the payload, from which CDR aligns; ROS 1 aligns nothing
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from vlatool.messages._wrong_values import WrongValue, fit_array
-
-if TYPE_CHECKING:
-    from vlatool.messages._plan import Plan
 
 PADS = tuple(bytes(count) for count in range(8))
 """Count -> as many zero bytes."""
@@ -164,36 +161,6 @@ class Numbers:
             array = array.astype(self.native)
         array.flags.writeable = False
         return array, end
-
-
-class Messages:
-    """A sequence of messages of one type."""
-
-    counted, smallest = True, 0
-
-    def __init__(self, plan: Plan) -> None:
-        self.plan = plan
-
-    def prepare(self, value: Any) -> tuple[int, Any]:
-        """Return the count of the messages, and the messages."""
-        if not isinstance(value, (tuple, list)):
-            raise WrongValue
-        return len(value), value
-
-    def write(self, payload: Any, parts: list[Any], position: int) -> int:
-        """Append the messages."""
-        for message in payload:
-            position = self.plan.write(message, parts, position)
-        return position
-
-    def read(self, data: memoryview, position: int, count: int) -> tuple[Any, int]:
-        """Return a tuple of the messages."""
-        check_count(count, self.plan.smallest, data, position)
-        messages = []
-        for _ in range(count):
-            message, position = self.plan.read(data, position)
-            messages.append(message)
-        return tuple(messages), position
 
 
 def check_count(count: int, smallest: int, data: memoryview, position: int) -> None:

@@ -42,7 +42,7 @@ def prepare(folder: Path) -> dict[str, str]:
     paths = [str(path) for path in (ROOT, root / MODULES, site)]
     kept = {name: value for name, value in os.environ.items() if not name.startswith("ROS_")}
     return kept | {
-        "PYTHONPATH": os.pathsep.join(paths), "ROS_IP": "127.0.0.1", "ROS_LOG_DIR": str(folder / "logs"),
+        "PYTHONPATH": os.pathsep.join(paths), "ROS_LOG_DIR": str(folder / "logs"),
         "ROS_HOME": str(folder / "home"), "PYTHONWARNINGS": "ignore", "ROS_ROOT": str(root / "usr/share/ros"),
         "ROS_PYTHON_LOG_CONFIG_FILE": str(root / "etc/ros/python_logging.conf"),
         "PATH": f"{root / 'usr/bin'}{os.pathsep}{kept.get('PATH', '')}",
@@ -85,7 +85,8 @@ class Peer:
 
     def __init__(self, *arguments: object) -> None:
         command = [sys.executable, str(HERE / "_rospy_peer.py"), *map(str, arguments)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        environment = {**os.environ, "ROS_IP": "127.0.0.1"}
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 
     def read(self) -> Any:
         """Return the next line that it says."""

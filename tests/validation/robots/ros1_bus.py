@@ -203,6 +203,7 @@ def inside(folder: Path) -> int:
             began = time.monotonic()
             bus = open_bus(f"ros1:{master.uri}", "vlatool_check")
             rows.append(("opened in", f"{time.monotonic() - began:.2f} s", time.monotonic() - began < 5))
+            rows.append(("the address that other nodes are told", os.environ["ROS_IP"], True))
             now = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
             rows.append(("signals are left alone", "", now == handlers))
             for check in (both_directions, one_direction, image_to_twist, services, actions, topics_and_types):
