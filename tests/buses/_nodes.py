@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -11,13 +13,26 @@ import numpy as np
 import pytest
 from buses._trials import QUALITY, WAIT_S, Heard, forward, speeds, wait_until
 
-from vlatool.buses import Bus, QoS, TopicInfo
+from vlatool.buses import (
+    GOAL_ABORTED,
+    GOAL_CANCELED,
+    GOAL_SUCCEEDED,
+    ActionBus,
+    ActionType,
+    Bus,
+    Goal,
+    Outcome,
+    QoS,
+    TopicInfo,
+)
 from vlatool.errors import BusError, UsageError
 from vlatool.messages import same
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.sensor_msgs import Image
 from vlatool.messages.std_srvs import SetBoolRequest, SetBoolResponse, TriggerRequest, TriggerResponse
+from vlatool.messages.vlatool_msgs import ACTION, RunInstructionFeedback, RunInstructionGoal, RunInstructionResult
 
+RUN = ActionType(ACTION, RunInstructionGoal, RunInstructionFeedback, RunInstructionResult)
 Open = Callable[[str], Bus]
 
 
@@ -136,6 +151,19 @@ class NetworkBus:
             with pytest.raises(BusError, match=r"Nobody served /none within 0.05 s"):
                 caller.call("/none", TriggerRequest(), TriggerResponse, 0.05)
 
+    def test_two_requests_are_answered_at_once(self, open_node: Open) -> None:
+        both = threading.Barrier(2)
+
+        def handler(ask: Any) -> SetBoolResponse:
+            both.wait(WAIT_S)
+            return SetBoolResponse(ask.data, "met")
+
+        with opened(open_node, "robot", "caller") as (robot, caller), ThreadPoolExecutor(2) as callers:
+            robot.serve("/meet", SetBoolRequest, SetBoolResponse, handler)
+            asked = [SetBoolRequest(True), SetBoolRequest(False)]
+            calls = [callers.submit(caller.call, "/meet", ask, SetBoolResponse, WAIT_S) for ask in asked]
+            assert [call.result().success for call in calls] == [True, False]
+
     def test_service_that_raises_goes_on(self, open_node: Open) -> None:
         def handler(ask: Any) -> SetBoolResponse:
             if ask.data:
@@ -149,6 +177,34 @@ class NetworkBus:
                 caller.call("/stop", SetBoolRequest(True), SetBoolResponse, 0.2)
             assert wait_until(lambda: [(f.topic, f.count) for f in robot.faults()] == [("/stop", 1)])
             assert caller.call("/stop", SetBoolRequest(False), SetBoolResponse, WAIT_S).success
+
+    def test_action_reports_ends_and_is_canceled(self, open_node: Open) -> None:
+        def run(goal: Goal) -> Outcome:
+            goal.feedback(RunInstructionFeedback(goal.message.instruction, 0.5))  # type: ignore[attr-defined]
+            if goal.message.timeout_s and not goal.canceled.wait(WAIT_S):  # type: ignore[attr-defined]
+                return Outcome(GOAL_ABORTED, RunInstructionResult())
+            end = GOAL_CANCELED if goal.canceled.is_set() else GOAL_SUCCEEDED
+            return Outcome(end, RunInstructionResult(end == GOAL_SUCCEEDED, end))
+
+        with opened(open_node, "robot", "client") as (robot, client):
+            assert isinstance(robot, ActionBus)
+            assert isinstance(client, ActionBus)
+            robot.serve_action("/run_instruction", RUN, run)
+            heard: list[Any] = []
+            sent = client.send_goal("/run_instruction", RUN, RunInstructionGoal("go"), heard.append)
+            outcome = sent.result(WAIT_S)
+            assert (outcome.status, outcome.result.success) == (GOAL_SUCCEEDED, True)  # type: ignore[attr-defined]
+            waits = client.send_goal("/run_instruction", RUN, RunInstructionGoal("wait", 1.0), heard.append)
+            with pytest.raises(BusError, match=r"/run_instruction gave no result within 0.1 s"):
+                waits.result(0.1)
+            waits.cancel()
+            assert waits.result(WAIT_S).status == GOAL_CANCELED
+            assert wait_until(lambda: "wait" in [feedback.status for feedback in heard])
+            replaced = client.send_goal("/run_instruction", RUN, RunInstructionGoal("wait", 1.0))
+            newer = client.send_goal("/run_instruction", RUN, RunInstructionGoal("go"))
+            assert replaced.result(WAIT_S).status == GOAL_ABORTED
+            assert newer.result(WAIT_S).status == GOAL_SUCCEEDED
+            assert robot.faults() == client.faults() == []
 
     def test_closed_bus_says_so(self, open_node: Open) -> None:
         with opened(open_node, "robot") as (robot,):

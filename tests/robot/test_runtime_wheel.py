@@ -109,7 +109,17 @@ def test_it_asks_for_numpy_alone_and_for_the_engines_that_vlatool_takes():
     project = SETTINGS["project"]
     assert project["dependencies"] == [line for line in whole["dependencies"] if line.startswith("numpy")]
     assert project["optional-dependencies"].items() <= whole["optional-dependencies"].items()
-    assert set(project["optional-dependencies"]) == {"ort", "cuda", "openvino", "text", "sign", "remote", "bags"}
+    assert set(project["optional-dependencies"]) == {
+        "ort",
+        "cuda",
+        "openvino",
+        "text",
+        "sign",
+        "remote",
+        "bags",
+        "dds",
+        "zenoh",
+    }
 
 
 def test_its_files_are_those_of_the_whole_wheel(wheels: dict[str, Path]):

@@ -11,7 +11,6 @@ NODE = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 NAME = re.compile(r"(?:~/?|/)?[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*", re.ASCII)
 """What ROS 1 and ROS 2 both take: parts of letters, digits and ``_``, with a slash between them."""
 
-
 DDS_TYPE = re.compile(r"(\w+)::(msg|srv|action)::dds_::(\w+)_")
 MAX_DOMAIN = 232
 """Largest domain whose ports are below 65536 (DDSI-RTPS 2.2, section 9.6.1.1)."""
@@ -46,6 +45,16 @@ def resolve(name: str, node: str) -> str:
     if name.startswith("~"):
         return f"/{node}/{name.lstrip('~/')}"
     return name if name.startswith("/") else f"/{name}"
+
+
+def full_name(name: str, node: str) -> str:
+    """Return the full name of a topic or service, those of an action, below ``/_action/``, included.
+
+    Raises:
+        UsageError: for one that ROS does not take.
+    """
+    base, below, part = name.partition("/_action/")
+    return resolve(base, node) + below + part
 
 
 def dds_type(name: str) -> str:

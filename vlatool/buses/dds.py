@@ -13,8 +13,9 @@ from vlatool.buses._dds_graph import DdsGraph
 from vlatool.buses._dds_services import Client, serve_requests
 from vlatool.buses._dds_types import describe
 from vlatool.buses._faults import Faults
-from vlatool.buses._interface import Fault, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, resolve, ros_type
+from vlatool.buses._interface import ActionType, Fault, Goal, Outcome, QoS, Reception, TopicInfo
+from vlatool.buses._names import check_node, full_name, resolve, ros_type
+from vlatool.buses._service_actions import ServiceActionClient, ServiceActionServer, ServiceGoal
 from vlatool.errors import BusError, require
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -55,7 +56,9 @@ class Dds:
         self._graph = DdsGraph(self._endpoints, node, self._faults)
         self._lock = threading.Lock()
         self._clients: dict[str, Client] = {}
-        self._closed = False
+        self._actions: list[ServiceActionServer] = []
+        self._action_clients: dict[str, ServiceActionClient] = {}
+        self._closing = self._closed = False
 
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
         """Call ``handler`` with each message of a topic, in a thread of the subscription.
@@ -96,8 +99,8 @@ class Dds:
         return send
 
     def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
-        """Answer a service, one request at a time, in a thread of the service."""
-        name = resolve(service, self._node)
+        """Answer a service, each request in a thread of its own."""
+        name = full_name(service, self._node)
         self._check_open(name)
         reader, writer = serve_requests(self._endpoints, name, request, response, handler, self._faults)
         self._graph.add_own(reader, writer)
@@ -108,13 +111,26 @@ class Dds:
         Raises:
             BusError: when nobody answers in time.
         """
-        name, deadline = resolve(service, self._node), time.monotonic() + timeout_s
+        name, deadline = full_name(service, self._node), time.monotonic() + timeout_s
         self._check_open(name)
         with self._lock:
             if name not in self._clients:
                 self._clients[name] = client = Client(self._endpoints, name, type(request), response, self._faults)
                 self._graph.add_own(client.reader_guid, client.writer_guid)
         return self._clients[name].call(request, response, deadline, timeout_s)
+
+    def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
+        """See ``ActionBus.serve_action``."""
+        self._actions.append(ServiceActionServer(self, resolve(action, self._node), kind, handler))
+
+    def send_goal(
+        self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
+    ) -> ServiceGoal:
+        """See ``ActionBus.send_goal``."""
+        name = resolve(action, self._node)
+        if name not in self._action_clients:
+            self._action_clients[name] = ServiceActionClient(self, name, kind)
+        return self._action_clients[name].send(goal, feedback)
 
     def topics(self) -> list[TopicInfo]:
         """Return what is on the bus now, this node's own included, sorted by name."""
@@ -131,16 +147,19 @@ class Dds:
 
     def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
         """Wait until each topic has a peer: a publisher, or a subscriber; return those without."""
-        names = {topic: resolve(topic, self._node) for topic in topics}
+        names = {topic: full_name(topic, self._node) for topic in topics}
         self._graph.wait(lambda: all(self._graph.has_peer(name) for name in names.values()), timeout_s)
         return tuple(topic for topic, name in names.items() if not self._graph.has_peer(name))
 
     def close(self) -> None:
         """Leave the bus; what is sent has left this process. Closing twice does nothing."""
         with self._lock:
-            if self._closed:
+            if self._closing:
                 return
-            self._closed = True
+            self._closing = True
+        for action in self._actions:
+            action.close()
+        self._closed = True
         self._endpoints.close()
         self._leave()
 
@@ -149,7 +168,7 @@ class Dds:
             raise _closed(topic)
 
     def _check(self, topic: str, message: type[Message]) -> str:
-        name = resolve(topic, self._node)
+        name = full_name(topic, self._node)
         self._check_open(name)
         self._discover()
         self._graph.check_type(name, message.TYPE)

@@ -11,8 +11,9 @@ from typing import Any, TypeVar
 from vlatool.buses._faults import Faults
 from vlatool.buses._graph import CLIENT, PUBLISHER, SERVICE, SUBSCRIBER, Entity
 from vlatool.buses._inbox import Inbox
-from vlatool.buses._interface import Fault, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, domain_id, resolve
+from vlatool.buses._interface import ActionType, Fault, Goal, Outcome, QoS, Reception, TopicInfo
+from vlatool.buses._names import check_node, domain_id, full_name, resolve
+from vlatool.buses._service_actions import ServiceActionClient, ServiceActionServer, ServiceGoal
 from vlatool.buses._zenoh_graph import ZenohGraph
 from vlatool.buses._zenoh_keys import ATTACHMENT, attachment, data_key, entity_token, gid_of, node_token
 from vlatool.buses._zenoh_session import open_session
@@ -56,7 +57,9 @@ class Zenoh:
         self._declared: list[Any] = []
         self._inboxes: list[Inbox] = []
         self._clients: dict[str, bytes] = {}
-        self._closed = False
+        self._actions: list[ServiceActionServer] = []
+        self._action_clients: dict[str, ServiceActionClient] = {}
+        self._closing = self._closed = False
         self._graph = ZenohGraph(self._zenoh, self._session, self._domain, self._faults)
         self._keep(self._session.liveliness().declare_token(node_token(self._domain, self._id, node)))
 
@@ -66,7 +69,7 @@ class Zenoh:
         Raises:
             BusError: when the topic carries another type.
         """
-        name, zenoh = resolve(topic, self._node), self._zenoh
+        name, zenoh = full_name(topic, self._node), self._zenoh
         self._check(name, message)
         inbox = Inbox(name, message, handler, qos.depth, lambda payload: payload.to_bytes(), self._faults)
         hear = zenoh.handlers.Callback(lambda sample: inbox.put(sample.payload), indirect=False)
@@ -90,7 +93,7 @@ class Zenoh:
         Raises:
             BusError: when the topic carries another type.
         """
-        name = resolve(topic, self._node)
+        name = full_name(topic, self._node)
         self._check(name, message)
         publisher = self._keep(self._declare_publisher(self._key(name, message), qos))
         gid = self._announce(PUBLISHER, name, message.TYPE, rihs01(message), qos)
@@ -105,8 +108,8 @@ class Zenoh:
         return send
 
     def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
-        """Answer a service, one request at a time, in a thread of the service."""
-        name = resolve(service, self._node)
+        """Answer a service, each request in a thread of its own."""
+        name = full_name(service, self._node)
         type_name, type_hash = _service_type(request, response)
         key = data_key(self._domain, name, type_name, type_hash)
 
@@ -119,7 +122,10 @@ class Zenoh:
                     self._faults.add_raised(name, error)
                     query.reply_err(str(error).encode())
 
-        self._keep(self._session.declare_queryable(key, answer, complete=True))
+        def hear(query: Any) -> None:
+            threading.Thread(target=answer, args=(query,), name=f"vlatool {name}", daemon=True).start()
+
+        self._keep(self._session.declare_queryable(key, hear, complete=True))
         self._announce(SERVICE, name, type_name, type_hash, SERVICE_QOS)
 
     def call(self, service: str, request: Message, response: type[M], timeout_s: float) -> M:
@@ -128,7 +134,7 @@ class Zenoh:
         Raises:
             BusError: when nobody answers in time, the server refuses, or it serves another type.
         """
-        name, deadline = resolve(service, self._node), time.monotonic() + timeout_s
+        name, deadline = full_name(service, self._node), time.monotonic() + timeout_s
         type_name, type_hash = _service_type(type(request), response)
         gid = self._client(name, type_name, type_hash)
         if not self._graph.wait(lambda: bool(self._graph.service_types(name)), timeout_s):
@@ -154,6 +160,19 @@ class Zenoh:
             raise BusError(f"The service {name} refused: {refusal}.", "see the node that serves it")
         raise BusError(f"{name} did not answer within {timeout_s:g} s.", "see the node that serves it")
 
+    def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
+        """See ``ActionBus.serve_action``."""
+        self._actions.append(ServiceActionServer(self, resolve(action, self._node), kind, handler))
+
+    def send_goal(
+        self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
+    ) -> ServiceGoal:
+        """See ``ActionBus.send_goal``."""
+        name = resolve(action, self._node)
+        if name not in self._action_clients:
+            self._action_clients[name] = ServiceActionClient(self, name, kind)
+        return self._action_clients[name].send(goal, feedback)
+
     def topics(self) -> list[TopicInfo]:
         """Return what is on the bus now, this node's own included, sorted by name."""
         return self._graph.topics()
@@ -168,16 +187,19 @@ class Zenoh:
 
     def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
         """Wait until each topic has a peer: a publisher, or a subscriber; return those without."""
-        names = {topic: resolve(topic, self._node) for topic in topics}
+        names = {topic: full_name(topic, self._node) for topic in topics}
         self._graph.wait(lambda: all(self._graph.has_peer(name) for name in names.values()), timeout_s)
         return tuple(topic for topic, name in names.items() if not self._graph.has_peer(name))
 
     def close(self) -> None:
         """Leave the bus; what is sent has left this process. Closing twice does nothing."""
         with self._lock:
-            if self._closed:
+            if self._closing:
                 return
-            self._closed = True
+            self._closing = True
+        for action in self._actions:
+            action.close()
+        self._closed = True
         self._graph.close()
         for declared in reversed(self._declared):
             declared.undeclare()

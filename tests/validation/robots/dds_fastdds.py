@@ -13,11 +13,13 @@ import argparse
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
-from _bus_trials import Row, finish, picture_to_twist, there_and_back
+from _bus_trials import QUALITY, Row, finish, picture_to_twist, there_and_back, twists
 
 from vlatool.buses import open_bus
+from vlatool.messages.geometry_msgs import Twist
 
 HERE = Path(__file__).parent
 OUT = Path("out/robots/fastdds")
@@ -82,6 +84,38 @@ def trials(program: Path, count: int) -> list[Row]:
     return rows
 
 
+def malformed(program: Path, count: int) -> Row:
+    """Let Fast DDS answer with Twists that end after three numbers: none may arrive, and each is a fault."""
+    title = "malformed Twists from Fast DDS"
+    environment = {**os.environ, "LD_LIBRARY_PATH": str(libraries())}
+    peer = subprocess.Popen(
+        [str(program), str(DOMAIN), "malformed"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+    )
+    assert peer.stdin
+    assert peer.stdout
+    try:
+        assert peer.stdout.readline() == b"ready\n"
+        bus = open_bus(f"dds:{DOMAIN}@127.0.0.1", "trial")
+        came: list[object] = []
+        bus.subscribe("/from_peer", Twist, came.append, QUALITY)
+        send = bus.publisher("/to_peer", Twist, QUALITY)
+        bus.wait_for_peers(("/from_peer", "/to_peer"), 10.0)
+        time.sleep(1.0)
+        for twist in twists(count):
+            send(twist)
+            time.sleep(0.002)
+        deadline = time.monotonic() + 5.0
+        while sum(fault.count for fault in bus.faults()) < count and time.monotonic() < deadline:
+            time.sleep(0.05)
+        faults = {fault.topic: fault.count for fault in bus.faults()}
+        bus.close()
+    finally:
+        peer.stdin.close()
+        peer.wait(10)
+    passed = faults == {"/from_peer": count} and not came
+    return Row(title, f"{faults.get('/from_peer', 0)} of {count} counted as faults, {len(came)} handed on", passed)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=1000, help="Twists sent to each peer")
@@ -91,7 +125,7 @@ def main() -> int:
     except (OSError, subprocess.CalledProcessError) as error:
         print(f"Fast DDS cannot be unpacked or built here: {error}", file=sys.stderr)
         return 2
-    return finish("dds (cyclonedds) and its peers", trials(program, count))
+    return finish("dds (cyclonedds) and its peers", [*trials(program, count), malformed(program, 200)])
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 // A node of Fast DDS with ROS 2's topic and type names: it sends each Twist of /to_peer back on /from_peer, read and
-// written field by field, and answers each Image on /image with a Twist that holds the length of its bytes.
+// written field by field, and answers each Image on /image with a Twist that holds the length of its bytes. With a second
+// word it leaves out the last three numbers of what it sends: a malformed Twist.
 #include <cstdlib>
 #include <functional>
 #include <iostream>
@@ -24,6 +25,7 @@ using eprosima::fastrtps::rtps::InstanceHandle_t;
 using eprosima::fastrtps::rtps::SerializedPayload_t;
 
 struct Twist { double value[6]; };
+static int numbers = 6;
 using Bytes = std::vector<char>;
 
 template <typename Data> class Support : public TopicDataType {
@@ -50,7 +52,9 @@ public:
     bool getKey(void*, InstanceHandle_t*, bool) override { return false; }
 
 private:
-    static void write(eprosima::fastcdr::Cdr& cdr, Twist& twist) { for (double v : twist.value) cdr << v; }
+    static void write(eprosima::fastcdr::Cdr& cdr, Twist& twist) {
+        for (int i = 0; i < numbers; ++i) cdr << twist.value[i];
+    }
     static void write(eprosima::fastcdr::Cdr&, Bytes&) {}
     static bool read(eprosima::fastcdr::Cdr& cdr, SerializedPayload_t*, Twist& twist) {
         for (double& v : twist.value) cdr >> v;
@@ -82,6 +86,7 @@ private:
 };
 
 int main(int count, char** words) {
+    if (count > 2) numbers = 3;
     auto factory = DomainParticipantFactory::get_instance();
     DomainParticipantQos qos;
     auto udp = std::make_shared<eprosima::fastdds::rtps::UDPv4TransportDescriptor>();
