@@ -102,7 +102,7 @@ class _Messages:
         """Return the first input of which a message is missing; empty where all are there."""
         for name, readings in record.readings.items():
             there = self._waiting.get(name, {})
-            needed = [content for _, _, content in readings]
+            needed = [content for _, _, content in readings if "=" not in content]
             if any(len(there.get(content, ())) < needed.count(content) for content in set(needed)):
                 return name
         return ""
@@ -112,10 +112,12 @@ class _Messages:
         for name, readings in record.readings.items():
             taken = []
             for received_s, sequence, content in readings:
-                left = self._waiting[name][content]
-                taken.append(Reading(left.pop(0), received_s, sequence))
+                key = digest_of(content) if "=" in content else content
+                left = self._waiting.get(name, {}).get(key, [])
+                message = left.pop(0) if left else from_text(content)
+                taken.append(Reading(message, received_s, sequence))
                 if not left:
-                    del self._waiting[name][content]
+                    self._waiting.get(name, {}).pop(key, None)
             found[name] = tuple(taken)
         return found
 
@@ -171,7 +173,11 @@ class _Replay:
                 break
         else:
             note = self._missing() if self._waiting else ""
-        if not self._steps and not note:
+        if not self._steps and note:
+            raise DataError(
+                f"No step can be computed again: {note}.", "record the topics that it reads from the start on"
+            )
+        if not self._steps:
             raise DataError("The recording holds no step of a controller.",
                             "record the topics /NODE/steps and /NODE/controller, too, or all topics")  # fmt: skip
         unheard = sum((self._sent - self._messages.heard).values())

@@ -15,6 +15,8 @@ from typing import Any
 from vlatool.controllers import Command
 from vlatool.errors import DataError, VlatoolError
 from vlatool.files.json import parse_json
+from vlatool.messages import Message
+from vlatool.messages.std_msgs import String
 from vlatool.nodes.content import digest, to_text
 from vlatool.nodes.stepper import StepReport
 
@@ -30,7 +32,8 @@ class StepRecord:
         step: Number of the step, from 0.
         time_s: ``Snapshot.time_s``.
         stamp: Seconds and nanoseconds of ``Snapshot.stamp``.
-        readings: Input -> received_s, sequence and digest of each message that came since the last step.
+        readings: Input -> received_s, sequence and digest of each message that came since the last step; a text
+            (``std_msgs/msg/String``) is written out.
         requests: Service, number and text of each call.
         messages: Output -> texts of the messages that were sent.
         responses: Number of a call -> text of its response.
@@ -64,7 +67,7 @@ class StepRecord:
             report.number,
             snapshot.time_s,
             (snapshot.stamp.sec, snapshot.stamp.nanosec),
-            {name: tuple((got.received_s, got.sequence, digest(got.message)) for got in readings)
+            {name: tuple((got.received_s, got.sequence, _content(got.message)) for got in readings)
              for name, readings in snapshot.readings.items() if readings},
             tuple((request.service, request.number, to_text(request.message)) for request in snapshot.requests),
             {name: tuple(map(to_text, messages)) for name, messages in command.messages.items()},
@@ -100,6 +103,11 @@ class StepRecord:
             )  # fmt: skip
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             raise DataError(f"A record of a step is '{text:.60}', which cannot be read.", "record again") from None
+
+
+def _content(message: Message) -> str:
+    """Return a digest; a text is written out, since one that was latched came before any recorder."""
+    return to_text(message) if isinstance(message, String) else digest(message)
 
 
 def _pair(values: Any) -> tuple[int, int]:
