@@ -49,7 +49,7 @@ def compute_once(program: Iterable[ProgramStep], name: str, once: str, cut: Grap
             steps.append(step)
             continue
         values = {value: f"{once}.{value}" for value in cut.values}
-        first = ProgramStep(once, {feed: step.feeds[feed] for feed in cut.inputs}, values)
+        first = ProgramStep(once, {feed: step.feeds[feed] for feed in cut.inputs}, values, slow=step.slow)
         rest = replace(step, feeds={**{feed: step.feeds[feed] for feed in cut.kept}, **values})
         if not step.sources().isdisjoint(first.feeds.values()):
             first = replace(first, noise=step.noise, keep=step.keep)

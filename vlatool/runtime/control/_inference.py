@@ -7,7 +7,7 @@ import queue
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -141,12 +141,14 @@ class Moments:
 
     Args:
         spec: of the policy; ``lengths`` has its inputs with a ``history`` and how many moments they hold.
+        inputs: Names of the inputs that are wanted; all when None.
     """
 
-    def __init__(self, spec: PolicySpec) -> None:
-        self._names = [tensor.name for tensor in spec.inputs]
-        self.lengths = {tensor.name: tensor.history for tensor in spec.inputs if tensor.history}
-        self._axes = {tensor.name: len(tensor.observation.moment.shape) for tensor in spec.inputs if tensor.history}
+    def __init__(self, spec: PolicySpec, inputs: Collection[str] | None = None) -> None:
+        wanted = [tensor for tensor in spec.inputs if inputs is None or tensor.name in inputs]
+        self._names = [tensor.name for tensor in wanted]
+        self.lengths = {tensor.name: tensor.history for tensor in wanted if tensor.history}
+        self._axes = {tensor.name: len(tensor.observation.moment.shape) for tensor in wanted if tensor.history}
         self._before: deque[Mapping[str, Any]] = deque(maxlen=max(self.lengths.values(), default=1))
 
     def add(self, observation: Mapping[str, Any]) -> dict[str, Any]:
