@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import _thread
-import atexit
 import contextlib
 import os
 import select
@@ -14,13 +13,10 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from vlatool.errors import UsageError
+from vlatool.runtime.process_end import EXIT_S, close_at_exit
 
-EXIT_S = 1.0
-"""Seconds for which the process, when it ends, waits for a task that was stopped: a run of ONNX Runtime that returns
-while Python shuts down ends the process with SIGABRT."""
 MOST_HANDLES = 1024
 """Descriptors below this are the only ones that ``select()`` takes."""
-_WORKERS: weakref.WeakSet[Worker] = weakref.WeakSet()
 
 
 class Task(Protocol):
@@ -163,6 +159,32 @@ class _Desk:
         self.ended.send()
         return True
 
+    @property
+    def busy(self) -> bool:
+        """Whether a task is running."""
+        return self.call is not None
+
+    def abandon(self, call: Call) -> bool:
+        """Give a call up unless it has ended; see ``Worker.abandon``."""
+        with self.lock:
+            if self.call is not call:
+                return False
+            call.abandoned = True
+            if call.began:
+                call.task.stop()
+            return True
+
+    def end_call(self, seconds: float) -> None:
+        """Stop the task that runs, and wait until it has ended, but no longer than this."""
+        if (call := self.call) is not None:
+            self.abandon(call)
+            self.wait(call, seconds)
+
+    def close(self, seconds: float = EXIT_S) -> None:
+        """End the thread before Python shuts down, also where nobody has its worker any more."""
+        self.end_call(seconds)
+        self.leave()
+
     def wait(self, call: Call, seconds: float) -> bool:
         """Return whether a call ends within a time."""
         end = time.monotonic() + seconds
@@ -187,12 +209,12 @@ class Worker:
         self._name, self._clock = name, clock
         self._desk = _Desk(clock)
         self._thread: threading.Thread | None = None
-        weakref.finalize(self, self._desk.leave).atexit = False  # ``_close_all`` waits for the thread
+        weakref.finalize(self, self._desk.leave).atexit = False  # ``process_end`` waits for the thread
 
     @property
     def busy(self) -> bool:
         """Whether a task is running."""
-        return self._desk.call is not None
+        return self._desk.busy
 
     def call(self, task: Task, due: float) -> Any:
         """Return the result of a task that ends by a time of the clock.
@@ -246,34 +268,18 @@ class Worker:
 
     def abandon(self, call: Call) -> bool:
         """Give a call up unless it has ended: its task is stopped, and has no effect; returns whether it was."""
-        with self._desk.lock:
-            if self._desk.call is not call:
-                return False
-            call.abandoned = True
-            if call.began:
-                call.task.stop()
-            return True
+        return self._desk.abandon(call)
 
     def _start(self) -> None:
-        _WORKERS.add(self)
+        close_at_exit(self._desk)
         self._thread = threading.Thread(target=self._desk.serve, name=self._name, daemon=True)
         self._thread.start()
 
     def close(self, seconds: float = EXIT_S) -> None:
         """End the thread; the next call starts another. A task that runs is stopped, and waited for so many seconds."""
-        call, thread = self._desk.call, self._thread
-        if call is not None:
-            self.abandon(call)
-            self._desk.wait(call, seconds)
+        thread = self._thread
+        self._desk.end_call(seconds)
         if not self.busy and thread is not None:
             self._thread = None
             self._desk.wake.release()
             thread.join()
-
-
-def _close_all() -> None:
-    for worker in list(_WORKERS):
-        worker.close()
-
-
-atexit.register(_close_all)

@@ -15,6 +15,7 @@ import numpy as np
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import DataError
 from vlatool.runtime.interface import Array, Policy, observer_of
+from vlatool.runtime.process_end import EXIT_S, close_at_exit
 
 
 class Inference(Protocol):
@@ -77,7 +78,7 @@ class PlayedInference:
 
 
 class BackgroundInference:
-    """Infers in a thread of its own, which ends when this object is collected.
+    """Infers in a thread of its own, which ends when this object is collected, or with the process.
 
     An observation is copied before the thread gets it. Inputs that hold several moments are given whole, since the
     policy itself might see the moments in another order than they came.
@@ -86,10 +87,8 @@ class BackgroundInference:
     def __init__(self, policy: Policy) -> None:
         self.running = False
         self._moments = Moments(policy.spec)
-        self._work: queue.SimpleQueue[Mapping[str, Any] | None] = queue.SimpleQueue()
-        self._answers: queue.SimpleQueue[Array | BaseException] = queue.SimpleQueue()
-        arguments = policy.infer, self._work, self._answers
-        threading.Thread(target=_infer_all, args=arguments, name="vlatool-inference", daemon=True).start()
+        thread = _InferenceThread(policy.infer)
+        self._work, self._answers = thread.work, thread.answers
         weakref.finalize(self, self._work.put, None)
 
     def start(self, observation: Mapping[str, Any]) -> None:
@@ -124,16 +123,33 @@ class BackgroundInference:
         self._moments.clear()
 
 
-def _infer_all(
-    infer: Callable[..., Any],
-    work: queue.SimpleQueue[Mapping[str, Any] | None],
-    answers: queue.SimpleQueue[Array | BaseException],
-) -> None:
-    while (observation := work.get()) is not None:
-        try:
-            answers.put(infer(observation).chunk)
-        except BaseException as error:  # the control loop raises it
-            answers.put(error)
+class _InferenceThread:
+    """The thread of a ``BackgroundInference``, which it does not hold; it ends after a None of ``work``."""
+
+    def __init__(self, infer: Callable[..., Any]) -> None:
+        self.work: queue.SimpleQueue[Mapping[str, Any] | None] = queue.SimpleQueue()
+        self.answers: queue.SimpleQueue[Array | BaseException] = queue.SimpleQueue()
+        self.busy = False
+        """Whether it infers."""
+        self._infer = infer
+        self._thread = threading.Thread(target=self._infer_all, name="vlatool-inference", daemon=True)
+        self._thread.start()
+        close_at_exit(self)
+
+    def _infer_all(self) -> None:
+        while (observation := self.work.get()) is not None:
+            self.busy = True
+            try:
+                answer = self._infer(observation).chunk
+            except BaseException as error:  # the control loop raises it
+                answer = error
+            self.busy = False
+            self.answers.put(answer)
+
+    def close(self, seconds: float = EXIT_S) -> None:
+        """End it after the inference in progress, which is waited for so many seconds."""
+        self.work.put(None)
+        self._thread.join(seconds)
 
 
 class Moments:
