@@ -284,7 +284,7 @@ def test_a_disk_that_does_not_answer_keeps_no_request_and_no_end_waiting(tmp_pat
         log(request(number))
     log.close(0.1)
     written = os.read(reader, 1 << 16).splitlines()
-    assert log.lost == count - len(written) > 0
+    assert log.lost_count == count - len(written) > 0
     assert [json.loads(line)["client"] for line in written[:5]] == ["a"] * 5
     log(request(0))  # after the end: nobody takes it
     while log._telemetry.outlets[0]._thread.is_alive():
@@ -298,9 +298,9 @@ def test_records_that_a_full_disk_does_not_take_are_counted():
     for number in range(5):
         log(request(number))
     assert log._telemetry.flush()
-    assert log.lost == 5
+    assert log.lost_count == 5
     log.close()
-    assert log.lost == 5
+    assert log.lost_count == 5
 
 
 def test_a_line_after_one_that_was_cut_off_begins_anew(tmp_path: Path):
@@ -328,7 +328,7 @@ def test_requests_are_written_as_lines(tmp_path: Path):
     log.close()
     assert not [thread for thread in threading.enumerate() if thread is log._telemetry.outlets[0]._thread]
     assert (tmp_path / "requests.jsonl").read_text().count('"client": "a"') == 3
-    assert (log.times_ms()["p50"], log.lost) == (6.0, 0)
+    assert (log.times_ms()["p50"], log.lost_count) == (6.0, 0)
     assert RequestLog().times_ms() == {}
     with pytest.raises(Exception, match="cannot be written"):
         RequestLog(tmp_path)

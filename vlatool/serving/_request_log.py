@@ -37,7 +37,7 @@ class RequestLog:
         self._telemetry = None if self._file is None else Telemetry(self._file, size=waiting)
 
     @property
-    def lost(self) -> int:
+    def lost_count(self) -> int:
         """Records that are not in the file; before ``close``, those of which it is known."""
         if self._telemetry is None or self._unwritten is not None:
             return self._unwritten or 0

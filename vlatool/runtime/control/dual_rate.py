@@ -180,7 +180,7 @@ def _slow_part(policy: Policy) -> SlowPart:
 
 
 def _parts(policy: Any) -> tuple[Any, Any]:
-    """Return the slow part of a policy and the fast one; a policy that is no open bundle has them as ``parts()``."""
+    """Return the slow part of a policy and the fast one; another policy than an open bundle has them as ``parts()``."""
     return parts_of(policy) if isinstance(policy, BundlePolicy) else policy.parts()
 
 
