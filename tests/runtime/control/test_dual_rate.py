@@ -391,6 +391,17 @@ def test_an_evaluation_plays_it_by_name():
     assert controller.origin.latent_age_ms is not None
 
 
+@pytest.mark.parametrize("player", ["chunked", "late:delay=1", "asynchronous:delay=1", "rtc", "temporal_ensemble"])
+def test_every_player_says_how_old_the_values_are(player: str):
+    controller = build_controller(opened(), ["dual_rate:every=4", player])
+    ages = []
+    for seen in observations(6):
+        controller.act(seen)
+        ages.append(controller.origin.latent_age_ms)
+    assert None not in ages
+    assert 15 < max(ages)
+
+
 def test_noise_of_the_caller_goes_to_the_part_that_draws_it():
     dual, seen, noise = DualRate(opened(), 1), observations(1)[0], {"x": np.zeros((1, 4, 2), np.float32)}
     np.testing.assert_array_equal(dual.infer(seen, noise=noise).chunk, opened().infer(seen, noise=noise).chunk)

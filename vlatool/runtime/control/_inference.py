@@ -14,7 +14,7 @@ import numpy as np
 
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import DataError
-from vlatool.runtime.interface import Array, Policy, observer_of
+from vlatool.runtime.interface import Action, Array, Policy, observer_of
 from vlatool.runtime.process_end import EXIT_S, close_at_exit
 
 
@@ -22,6 +22,8 @@ class Inference(Protocol):
     """One inference at a time, beside the control steps."""
 
     running: bool
+    lead_ms: float | None
+    """How much older the observation is that the values of a slow part answer than that of the last chunk, in ms."""
 
     def start(self, observation: Mapping[str, Any]) -> None:
         """Start an inference with the observation of this control step."""
@@ -51,11 +53,12 @@ class PlayedInference:
 
     def __init__(self, policy: Policy, delay: int) -> None:
         self.running = False
+        self.lead_ms: float | None = None
         self._policy, self._delay, self._observer = policy, delay, observer_of(policy)
 
     def start(self, observation: Mapping[str, Any]) -> None:
         """Infer."""
-        self._chunk = self._policy.infer(observation).chunk
+        self._action = self._policy.infer(observation)
         self.running = True
 
     def observe(self, observation: Mapping[str, Any]) -> None:
@@ -69,8 +72,8 @@ class PlayedInference:
 
     def wait(self) -> Array:
         """Return the chunk."""
-        self.running = False
-        return self._chunk
+        self.running, self.lead_ms = False, _lead_ms(self._action)
+        return self._action.chunk
 
     def cancel(self) -> None:
         """Discard the chunk."""
@@ -86,6 +89,7 @@ class BackgroundInference:
 
     def __init__(self, policy: Policy) -> None:
         self.running = False
+        self.lead_ms: float | None = None
         self._moments = Moments(policy.spec)
         thread = _InferenceThread(policy.infer)
         self._work, self._answers = thread.work, thread.answers
@@ -113,7 +117,8 @@ class BackgroundInference:
         self.running = False
         if isinstance(answer, BaseException):
             raise answer
-        return answer
+        self.lead_ms = _lead_ms(answer)
+        return answer.chunk
 
     def cancel(self) -> None:
         """Wait for the thread and discard what it answers."""
@@ -128,7 +133,7 @@ class _InferenceThread:
 
     def __init__(self, infer: Callable[..., Any]) -> None:
         self.work: queue.SimpleQueue[Mapping[str, Any] | None] = queue.SimpleQueue()
-        self.answers: queue.SimpleQueue[Array | BaseException] = queue.SimpleQueue()
+        self.answers: queue.SimpleQueue[Action | BaseException] = queue.SimpleQueue()
         self.busy = False
         """Whether it infers."""
         self._infer = infer
@@ -139,8 +144,9 @@ class _InferenceThread:
     def _infer_all(self) -> None:
         while (observation := self.work.get()) is not None:
             self.busy = True
+            answer: Action | BaseException
             try:
-                answer = self._infer(observation).chunk
+                answer = self._infer(observation)
             except BaseException as error:  # the control loop raises it
                 answer = error
             self.busy = False
@@ -188,6 +194,10 @@ class Moments:
     def clear(self) -> None:
         """Start a new episode."""
         self._before.clear()
+
+
+def _lead_ms(action: Action) -> float | None:
+    return None if action.latent_age_ms is None else action.latent_age_ms - action.age_ms
 
 
 def _copied(value: Any) -> Any:
