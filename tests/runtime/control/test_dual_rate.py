@@ -26,6 +26,7 @@ from vlatool.runtime.control.dual_rate import DualRate
 from vlatool.runtime.replay import replay
 from vlatool.runtime.stack import Fallback, build_stack
 from vlatool.runtime.telemetry.cadence import Cadence
+from vlatool.runtime.two_parts import parts_of
 
 LONG_MS = 20_000.0
 
@@ -104,13 +105,35 @@ def test_at_every_kth_inference_it_computes_what_a_plain_loop_does(every: int, l
         assert [action.latent_age_ms for action in actions[:6]] == [0, 10, 20, 30, 0, 10], "planned time at 100 Hz"
 
 
-def test_both_parts_at_each_inference_are_the_whole_policy():
-    whole, dual = opened(), DualRate(opened(), 1)
+@pytest.mark.parametrize("engine", ["ort_cpu", "openvino"])
+def test_both_parts_at_each_inference_are_the_whole_policy(engine: str):
+    policies = [Policy.open(two_systems(), engine=engine, threads=1, seed=0) for _ in range(2)]
+    whole, dual = policies[0], DualRate(policies[1], 1)
     for seen in observations(5):
         wanted, action = whole.infer(seen), dual.infer(seen)
         np.testing.assert_array_equal(action.chunk, wanted.chunk)
         np.testing.assert_array_equal(action.outputs["action"], wanted.outputs["action"])
     assert (whole.infer(seen).latent_age_ms, dual.infer(seen).latent_age_ms) == (None, 0)
+
+
+@pytest.mark.parametrize("engine", ["ort_cpu", "openvino"])
+def test_both_parts_at_once_compute_what_they_do_in_turns(engine: str):
+    """Each chunk beside the thread is that of one of the values that the slow part gives in turn, for one scene."""
+    policies = [Policy.open(two_systems(), engine=engine, threads=1, seed=0) for _ in range(2)]
+    dual = DualRate(policies[0], thread=True, hz=0, max_age_ms=LONG_MS)
+    slow, fast = parts_of(policies[1])
+    scene = observations(1)[0]["scene"]
+    thoughts = [slow.run({"scene": scene}) for _ in range(70)]
+
+    def chunk_of(thought: Mapping[str, Any], seen: Mapping[str, Any], before: Any) -> np.ndarray[Any, Any]:
+        fast.restore(before)
+        fast.latent = thought
+        return fast.infer(seen).chunk
+
+    for seen in observations(60):
+        chunk, before = dual.infer({**seen, "scene": scene}).chunk, fast.snapshot
+        assert any(np.array_equal(chunk_of(thought, seen, before), chunk) for thought in thoughts)
+    dual.close()
 
 
 def test_the_fast_part_goes_on_while_the_slow_one_runs():
