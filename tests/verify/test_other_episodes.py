@@ -14,7 +14,7 @@ from vlatool.data import Recording, build_recording
 from vlatool.runtime.statistics import Normaliser
 from vlatool.stage.base import Context
 from vlatool.verify._distributions import explain_statistics
-from vlatool.verify._model import upper_bound
+from vlatool.verify._bounds import upper_bound
 from vlatool.verify._other_episodes import Judge, Outcome
 from vlatool.verify._reading import is_dense, names_of
 from vlatool.verify._texts import unknown_texts

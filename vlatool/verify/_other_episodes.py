@@ -12,8 +12,9 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import Recording
 from vlatool.files.rows import in_memory
 from vlatool.verify._appearance import CHANGES, MAX_FRAMES, RIGHT, Appearance, Looks, Verdict
+from vlatool.verify._diagnosis import Scales, explain
 from vlatool.verify._explanation import Explanation
-from vlatool.verify._model import Model, Scales, explain
+from vlatool.verify._model import Model
 from vlatool.verify._reading import Changes, Names, Reader, rows_of
 from vlatool.verify._search import (
     DELAY_KIND,
@@ -81,7 +82,7 @@ class Judge:
         looks = _looks(self.spec, self.reader.names, log, rows[_spread(len(rows))])
         verdicts = {name: self.images[name].judge(looks[name]) for name in looks}
         (series, *_), _ = self.reader.variants(log, _changes(verdicts))
-        model = self.model.for_log(series)
+        model = self.model.for_log(series, known=self._is_known(log, rows))
         found, right = explain(model, series, scales)
         explanations = [*_of_images(verdicts, len(rows)), *self._of_texts(log, rows)]
         for name, finding in found:
@@ -94,10 +95,17 @@ class Judge:
         components = tuple((name, each) for name in unseen for each in unseen[name])
         return Outcome(tuple(explanations), tuple(suspicious), tuple(sentences), components)
 
+    def _is_known(self, log: Recording, rows: Indices) -> bool:
+        """Return whether the reference has each text of the log, and other episodes with it."""
+        mine = _texts(self.spec, log, rows)
+        return bool(mine) and all({*mine[name]} <= {*self.texts[name]} for name in mine)
+
     def labels(self, name: str) -> Sequence[str]:
         """Return a name for each element of a signal."""
         tensor = next((each for each in (*self.spec.inputs, self.spec.action) if each.name == name), None)
         width = self.series.values[name].shape[1]
+        if name in self.reader.codes:
+            return [f"{value:g}" for value in self.reader.codes[name].tolist()]
         own = tensor.labels if tensor is not None else ()
         return own if len(own) == width else [f"[{index}]" for index in range(width)]
 

@@ -200,8 +200,14 @@ def _log_slopes(outcome: Array, predicted: Array) -> Array:
         return np.log(np.where((slopes > 0) & (_correlations(one, other) > 0.3), slopes, np.nan))
 
 
-def views_of(vectors: Sequence[str], images: Sequence[str], commands: str, *, dense: bool) -> list[View]:
-    """Return what is predicted from what: vectors from the commands, or the others, and images from the vectors."""
+def views_of(
+    vectors: Sequence[str], images: Sequence[str], commands: str, *, dense: bool, discrete: bool = False
+) -> list[View]:
+    """Return what is predicted from what: vectors from the commands, or the others, and images from the vectors.
+
+    Args:
+        discrete: whether the commands are indices, which images have other witnesses for.
+    """
     found = [View(name, PLACE, tuple(f"{image}{PLACES}" for image in images)) for name in vectors if images]
     if not dense:
         return found
@@ -211,9 +217,9 @@ def views_of(vectors: Sequence[str], images: Sequence[str], commands: str, *, de
     for name in images:
         if vectors:
             found.append(View(name, MOTION, tuple(vectors)))
-        elif commands:
+        elif commands and not discrete:
             found.append(View(name, VALUE, (commands,), commands=True))
-    if commands and (sources := tuple(vectors) or tuple(images)):
+    if commands and (sources := tuple(vectors) or (() if discrete else tuple(images))):
         found.append(View(commands, VALUE, sources))
     return found
 

@@ -23,10 +23,10 @@ from vlatool.runtime.statistics import Normaliser, load_normaliser
 from vlatool.stage.base import Context
 from vlatool.stage.identity import with_identity
 from vlatool.verify._actions import explain_actions, in_memory
+from vlatool.verify._diagnosis import Scales
 from vlatool.verify._distributions import explain_statistics, scales_of
 from vlatool.verify._explanation import Explanation
 from vlatool.verify._images import explain_images, is_image
-from vlatool.verify._model import Scales
 from vlatool.verify._other_episodes import Judge, Outcome
 from vlatool.verify._pairing import Pairs, pair_rows
 from vlatool.verify._reading import names_of
