@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.stats.intervals import student
-from vlatool.verify._search import KINDS, Tables, search
+from vlatool.verify._search import DELAY_KIND, KINDS, Tables, search
 from vlatool.verify._series import Series
 from vlatool.verify._views import folds
 
@@ -22,9 +22,11 @@ MIN_LOG = 50
 ALARM = 1e-3
 """Share of right logs in which a kind of change of a signal may be found."""
 MIN_EVIDENCE = float(np.log(1 / ALARM))
+NEAR = 1.5
+"""A log is judged as those of the next number of episodes if that has at most so many times its rows."""
 SIZES, MAX_LOGS, MIN_SIZE_LOGS = (1, 2, 4), 12, 12
 """Episodes of a log that is judged; logs of several that each part gives, and that all need to give."""
-Needed = Mapping[str, Mapping[str, float]]
+Needed = Mapping[str, dict[str, float]]
 """Signal -> kind of change -> what must speak for it, so that it is not found in a right log."""
 Part = tuple[NDArray[np.bool_], list[list[int]]]
 """Which rows are left out together, and episodes among them of ``MIN_LOG`` rows or more, of which a log is."""
@@ -42,13 +44,26 @@ class Bounds:
     by_size: Mapping[int, Needed]
     rows: float
 
+    def with_delays_of(self, other: Bounds) -> Bounds:
+        """Return bounds of which those of delays are as high as others.
+
+        By how much an image seems to be ahead of its sensors differs from task to task by a part of a control step, of
+        which episodes of the same tasks tell too little.
+        """
+        found = {
+            size: {name: each | {DELAY_KIND: max(each[DELAY_KIND], other.by_size[size][name][DELAY_KIND])}
+                   for name, each in signals.items()} if size in other.by_size else signals
+            for size, signals in self.by_size.items()
+        }  # fmt: skip
+        return Bounds(found, self.rows)
+
     def needed(self, rows: int) -> Needed:
         """Return what is needed in a log of so many rows.
 
         Beyond the longest that was judged, what a right log has because predictions are not exact grows with its rows,
         and what it has by chance with their root: residuals hang together over more rows than the regression knows.
         """
-        size = max((size for size in self.by_size if size * self.rows <= rows), default=min(self.by_size))
+        size = max(size for size in self.by_size if size == 1 or size * self.rows <= NEAR * rows)
         least = MIN_EVIDENCE * size**0.5
         longer = max(1.0, rows / (size * self.rows))
         return {

@@ -66,10 +66,13 @@ def _cost(fix: Fix) -> float:
 
 
 def _neighbours(width: int) -> Iterator[Callable[[Fix], Fix]]:
-    """Yield exchanges of two elements, and each sign and factor of one."""
+    """Yield exchanges of two elements, and each sign and factor of one, but those that make it smaller.
+
+    Commands that are too large are seen by themselves; to divide one may fit better because it is silent then.
+    """
     yield from (functools.partial(_exchanged, one=one, other=other) for one in range(width) for other in range(one))
     yield from (functools.partial(_scaled, index=index, sign=sign, factor=factor)
-                for index in range(width) for sign, factor in SIGNS_FACTORS)  # fmt: skip
+                for index in range(width) for sign, factor in SIGNS_FACTORS if factor <= 1)  # fmt: skip
 
 
 def _exchanged(fix: Fix, one: int, other: int) -> Fix:

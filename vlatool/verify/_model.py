@@ -96,9 +96,14 @@ class Model:
                 for each, nulls in ((series, clean), (shifted, clean), (noisy, rough)):
                     nulls.add([other.all_tables(each.part(np.isin(each.episodes, log))) for log in logs],
                               self.names.images)  # fmt: skip
-            like = clean.found or not known
-            bounds[known, True] = clean.bounds(self.signals, rows) if like else bounds[False, True]
-            bounds[known, False] = clean.bounds(self.signals, rows, rough) if like else bounds[False, False]
+            if not known:
+                bounds = {(False, True): clean.bounds(self.signals, rows),
+                          (False, False): clean.bounds(self.signals, rows, rough)}  # fmt: skip
+            for quiet, others in ((True, ()), (False, (rough,))):
+                new = bounds[False, quiet]
+                bounds[True, quiet] = (
+                    clean.bounds(self.signals, rows, *others).with_delays_of(new) if clean.found else new
+                )
         episodes = [series.part(series.episodes == number) for number in np.unique(series.episodes)]
         usual = {name: upper_bound([roughness(each, name) for each in episodes], 0.0) for name in self.signals}
         return replace(self, usual=usual, bounds=bounds)
