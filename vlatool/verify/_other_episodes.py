@@ -27,6 +27,7 @@ from vlatool.verify._search import (
     episodes_of,
 )
 from vlatool.verify._series import Series
+from vlatool.verify._tasks import Tasks
 from vlatool.verify._texts import explain_empty, unknown_texts
 from vlatool.verify._vectors import FACTORS
 
@@ -56,6 +57,7 @@ class Judge:
 
     Args:
         images: image -> classifier of how it looks.
+        tasks: input of text -> classifier of the tasks that it names.
     """
 
     spec: PolicySpec
@@ -64,6 +66,7 @@ class Judge:
     images: Mapping[str, Appearance]
     texts: Mapping[str, Sequence[str]]
     series: Series
+    tasks: Mapping[str, Tasks]
 
     @classmethod
     def of(cls, spec: PolicySpec, names: Names, reference: Recording) -> Judge:
@@ -74,7 +77,10 @@ class Judge:
         shown = _spread(len(rows))
         looks = _looks(spec, names, reference, rows[shown])
         images = {name: Appearance.of(_of_size(looks, name), name, groups[shown], episodes[shown]) for name in looks}
-        return cls(spec, reader, model, images, _texts(spec, reference, rows), series)
+        texts = _texts(spec, reference, rows[shown])
+        found = {name: Tasks.of(looks, each, episodes[shown]) for name, each in texts.items()}
+        tasks = {name: each for name, each in found.items() if each is not None}
+        return cls(spec, reader, model, images, _texts(spec, reference, rows), series, tasks)
 
     def explain(self, log: Recording, scales: Scales) -> Outcome:
         """Say what is wrong with a log."""
@@ -84,7 +90,8 @@ class Judge:
         (series, *_), _ = self.reader.variants(log, _changes(verdicts))
         model = self.model.for_log(series, known=self._is_known(log, rows))
         found, right = explain(model, series, scales)
-        explanations = [*_of_images(verdicts, len(rows)), *self._of_texts(log, rows)]
+        wrong = list(_of_images(verdicts, len(rows)))
+        explanations = [*wrong, *self._of_texts(log, rows), *(() if wrong else self._of_tasks(log, looks, rows))]
         for name, finding in found:
             explanations += self._of_signal(model, name, finding, len(rows))
         suspicious = [*_odd_images(verdicts), *self._odd_texts(log, rows, episodes), *self._odd_levels(right)]
@@ -123,6 +130,12 @@ class Judge:
     def _of_texts(self, log: Recording, rows: Indices) -> Iterator[Explanation]:
         for name, mine in _texts(self.spec, log, rows).items():
             yield from explain_empty(name, mine, self.texts[name])
+
+    def _of_tasks(self, log: Recording, looks: Mapping[str, Looks], rows: Indices) -> Iterator[Explanation]:
+        """Yield texts of another task than the images are of, where the images look right."""
+        for name, mine in _texts(self.spec, log, rows[_spread(len(rows))]).items():
+            if name in self.tasks:
+                yield from self.tasks[name].explain(name, looks, mine)
 
     def _odd_texts(self, log: Recording, rows: Indices, episodes: Indices) -> Iterator[str]:
         for name, mine in _texts(self.spec, log, rows).items():

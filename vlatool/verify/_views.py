@@ -92,14 +92,18 @@ class Basis:
         return cls(values[chosen], values.std(axis=0) + 1e-9, lead)
 
     def features(self, series: Series, sources: Sequence[str]) -> Array:
-        """Return how near the arm comes to each place in a step, and how fast it moves there: (N, 2 K)."""
+        """Return how near the arm comes to each place, how fast it moves there, and each element: (N, 2 (K + A)).
+
+        Of how fast an element moves also the root, since the motion in a part of an image is measured as a root.
+        """
         values = np.concatenate([series.values[name] for name in sources], axis=1) / self.scale
         centres = self.centres / self.scale
         squares = (values**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2 * values @ centres.T
         near = np.exp(-np.maximum(squares, 0) / values.shape[1])
         ahead = series.rows(1)
-        speed = np.sqrt(((values[ahead] - values) ** 2).sum(axis=1, keepdims=True))
-        found = np.concatenate([near[ahead] - near, speed * near], axis=1)
+        moved = np.abs(values[ahead] - values)
+        speed = np.sqrt((moved**2).sum(axis=1, keepdims=True))
+        found = np.concatenate([near[ahead] - near, speed * near, moved, np.sqrt(moved)], axis=1)
         share = abs(self.lead)
         return (1 - share) * found + share * found[series.rows(1 if self.lead > 0 else -1)] if share else found
 
