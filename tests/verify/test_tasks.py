@@ -18,7 +18,9 @@ def looks(scene: int, seed: int, light: float = 1.0) -> Looks:
     wall = np.random.default_rng(0).uniform(50, 90, (GRID, GRID, 3))
     images = np.repeat(wall[None], ROWS, axis=0) + random.normal(0, 2, (ROWS, GRID, GRID, 3))
     row = 3 + int(random.integers(3))
-    images[:, row : row + 4, 3 * scene : 3 * scene + 4] += np.array([120, 40, 10]) * np.roll(np.eye(3), scene, axis=1)[0]
+    images[:, row : row + 4, 3 * scene : 3 * scene + 4] += (
+        np.array([120, 40, 10]) * np.roll(np.eye(3), scene, axis=1)[0]
+    )
     return Looks(light * images, light * images.reshape(ROWS, -1, 3))
 
 
