@@ -113,5 +113,5 @@ def test_what_contradicts_itself_is_an_error(tmp_path, case):
 
 
 def test_files_of_aloha_have_no_filter_keys(tmp_path):
-    with pytest.raises(DataError, match="no file of robomimic"):
+    with pytest.raises(DataError, match="not a file of robomimic"):
         read_recording(NamedRecording(datasets.aloha(tmp_path / "aloha"), {"mask": "train"}), spec())

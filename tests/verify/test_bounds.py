@@ -19,17 +19,17 @@ def bounds(value: float, rows: float = 100.0) -> Bounds:
     (400, MIN_EVIDENCE * 2), (1600, MIN_EVIDENCE * 4),
 ])  # fmt: skip
 def test_what_is_needed_grows_with_the_root_of_the_episodes(rows, needed):
-    assert bounds(MIN_EVIDENCE).needed(rows)["state"]["negated"] == pytest.approx(needed)
+    assert bounds(MIN_EVIDENCE).threshold(rows)["state"]["negated"] == pytest.approx(needed)
 
 
 def test_what_exceeds_chance_grows_with_the_rows_beyond_the_longest_that_was_judged():
-    assert bounds(20.0).needed(800)["state"]["negated"] == pytest.approx(
+    assert bounds(20.0).threshold(800)["state"]["negated"] == pytest.approx(
         2 * MIN_EVIDENCE * 2**0.5 + 2 * (40 - 2 * MIN_EVIDENCE)
     )
 
 
 def test_delays_need_as_much_as_in_new_tasks():
-    found = bounds(7.0).with_delays_of(bounds(30.0)).needed(100)["state"]
+    found = bounds(7.0).with_delays_of(bounds(30.0)).threshold(100)["state"]
     assert found["delayed"] == 30
     assert {found[kind] for kind in KINDS if kind != "delayed"} == {7.0}
 

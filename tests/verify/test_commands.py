@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vlatool.verify._commands import refined
+from vlatool.verify._commands import best_change
 from vlatool.verify._model import Model
 from vlatool.verify._reading import Names
 from vlatool.verify._search import KINDS
@@ -41,29 +41,29 @@ def changed(change: Array) -> Series:
 
 
 def test_right_commands_are_right(model):
-    assert refined(model, series(range(50, 52))).components == ()
+    assert best_change(model, series(range(50, 52))).components == ()
 
 
 @pytest.mark.parametrize("order", [[1, 0, 2, 3, 4], [1, 2, 3, 4, 0], [4, 3, 1, 2, 0]])
 def test_an_order_is_found_whole(model, order):
-    finding = refined(model, changed(np.eye(JOINTS)[:, order]))
+    finding = best_change(model, changed(np.eye(JOINTS)[:, order]))
     assert finding.fix.order == tuple(order)
     assert {each.kind for each in finding.components} == {"permuted"}
 
 
 def test_signs_and_units_that_are_too_small_are_found(model):
     signs = np.array([1, -1, 1, -1, 1.0])
-    assert refined(model, changed(np.diag(signs))).fix.signs == (1, -1, 1, -1, 1)
-    finding = refined(model, changed(np.diag([1, 1, 1e-3, 1e-3, 1])))
+    assert best_change(model, changed(np.diag(signs))).fix.signs == (1, -1, 1, -1, 1)
+    finding = best_change(model, changed(np.diag([1, 1, 1e-3, 1e-3, 1])))
     np.testing.assert_allclose(finding.fix.factors, [1, 1, 1e-3, 1e-3, 1])
 
 
 def test_commands_are_not_divided(model):
-    finding = refined(model, changed(np.diag([1, 1, 1, 1, 1e3])))
+    finding = best_change(model, changed(np.diag([1, 1, 1, 1, 1e3])))
     assert max(finding.fix.factors) == 1
 
 
 def test_what_has_too_little_for_it_is_left_out(model):
     high = replace(model, needed={name: dict.fromkeys(KINDS, 1e6) for name in NEEDED})
-    finding = refined(high, changed(np.eye(JOINTS)[:, [1, 0, 2, 3, 4]]))
+    finding = best_change(high, changed(np.eye(JOINTS)[:, [1, 0, 2, 3, 4]]))
     assert (finding.components, finding.fix.order) == ((), tuple(range(JOINTS)))

@@ -152,7 +152,7 @@ def _episodes(file: Path, key: str) -> _Content:
         if "data" not in opened or not hasattr(opened["data"], "keys"):
             if key:
                 raise DataError(
-                    f"{file} is no file of robomimic, which has filter keys.", f"leave --map mask={key} out"
+                    f"{file} is not a file of robomimic: only those have filter keys.", f"leave --map mask={key} out"
                 )
             return _Content([_episode(file, opened, "")])
         names = sorted(opened["data"], key=_natural)

@@ -22,7 +22,7 @@ MIN_LOG = 50
 ALARM = 1e-3
 """Share of right logs in which a kind of change of a signal may be found."""
 MIN_EVIDENCE = float(np.log(1 / ALARM))
-NEAR = 1.5
+ROWS_RATIO = 1.5
 """A log is judged as those of the next number of episodes if that has at most so many times its rows."""
 SIZES, MAX_LOGS, MIN_SIZE_LOGS = (1, 2, 4), 12, 12
 """Episodes of a log that is judged; logs of several that each part gives, and that all need to give."""
@@ -57,13 +57,13 @@ class Bounds:
         }  # fmt: skip
         return Bounds(found, self.rows)
 
-    def needed(self, rows: int) -> Needed:
+    def threshold(self, rows: int) -> Needed:
         """Return what is needed in a log of so many rows.
 
         Beyond the longest that was judged, what a right log has because predictions are not exact grows with its rows,
         and what it has by chance with their root: residuals hang together over more rows than the regression knows.
         """
-        size = max(size for size in self.by_size if size == 1 or size * self.rows <= NEAR * rows)
+        size = max(size for size in self.by_size if size == 1 or size * self.rows <= ROWS_RATIO * rows)
         least = MIN_EVIDENCE * size**0.5
         longer = max(1.0, rows / (size * self.rows))
         return {
@@ -83,7 +83,7 @@ class Nulls:
         for size in SIZES:
             for chosen in _spread(list(itertools.combinations(logs, size)), MAX_LOGS if size > 1 else len(logs)):
                 for name in chosen[0]:
-                    together = Tables.together([tables[name] for tables in chosen])
+                    together = Tables.sum_of([tables[name] for tables in chosen])
                     parts = search(together, dict.fromkeys(KINDS, 0.0), only_delay=name in images).components
                     for kind in KINDS:
                         value = max((each.evidence for each in parts if each.kind == kind), default=0.0)

@@ -38,15 +38,15 @@ class _Fits:
 
     def __call__(self, fix: Fix) -> float:
         fixed = self.series.with_signals((self.model.names.commands,), fix.apply)
-        return self.model.fit_of(fixed, changed(self.model)) - _cost(fix)
+        return self.model.fit_of(fixed, affected_signals(self.model)) - _cost(fix)
 
 
-def refined(model: Model, series: Series) -> Finding:
+def best_change(model: Model, series: Series) -> Finding:
     """Return the change of commands that are numbers with which all signals fit best; without components for none."""
     name = model.names.commands
     width = series.values[name].shape[1] if name else 0
     fix = Fix(tuple(range(width)), (1,) * width, (1.0,) * width, (0.0,) * width)
-    if model.discrete or not 0 < width <= MAX_WIDTH or len(changed(model)) < 2:
+    if model.discrete or not 0 < width <= MAX_WIDTH or len(affected_signals(model)) < 2:
         return Finding(fix, ())
     fits = _Fits(model, series)
     best = fits(fix)
@@ -112,10 +112,10 @@ def _finding(model: Model, fits: _Fits, fix: Fix, best: float) -> Finding:
 
 def _needed(model: Model, kind: str) -> float:
     """Return what is needed for a change of the commands: as much as for one of each signal that it changes."""
-    return sum(model.needed[each][kind] for each in changed(model))
+    return sum(model.needed[each][kind] for each in affected_signals(model))
 
 
-def changed(model: Model) -> tuple[str, ...]:
+def affected_signals(model: Model) -> tuple[str, ...]:
     """Return the signals that fit otherwise when the commands change: these, and what is predicted from them."""
     name = model.names.commands
     followers = [each for each, known in model.predictions.items() if any(view.view.commands for view in known)]

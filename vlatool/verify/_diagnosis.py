@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping
 
-from vlatool.verify._commands import refined
+from vlatool.verify._commands import best_change
 from vlatool.verify._model import Model
 from vlatool.verify._search import (
     DELAY_KIND,
@@ -75,7 +75,7 @@ def _candidates(
             yield name, finding, _with_fix(series, name, finding)
         if name in scales and name not in found:
             yield from _of_scale(model, series, name, *scales[name])
-    if commands not in found and (better := refined(model, series)).components:
+    if commands not in found and (better := best_change(model, series)).components:
         yield commands, better, _with_fix(series, commands, better)
     if late and commands not in found:
         yield from _late_commands(model, series, late)

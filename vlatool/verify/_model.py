@@ -115,7 +115,7 @@ class Model:
             known: whether the reference has other episodes of each task of the log.
         """
         quiet = all(roughness(series, name) <= self.usual.get(name, np.inf) for name in self.signals)
-        return replace(self, needed=self.bounds[known, quiet].needed(len(series)))
+        return replace(self, needed=self.bounds[known, quiet].threshold(len(series)))
 
 
 def roughness(series: Series, name: str) -> float:

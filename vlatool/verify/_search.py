@@ -185,7 +185,7 @@ class Tables:
     by_delay: Mapping[int, Array]
 
     @classmethod
-    def together(cls, parts: Sequence[Tables]) -> Tables:
+    def sum_of(cls, parts: Sequence[Tables]) -> Tables:
         """Return what several logs say together."""
         return cls({delay: np.sum([each.by_delay[delay] for each in parts], axis=0) for delay in parts[0].by_delay})
 

@@ -50,8 +50,8 @@ class Tasks:
         Returns:
             None where nothing can be told: an episode has several texts, a text too few episodes, or all look alike.
         """
-        known = _place_of(texts, episodes)
-        place = np.array([known.get(key, -1) for key in zip(texts, episodes.tolist(), strict=True)])
+        known = _positions(texts, episodes)
+        position = np.array([known.get(key, -1) for key in zip(texts, episodes.tolist(), strict=True)])
         tasks = {text: at for at, text in enumerate(sorted({text for text, _ in known}))}
         least = max(2, len(tasks) // 2)
         if len(tasks) < 2 or not looks or len({*zip(texts, episodes.tolist(), strict=True)}) > len(np.unique(episodes)):
@@ -59,7 +59,7 @@ class Tasks:
         seen, others = _variants(looks, 1, SHIFTS), _variants(looks, 2, OTHER_SHIFTS)
         while len(set(tasks.values())) >= least:
             at = np.array([tasks.get(text, -1) for text in texts])
-            left_out = _left_out(seen, others, at, place, episodes)
+            left_out = _left_out(seen, others, at, position, episodes)
             if len(left_out) < MIN_MARGINS:
                 return None
             own, other, margins = max(left_out, key=lambda each: each[2][0])
@@ -87,8 +87,8 @@ class Tasks:
                                   needed=self.needed)  # fmt: skip
 
 
-def _place_of(texts: Sequence[str], episodes: Indices) -> dict[tuple[str, int], int]:
-    """Return text and episode -> its place among the episodes of that text, of texts that have some."""
+def _positions(texts: Sequence[str], episodes: Indices) -> dict[tuple[str, int], int]:
+    """Return text and episode -> its position among the episodes of that text, of texts that have some."""
     numbers: dict[str, list[int]] = {}
     for text, number in sorted({*zip(texts, episodes.tolist(), strict=True)}):
         numbers.setdefault(text, []).append(number)
@@ -97,7 +97,7 @@ def _place_of(texts: Sequence[str], episodes: Indices) -> dict[tuple[str, int], 
 
 
 def _left_out(
-    seen: Sequence[Array], others: Sequence[Array], at: Indices, place: Indices, episodes: Indices
+    seen: Sequence[Array], others: Sequence[Array], at: Indices, position: Indices, episodes: Indices
 ) -> list[tuple[int, int, list[float]]]:
     """Return for each episode its task, the likeliest other, and its margin in the images and in changed ones.
 
@@ -106,12 +106,12 @@ def _left_out(
     """
     found = []
     for part in range(PARTS):
-        left = (place >= 0) & (place % PARTS != part)
-        if not {*at[place >= 0].tolist()} <= {*at[left].tolist()}:
+        left = (position >= 0) & (position % PARTS != part)
+        if not {*at[position >= 0].tolist()} <= {*at[left].tolist()}:
             continue
         weights = _fit(seen, at, left)
-        for number in np.unique(episodes[(place >= 0) & ~left]):
-            rows = (episodes == number) & (place >= 0)
+        for number in np.unique(episodes[(position >= 0) & ~left]):
+            rows = (episodes == number) & (position >= 0)
             scores, own = np.array([_scores(weights, features[rows]) for features in others]), int(at[rows][0])
             tasks = np.arange(scores.shape[1])
             rest = np.where(np.isin(tasks, at) & (tasks != own), scores, -np.inf)
