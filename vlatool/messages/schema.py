@@ -1,14 +1,19 @@
 """What a message is: a frozen dataclass whose annotations are types of the ROS interface language.
 
-Each field is annotated with one of the aliases below, with another message class, or with ``tuple[M, ...]`` of them.
-The order of the fields is that of the ROS 2 definition. Every field has a default, as in ROS: zero, false or empty.
+Each field is annotated with one of the aliases below, with another message class, or with ``tuple[M, ...]`` of them;
+a constant with ``ClassVar`` of an alias. The order of the fields is that of the ROS 2 definition. Every field has a
+default, as in ROS: zero, false or empty.
 Encodings (CDR, ROS 1), RIHS01 hashes and texts of definitions are derived from these classes.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import pkgutil
+import struct
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -35,6 +40,23 @@ class Elements:
 
     name: str
     length: int | None = None
+
+
+@dataclass(frozen=True)
+class Ros1Form:
+    """How the ROS 1 definition of a type (Noetic) differs from that of ROS 2.
+
+    Args:
+        sequence: Whether a number ``uint32 seq`` comes first, which is written as 0 and not read.
+        names: Pairs of a field and its name in ROS 1.
+        absent: Fields and constants that ROS 1 lacks: they are not written, and read as their defaults.
+        constants: Primitive of the constants; that of ROS 2 when empty.
+    """
+
+    sequence: bool = False
+    names: tuple[tuple[str, str], ...] = ()
+    absent: tuple[str, ...] = ()
+    constants: str = ""
 
 
 boolean = Annotated[bool, Primitive("bool")]
@@ -75,11 +97,14 @@ class Message:
 
     TYPE: ClassVar[str] = ""
     """Name of the ROS 2 type, such as ``geometry_msgs/msg/Twist``."""
+    ROS1: ClassVar[Ros1Form] = Ros1Form()
+    """How the definition differs in ROS 1."""
 
-    def __init_subclass__(cls, name: str = "", **options: Any) -> None:
+    def __init_subclass__(cls, name: str = "", ros1: Ros1Form | None = None, **options: Any) -> None:
         super().__init_subclass__(**options)
         if name:
             cls.TYPE = name
+            cls.ROS1 = ros1 or Ros1Form()
             _TYPES[name] = cls
 
 
@@ -93,14 +118,38 @@ def find_type(name: str) -> type[Message]:
         UsageError: for an unknown type.
     """
     package, _, rest = name.partition("/")
+    if package in packages():
+        importlib.import_module(f"vlatool.messages.{package}")
     full = name if "/" in rest else f"{package}/msg/{rest}"
     if full not in _TYPES:
-        raise UsageError.unknown(f"Unknown type of message '{name}'", full, sorted(_TYPES))
+        by_ros1_name = {ros1_name(known): known for known in _TYPES}
+        full = by_ros1_name.get(name, full)
+    if full not in _TYPES:
+        raise UsageError.unknown(f"Unknown type of message '{name}'", full, [kind.TYPE for kind in all_types()])
     return _TYPES[full]
 
 
+def ros1_name(full: str) -> str:
+    """Return the ROS 1 name of a type: of a service, ``std_srvs/SetBoolRequest``."""
+    package, kind, name = full.split("/")
+    return f"{package}/{name if kind == 'msg' else name.replace('_', '')}"
+
+
+def packages() -> list[str]:
+    """Return the names of the ROS packages that have types here."""
+    names = (module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]))
+    return sorted(name for name in names if name.endswith(("_msgs", "_srvs", "_interfaces")))
+
+
+def all_types() -> list[type[Message]]:
+    """Return the classes of all types, sorted by name."""
+    for package in packages():
+        importlib.import_module(f"vlatool.messages.{package}")
+    return [_TYPES[name] for name in sorted(_TYPES)]
+
+
 def same(one: Any, other: Any) -> bool:
-    """Return whether two messages, or values of fields, are equal bit for bit; NaN equals NaN."""
+    """Return whether two messages, or values of fields, are equal bit for bit: 0.0 is not -0.0; NaN equals NaN."""
     if isinstance(one, Message):
         return type(one) is type(other) and all(
             same(getattr(one, entry.name), getattr(other, entry.name))
@@ -111,4 +160,6 @@ def same(one: Any, other: Any) -> bool:
         return left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes()
     if isinstance(one, tuple):
         return isinstance(other, tuple) and len(one) == len(other) and all(map(same, one, other))
-    return bool(one == other) or (one != one and other != other)
+    if isinstance(one, float) and isinstance(other, float):
+        return struct.pack("d", one) == struct.pack("d", other) or (one != one and other != other)
+    return bool(one == other)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from vlatool.messages.geometry_msgs import Quaternion, Vector3
 from vlatool.messages.schema import (
     Message,
+    Ros1Form,
     boolean,
     float32,
     float32_sequence,
@@ -57,7 +59,11 @@ class RegionOfInterest(Message, name="sensor_msgs/msg/RegionOfInterest"):
 
 
 @dataclass(frozen=True, eq=False)
-class CameraInfo(Message, name="sensor_msgs/msg/CameraInfo"):
+class CameraInfo(
+    Message,
+    name="sensor_msgs/msg/CameraInfo",
+    ros1=Ros1Form(names=(("d", "D"), ("k", "K"), ("r", "R"), ("p", "P"))),
+):
     """Calibration of a camera: distortion ``d``, intrinsic matrix ``k``, rectification ``r``, projection ``p``."""
 
     header: Header = Header()
@@ -75,7 +81,16 @@ class CameraInfo(Message, name="sensor_msgs/msg/CameraInfo"):
 
 @dataclass(frozen=True, eq=False)
 class PointField(Message, name="sensor_msgs/msg/PointField"):
-    """One field of the points of a cloud; ``datatype`` 7 is float32, 8 float64."""
+    """One field of the points of a cloud, of a ``datatype`` below."""
+
+    INT8: ClassVar[uint8] = 1
+    UINT8: ClassVar[uint8] = 2
+    INT16: ClassVar[uint8] = 3
+    UINT16: ClassVar[uint8] = 4
+    INT32: ClassVar[uint8] = 5
+    UINT32: ClassVar[uint8] = 6
+    FLOAT32: ClassVar[uint8] = 7
+    FLOAT64: ClassVar[uint8] = 8
 
     name: string = ""
     offset: uint32 = 0
@@ -139,8 +154,36 @@ class JointState(Message, name="sensor_msgs/msg/JointState"):
 
 
 @dataclass(frozen=True, eq=False)
-class BatteryState(Message, name="sensor_msgs/msg/BatteryState"):
+class BatteryState(
+    Message,
+    name="sensor_msgs/msg/BatteryState",
+    ros1=Ros1Form(absent=("POWER_SUPPLY_TECHNOLOGY_TERNARY", "POWER_SUPPLY_TECHNOLOGY_VRLA")),
+):
     """A battery: volts, degrees Celsius, amperes, ampere hours, and ``percentage`` from 0 to 1; NaN is unmeasured."""
+
+    POWER_SUPPLY_STATUS_UNKNOWN: ClassVar[uint8] = 0
+    POWER_SUPPLY_STATUS_CHARGING: ClassVar[uint8] = 1
+    POWER_SUPPLY_STATUS_DISCHARGING: ClassVar[uint8] = 2
+    POWER_SUPPLY_STATUS_NOT_CHARGING: ClassVar[uint8] = 3
+    POWER_SUPPLY_STATUS_FULL: ClassVar[uint8] = 4
+    POWER_SUPPLY_HEALTH_UNKNOWN: ClassVar[uint8] = 0
+    POWER_SUPPLY_HEALTH_GOOD: ClassVar[uint8] = 1
+    POWER_SUPPLY_HEALTH_OVERHEAT: ClassVar[uint8] = 2
+    POWER_SUPPLY_HEALTH_DEAD: ClassVar[uint8] = 3
+    POWER_SUPPLY_HEALTH_OVERVOLTAGE: ClassVar[uint8] = 4
+    POWER_SUPPLY_HEALTH_UNSPEC_FAILURE: ClassVar[uint8] = 5
+    POWER_SUPPLY_HEALTH_COLD: ClassVar[uint8] = 6
+    POWER_SUPPLY_HEALTH_WATCHDOG_TIMER_EXPIRE: ClassVar[uint8] = 7
+    POWER_SUPPLY_HEALTH_SAFETY_TIMER_EXPIRE: ClassVar[uint8] = 8
+    POWER_SUPPLY_TECHNOLOGY_UNKNOWN: ClassVar[uint8] = 0
+    POWER_SUPPLY_TECHNOLOGY_NIMH: ClassVar[uint8] = 1
+    POWER_SUPPLY_TECHNOLOGY_LION: ClassVar[uint8] = 2
+    POWER_SUPPLY_TECHNOLOGY_LIPO: ClassVar[uint8] = 3
+    POWER_SUPPLY_TECHNOLOGY_LIFE: ClassVar[uint8] = 4
+    POWER_SUPPLY_TECHNOLOGY_NICD: ClassVar[uint8] = 5
+    POWER_SUPPLY_TECHNOLOGY_LIMN: ClassVar[uint8] = 6
+    POWER_SUPPLY_TECHNOLOGY_TERNARY: ClassVar[uint8] = 7
+    POWER_SUPPLY_TECHNOLOGY_VRLA: ClassVar[uint8] = 8
 
     header: Header = Header()
     voltage: float32 = 0.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vlatool.messages.builtin_interfaces import Time
-from vlatool.messages.schema import Message, boolean, float32, string
+from vlatool.messages.schema import Message, Ros1Form, boolean, float32, string
 
 
 @dataclass(frozen=True, eq=False)
-class Header(Message, name="std_msgs/msg/Header"):
+class Header(Message, name="std_msgs/msg/Header", ros1=Ros1Form(sequence=True)):
     """When and in which frame the data of a message were taken."""
 
     stamp: Time = Time()
