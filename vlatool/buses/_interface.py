@@ -7,10 +7,12 @@ return soon; the run of a controller (``vlatool.nodes``) puts what they get into
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
+from vlatool.errors import BusError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.registry import load
@@ -62,6 +64,21 @@ class TopicInfo:
     subscribers: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Fault:
+    """What went wrong on a topic or a service while its messages were handled.
+
+    Args:
+        topic: The topic or service.
+        count: How often something went wrong there.
+        error: The latest error.
+    """
+
+    topic: str
+    count: int
+    error: BusError
+
+
 @runtime_checkable
 class Bus(Protocol):
     """A connection of one node to a bus; the class in ``vlatool/buses/NAME.py`` is built as ``NAME(address, node)``."""
@@ -89,6 +106,13 @@ class Bus(Protocol):
     def topics(self) -> list[TopicInfo]:
         """Return what is on the bus now, this node's own included, sorted by name."""
 
+    def faults(self) -> list[Fault]:
+        """Return what went wrong so far, one entry for each topic or service, sorted by name.
+
+        Malformed messages, errors that handlers raise, and another type that appears on a topic later are counted
+        here; none of them stops the bus.
+        """
+
     def stamp(self) -> Time:
         """Return the moment by the clock that stamps this bus's messages."""
 
@@ -97,6 +121,85 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Leave the bus; what is sent has left this process. Closing twice does nothing."""
+
+
+GOAL_SUCCEEDED, GOAL_CANCELED, GOAL_ABORTED = "succeeded", "canceled", "aborted"
+"""How a goal of an action ends."""
+
+
+class ActionType(NamedTuple):
+    """Type of an action.
+
+    Args:
+        name: ROS 2 name, such as ``vlatool_msgs/action/RunInstruction``.
+        goal: Class of its goals.
+        feedback: Class of what it reports meanwhile.
+        result: Class of what it reports at the end.
+    """
+
+    name: str
+    goal: type[Message]
+    feedback: type[Message]
+    result: type[Message]
+
+
+class Outcome(NamedTuple):
+    """How a goal ended: ``GOAL_SUCCEEDED``, ``GOAL_CANCELED`` or ``GOAL_ABORTED``, and the result."""
+
+    status: str
+    result: Message
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A goal of an action, as its server sees it.
+
+    Args:
+        message: The goal.
+        feedback: Sends feedback to the client.
+        canceled: Set when the client cancels the goal, a newer goal replaces it, or the bus closes.
+    """
+
+    message: Message
+    feedback: Callable[[Message], None]
+    canceled: threading.Event
+
+
+@runtime_checkable
+class ClientGoal(Protocol):
+    """A goal of an action, as its client sees it."""
+
+    def result(self, timeout_s: float) -> Outcome:
+        """Wait for the end of the goal.
+
+        Raises:
+            BusError: when it is not reached in time, or the server refuses the goal.
+        """
+
+    def cancel(self) -> None:
+        """Ask the server to cancel the goal; ``result`` tells how it ended."""
+
+
+@runtime_checkable
+class ActionBus(Bus, Protocol):
+    """A bus that also has actions: goals that take a while, report meanwhile and can be canceled."""
+
+    def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
+        """Answer an action.
+
+        ``handler`` runs in a thread of its own until the goal ends, and looks at ``Goal.canceled`` meanwhile. One goal
+        runs at a time: a newer one cancels that which runs, and starts when its handler has returned. A handler that
+        raises ends its goal as aborted, with an empty result.
+        """
+
+    def send_goal(
+        self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
+    ) -> ClientGoal:
+        """Send a goal; ``feedback`` is called with what the server reports meanwhile.
+
+        Raises:
+            BusError: when nobody serves the action.
+        """
 
 
 def open_bus(name: str, node: str) -> Bus:
