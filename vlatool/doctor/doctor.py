@@ -37,6 +37,8 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "sign": ("cryptography",),
     "remote": ("websockets", "msgpack"),
     "serve": ("websockets", "msgpack", "grpcio", "pyzmq"),
+    "dds": ("cyclonedds",),
+    "zenoh": ("eclipse-zenoh",),
     "search": ("optuna",),
     "tensorboard": ("tensorboard",),
     "video": ("pillow",),

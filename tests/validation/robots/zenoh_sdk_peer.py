@@ -1,0 +1,40 @@
+"""A node of zenoh-ros2-sdk, run by its own Python: it sends each Twist of /to_peer back on /from_peer.
+
+    out/robots/zenoh-sdk/venv/bin/python tests/validation/robots/zenoh_sdk_peer.py PORT
+
+For each topic on its standard input it prints which nodes it sees there. Definition and hash of the type are those of
+rosbags; without them the sdk would download definitions.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+from rosbags.typesys import Stores, get_typestore
+from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
+from zenoh_ros2_sdk.discovery import get_topic_info
+
+TYPE = "geometry_msgs/msg/Twist"
+
+
+def main() -> None:
+    port, store = int(sys.argv[1]), get_typestore(Stores.ROS2_JAZZY)
+    definition, _ = store.generate_msgdef(TYPE, ros_version=2)
+    known = {"msg_definition": definition, "type_hash": store.hash_rihs01(TYPE), "node_name": "sdk_node"}
+    router = {"router_ip": "127.0.0.1", "router_port": port, "domain_id": 0}
+    publisher = ROS2Publisher("/from_peer", TYPE, **known, **router)
+
+    def answer(message: object) -> None:
+        publisher.publish(linear=message.linear, angular=message.angular)
+
+    ROS2Subscriber("/to_peer", TYPE, answer, **known, **router)
+    print("ready", publisher.type_hash, flush=True)
+    for line in sys.stdin:
+        info = get_topic_info(line.strip(), domain_id=0, router_ip="127.0.0.1", router_port=port, verbose=True)
+        ends = [*info.publishers, *info.subscribers] if info else []
+        print(json.dumps([[end.node_name, end.topic_type, end.type_hash, end.qos] for end in ends]), flush=True)
+
+
+if __name__ == "__main__":
+    main()
