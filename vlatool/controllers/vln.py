@@ -1,0 +1,272 @@
+"""Follow an instruction with a policy that chooses between motions: turns, steps forward, stop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from vlatool.controllers._discrete_policy import Observed, choose, observation, observed_by
+from vlatool.controllers._freshness import age_s, note_changes
+from vlatool.controllers._geometry import PlanarPose, pose_of, twist
+from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
+from vlatool.controllers._motions import BACKWARD, FORWARD, STOP, WAIT, Speeds, drive, motions_of, plan
+from vlatool.controllers._sensor_arrays import colours_of, depth_of
+from vlatool.controllers._settings import check_range, check_rate
+from vlatool.controllers._vln_state import (
+    ARRIVED_PHASE,
+    FAILED_PHASE,
+    IDLE_PHASE,
+    PAUSED_PHASE,
+    RUNNING_PHASE,
+    VlnState,
+)
+from vlatool.errors import DeadlineMissed, UsageError, VlatoolError
+from vlatool.messages.geometry_msgs import Twist
+from vlatool.messages.nav_msgs import Odometry
+from vlatool.messages.sensor_msgs import Image
+from vlatool.messages.std_msgs import Bool, String
+
+ALLOWED_SPEED = {"linear": 0.306, "angular": 1.9}
+"""Fastest of a Create 3 with its safety on, in m/s and rad/s (Create 3 documentation, "Safety")."""
+
+
+@dataclass(frozen=True)
+class Vln:
+    """Follows the instruction on ``/vln/instruction`` with the motions that a policy chooses.
+
+    The policy sees a frame when the robot stands, and its action becomes a motion: a turn by ``turn_deg`` or a step of
+    ``forward_m``, from the pose at which the last motion was to end, so that small errors do not add up. Odometry ends
+    it. The next frame is one that was taken after that. A step forward that depth says is blocked is not driven, and
+    the policy is asked again, with the action among its past ones.
+
+    It ends with a ``stop`` label or when ``/vln/arrived`` says so. It never moves without an instruction; an empty one
+    ends it. It stands while the camera or the odometry is older than ``max_age_s``. The first word of ``/vln/status``
+    is ``idle``, ``running``, ``paused``, ``arrived`` or ``failed``.
+
+    Args:
+        rate: Steps in a second.
+        turn_deg: Angle of a turn, in degrees.
+        forward_m: Length of a step, in metres.
+        max_linear_speed: In m/s.
+        max_angular_speed: In rad/s.
+        position_m: Distance from its end at which a step ends, in metres.
+        angle_deg: Angle from its end at which a turn ends, in degrees.
+        clearance_m: Depth beyond a step that must be free, in metres.
+        way_share: Share of the width of the depth image, in its middle, that is the way ahead.
+        max_age_s: Age of the camera and of odometry above which the robot stands, in seconds.
+        motion_s: Time after which a motion that did not reach its end is over, in seconds.
+        settle_s: Time after a motion after which a frame is used whatever its stamp, in seconds.
+        max_actions: Actions after which it gives up; 0 for none.
+        motions: ``LABEL=MOTION`` for labels whose words do not say it, separated by commas.
+        policy: What ``vlatool.load`` returned.
+
+    Raises:
+        UsageError: for a setting out of its range, or a policy without labels that are motions.
+    """
+
+    rate: float = 10.0
+    turn_deg: float = 90.0
+    forward_m: float = 1.0
+    max_linear_speed: float = 0.3
+    max_angular_speed: float = 1.0
+    position_m: float = 0.01
+    angle_deg: float = 1.0
+    clearance_m: float = 0.25
+    way_share: float = 0.3
+    max_age_s: float = 0.5
+    motion_s: float = 20.0
+    settle_s: float = 1.0
+    max_actions: int = 0
+    motions: str = ""
+    policy: Any = field(default=None, metadata={"setting": False})
+
+    def __post_init__(self) -> None:
+        check_rate(self.rate)
+        check_range("turn_deg", self.turn_deg, 1.0, 180.0)
+        check_range("forward_m", self.forward_m, 0.01, 10.0)
+        check_range("max_linear_speed", self.max_linear_speed, 0.01, ALLOWED_SPEED["linear"])
+        check_range("max_angular_speed", self.max_angular_speed, 0.01, ALLOWED_SPEED["angular"])
+        for name in ("position_m", "angle_deg", "clearance_m", "way_share", "max_age_s", "motion_s", "settle_s"):
+            check_range(name, getattr(self, name), 0.0)
+        check_range("max_actions", self.max_actions, 0)
+        if self.policy is not None:
+            motions_of(self._observed.labels, self.motions)
+
+    @cached_property
+    def _observed(self) -> Observed:
+        if self.policy is None:
+            raise UsageError(
+                "vln has no policy; allowed: one that vlatool.load returned.", "name a bundle: --bundle DIR"
+            )
+        return observed_by(self.policy.spec)
+
+    @cached_property
+    def _motions(self) -> tuple[str, ...]:
+        return motions_of(self._observed.labels, self.motions)
+
+    @property
+    def rate_hz(self) -> float:
+        """Steps in a second."""
+        return self.rate
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """Camera, odometry and instruction; depth and the word that it arrived where the robot has them."""
+        return (
+            Input("image", "/camera/color/image_raw", Image),
+            Input("odometry", "/odom", Odometry),
+            Input("instruction", "/vln/instruction", String, required=False, reliable=True, latched=True),
+            Input("depth", "/camera/depth/image_raw", Image, required=False),
+            Input("arrived", "/vln/arrived", Bool, required=False, reliable=True),
+        )
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Velocity and status."""
+        return (Output("cmd_vel", "/cmd_vel", Twist), Output("status", "/vln/status", String, latched=True))
+
+    @property
+    def services(self) -> tuple[Service, ...]:
+        """Nothing."""
+        return ()
+
+    def start(self) -> VlnState:
+        """Return the state of a robot without an instruction; the policy is reset.
+
+        Raises:
+            UsageError: without a policy, or with one whose labels are not motions.
+        """
+        _ = self._motions
+        self.policy.reset()
+        return VlnState()
+
+    def step(self, snapshot: Snapshot, state: VlnState) -> tuple[Command, VlnState]:
+        """Return the velocity and the status at this step."""
+        state = self._listen(snapshot, state)
+        changes = note_changes(snapshot, ("image", "odometry"), state.changes)
+        state = state._replace(changes=changes)
+        if state.phase in (IDLE_PHASE, ARRIVED_PHASE, FAILED_PHASE):
+            return self._stand(state)
+        pose = pose_of(snapshot.message("odometry", Odometry))
+        trouble = self._trouble(snapshot, state, pose)
+        if trouble or pose is None:
+            return self._stand(state._replace(phase=PAUSED_PHASE, detail=trouble))
+        state = state._replace(phase=RUNNING_PHASE)
+        if state.motion is not None:
+            return self._move(snapshot, state, pose)
+        return self._decide(snapshot, state, pose)
+
+    def rest(self) -> Command:
+        """Stand."""
+        return Command({"cmd_vel": (twist(),), "status": (String(IDLE_PHASE),)}, status="stopped")
+
+    def _listen(self, snapshot: Snapshot, state: VlnState) -> VlnState:
+        """Return the state after what came on the instruction and on the word that the robot arrived."""
+        reading = snapshot.newest.get("instruction")
+        if reading is not None and reading.sequence != state.heard:
+            text = reading.message.data.strip() if isinstance(reading.message, String) else ""
+            self.policy.reset()
+            phase = RUNNING_PHASE if text else IDLE_PHASE
+            return VlnState(phase=phase, instruction=text, heard=reading.sequence, changes=state.changes)
+        arrived = snapshot.readings.get("arrived", ())
+        if state.phase in (RUNNING_PHASE, PAUSED_PHASE) and any(
+            getattr(item.message, "data", False) for item in arrived
+        ):
+            return state._replace(
+                phase=ARRIVED_PHASE if state.phase == RUNNING_PHASE else state.phase, motion=None, detail=""
+            )
+        return state
+
+    def _trouble(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose | None) -> str:
+        """Return why the robot cannot move now; empty when it can."""
+        for name, what in (("odometry", "odometry"), ("image", "camera")):
+            age = age_s(snapshot, name, state.changes)
+            if not age <= self.max_age_s:
+                return f"no {what} yet" if math.isinf(age) else f"{what} {age:.1f} s old"
+        return "odometry is not a pose" if pose is None else ""
+
+    def _move(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose) -> tuple[Command, VlnState]:
+        """Go on with a motion, or end it."""
+        assert state.motion is not None
+        motion = state.motion
+        speeds = Speeds(self.max_linear_speed, self.max_angular_speed, self.position_m, math.radians(self.angle_deg))
+        linear, angular, over = drive(motion, pose, speeds)
+        waypoint = motion.goal
+        late = snapshot.time_s - motion.began_s > self.motion_s
+        hit = motion.kind == FORWARD and self._ahead(snapshot) < self.clearance_m
+        if not over and (late or hit):
+            over, waypoint, linear, angular = True, pose, 0.0, 0.0
+        if over:
+            stamp = self._odometry_stamp(snapshot)
+            state = state._replace(motion=None, waypoint=waypoint, ended_s=snapshot.time_s, ended_stamp=stamp)
+            return self._stand(state._replace(detail="blocked on the way" if hit else "looking"))
+        return self._command(state._replace(detail=motion.kind), linear, angular), state
+
+    def _decide(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose) -> tuple[Command, VlnState]:
+        """Ask the policy, once there is a frame that was taken while the robot stood."""
+        if not self._has_settled(snapshot, state):
+            return self._stand(state._replace(detail="looking"))
+        if self.max_actions and len(state.actions) >= self.max_actions:
+            return self._stand(state._replace(phase=FAILED_PHASE, detail=f"no arrival in {self.max_actions} actions"))
+        image, problem = colours_of(snapshot.message("image", Image))
+        if image is None:
+            return self._stand(state._replace(phase=PAUSED_PHASE, detail=problem))
+        known = tuple(frame for frame in state.frames if frame.shape == image.shape)
+        frames = (*known, image)[-self._observed.frames :]
+        try:
+            index = choose(self.policy, observation(self._observed, frames, state.actions, state.instruction))
+            kind = self._motions[index]
+        except DeadlineMissed:
+            return self._stand(state._replace(detail="the policy is late"))
+        except (VlatoolError, IndexError) as error:
+            detail = error.message if isinstance(error, VlatoolError) else "the policy chose an action without a label"
+            return self._stand(state._replace(phase=FAILED_PHASE, detail=detail))
+        state = state._replace(frames=frames, actions=(*state.actions, index), waypoint=state.waypoint or pose)
+        return self._begin(snapshot, state, kind)
+
+    def _begin(self, snapshot: Snapshot, state: VlnState, kind: str) -> tuple[Command, VlnState]:
+        """Begin the motion of an action; nothing is driven at this step."""
+        over = state._replace(ended_s=snapshot.time_s, ended_stamp=self._odometry_stamp(snapshot))
+        if kind == STOP:
+            return self._stand(state._replace(phase=ARRIVED_PHASE, detail="by its stop label"))
+        if kind == WAIT:
+            return self._stand(over._replace(detail=WAIT))
+        if kind == FORWARD and self._ahead(snapshot) < self.forward_m + self.clearance_m:
+            return self._stand(over._replace(detail="blocked"))
+        assert state.waypoint is not None
+        motion = plan(kind, state.waypoint, math.radians(self.turn_deg), self.forward_m, snapshot.time_s)
+        return self._stand(state._replace(motion=motion, detail=kind if kind != BACKWARD else "backward"))
+
+    def _has_settled(self, snapshot: Snapshot, state: VlnState) -> bool:
+        """Whether the newest frame was taken after the last motion."""
+        if state.ended_s is None or snapshot.time_s - state.ended_s >= self.settle_s:
+            return True
+        image = snapshot.message("image", Image)
+        return image is not None and image.header.stamp.seconds > state.ended_stamp
+
+    def _odometry_stamp(self, snapshot: Snapshot) -> float:
+        odometry = snapshot.message("odometry", Odometry)
+        return odometry.header.stamp.seconds if odometry is not None else 0.0
+
+    def _ahead(self, snapshot: Snapshot) -> float:
+        """Return the depth of the way ahead in metres: the 5th percentile of the middle; infinity where unknown."""
+        depth, _ = depth_of(snapshot.message("depth", Image))
+        if depth is None or not depth.size:
+            return math.inf
+        rows, columns = depth.shape
+        half = max(round(columns * self.way_share / 2.0), 1)
+        middle = depth[rows // 4 : max(rows // 2, rows // 4 + 1), max(columns // 2 - half, 0) : columns // 2 + half]
+        known = middle[np.isfinite(middle)]
+        return float(np.percentile(known, 5)) if known.size else math.inf
+
+    def _stand(self, state: VlnState) -> tuple[Command, VlnState]:
+        return self._command(state, 0.0, 0.0), state
+
+    def _command(self, state: VlnState, linear: float, angular: float) -> Command:
+        text = f"{state.phase} {state.detail}".strip()
+        messages = {"cmd_vel": (twist(linear, angular),), "status": (String(text),)}
+        return Command(messages, status=text, notes={"actions": float(len(state.actions))})
