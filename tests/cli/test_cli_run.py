@@ -95,7 +95,7 @@ def test_a_policy_that_is_too_slow_for_its_deadline_ends_with_1(vlatool, speeds:
 
 @pytest.mark.parametrize(
     ("words", "code", "message"),
-    [((), 2, "There is no connection to a robot yet"),
+    [((), 2, "does not say which topics its inputs and actions are"),
      (("--dry-run", "--deadline-ms", 11), 2, "longer than the control"),
      (("--dry-run", "--robot", "no-robot"), 3, "no-robot"), (("--dry-run", "--robot", "ur5e"), 2, "has 2 elements"),
      (("--dry-run", "--deadline-ms", 0), 2, "deadline_ms is 0"),

@@ -41,6 +41,16 @@ def engines(incomplete: str) -> list[str]:
     return _starting(registry.names("engines"), incomplete)
 
 
+def buses(incomplete: str) -> list[str]:
+    """Return names of buses."""
+    return _starting(registry.names("buses"), incomplete)
+
+
+def worlds(incomplete: str) -> list[str]:
+    """Return names of simulated robots."""
+    return _starting(registry.names("worlds"), incomplete)
+
+
 def samples(incomplete: str) -> list[str]:
     """Return the shapes of policies that can be made."""
     return _starting((name.replace("_", "-") for name in registry.names("samples")), incomplete)

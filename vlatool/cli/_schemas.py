@@ -50,10 +50,12 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "verify-signature": ("signature",),
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
-    "run": ("dry_run",),
+    "run": ("controller_run", "planned_run", "dry_run"),
+    "sim": ("simulated_robot",),
+    "topics": ("bus_topics",),
     "serve": ("served",),
-    "record": ("recorded_run",),
-    "replay": ("replayed_run",),
+    "record": ("recorded_run", "recorded_bus"),
+    "replay": ("replayed_run", "replayed_controller"),
     "simulate": ("simulation",),
     "telemetry": ("telemetry",),
     "profiles list": ("profiles",),
@@ -132,10 +134,46 @@ def definitions(report: Schema) -> dict[str, Schema]:
         },
         "profile": {**_inlined(Profile.model_json_schema(mode="serialization")), "description": "A hardware profile."},
         **_documents_of_bundles(),
+        **_documents_of_robots(),
         **_documents_of_stores(),
         **_documents_of_deployment(),
         **_documents_of_machines(),
     }
+
+
+def _documents_of_robots() -> dict[str, Schema]:
+    """Return the documents about robot controllers, buses and simulated robots."""
+    end = record(name=TEXT, topic=TEXT, type=TEXT)
+    texts = many(TEXT)
+    return {
+        "controller_run": document(
+            "A run of a robot controller; times of its steps in ms.",
+            controller=TEXT, node=TEXT, topics=by_name(TEXT), steps=INTEGER, skipped=INTEGER, seconds=NUMBER,
+            status=TEXT, late_ms=SPREAD, compute_ms=SPREAD, overhead_ms=SPREAD, overwritten=by_name(INTEGER), lost_records=INTEGER,
+            log_full=FLAG, failure=TEXT,
+        ),
+        "planned_run": document(
+            "What a run of a robot controller would be.", controller=TEXT, node=TEXT, rate_hz=NUMBER, inputs=many(end),
+            outputs=many(end), services=many(end), settings=ANY_OBJECT,
+        ),
+        "simulated_robot": document(
+            "What a simulated robot did.", robot=TEXT, seconds=NUMBER, reports=INTEGER, commands=INTEGER,
+            behind_s=NUMBER, truth=ANY_OBJECT,
+        ),
+        "bus_topics": document("Topics on a bus.", bus=TEXT, topics=many(record(
+            topic=TEXT, types=texts, publishers=texts, subscribers=texts, messages=INTEGER, hz=NUMBER, age_ms=NUMBER,
+            problems=texts))),
+        "recorded_bus": document(
+            "A bag of a bus: topic -> messages, and why topics are not in it.", file=TEXT, messages=by_name(INTEGER),
+            unknown=by_name(TEXT), seconds=NUMBER,
+        ),
+        "replayed_controller": document(
+            "Steps of a controller that were computed again; note: why the replay ends before the recording.",
+            steps=INTEGER, messages=INTEGER, differing=INTEGER, unused=INTEGER, unheard=INTEGER, note=TEXT, equal=FLAG,
+            difference={"anyOf": [{"type": "null"}, record(
+                step=INTEGER, output=TEXT, index=INTEGER, recorded=TEXT, computed=TEXT)]},
+        ),
+    }  # fmt: skip
 
 
 def _documents_of_bundles() -> dict[str, Schema]:

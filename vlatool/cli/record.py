@@ -7,22 +7,50 @@ from typing import Annotated
 
 import typer
 
+from vlatool.cli import _complete
 from vlatool.cli._document import answer
 from vlatool.cli._options import (
     AsJson,
     BundleEngine,
-    BundlePath,
     Controllers,
     Neutral,
     RobotName,
     StepDeadline,
     Threads,
 )
+from vlatool.cli._signals import stopped_by_signals
+from vlatool.errors import UsageError
+from vlatool.files.printable import printable
+
+NODE = "vlatool_record"
 
 
 def record(
-    bundle: BundlePath,
-    output: Annotated[Path, typer.Option("-o", "--output", help="new file", show_default=False)],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="new file; NAME.mcap, NAME.db3 or NAME.bag of a bus", show_default=False),
+    ],
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="BUNDLE|TOPIC...",
+            help="a bundle; with --bus topics, all when none is named",
+            show_default=False,
+            autocompletion=_complete.bundles,
+        ),
+    ] = None,
+    bus: Annotated[
+        str,
+        typer.Option(
+            "--bus",
+            metavar="BUS[:ADDRESS]",
+            help="bus whose topics are recorded, to a bag",
+            autocompletion=_complete.buses,
+        ),
+    ] = "",
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="with --bus: end after so many seconds; at Ctrl-C when not given")
+    ] = None,
     robot: RobotName = "",
     deadline_ms: StepDeadline = None,
     fallback: Annotated[
@@ -36,14 +64,22 @@ def record(
     seed: Annotated[int, typer.Option(min=0, help="seed of the noise")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Record control steps of a bundle and its layers on this machine, to compute them again with replay.
+    """Record control steps of a bundle on this machine, or the topics of a bus, to compute them again with replay.
 
-    No robot moves; on a robot, load(..., record=FILE) records the same.
+    Of a bundle, no robot moves; on a robot, load(..., record=FILE) records the same. Of a bus, start it before the
+    controller, so that the first step is in the bag.
     """
+    words = what or []
+    if bus:
+        _record_bus(bus, output, words, seconds, as_json)
+        return
+    if len(words) != 1:
+        raise UsageError(f"{len(words)} bundles are named to record; allowed: one, or topics with --bus.",
+                         "name a bundle, or pass --bus BUS")  # fmt: skip
     from vlatool.measurement.recorded_run import record_run
 
     found = record_run(
-        bundle,
+        Path(words[0]),
         output,
         robot=robot,
         deadline_ms=deadline_ms,
@@ -56,3 +92,30 @@ def record(
         seed=seed,
     )
     answer(as_json, found.to_dict(), [f"{found.file}: {found.steps} control steps, {found.bytes / 1e6:.3g} MB"])
+
+
+def _record_bus(bus: str, output: Path, topics: list[str], seconds: float | None, as_json: bool) -> None:
+    """Record topics of a bus to a new bag."""
+    from vlatool.buses import open_bus
+    from vlatool.nodes.bus_recorder import BusRecorder, RecordSummary
+
+    if not str(output).strip() or ":" in str(output):
+        raise UsageError(f"The bag '{output}' has a colon in its name, which separates bags.", "name it without one")
+    opened = open_bus(bus, NODE)
+    summary = RecordSummary()
+    try:
+        bag = open_bus(f"bag::{output}", NODE)
+        try:
+            recorder = BusRecorder(opened, bag, NODE, topics)
+            summary = recorder.summary
+            with stopped_by_signals(recorder.stop):
+                recorder.run(seconds)
+        finally:
+            bag.close()
+    finally:
+        opened.close()
+    lines = [f"{output}: {sum(summary.messages.values())} messages of {len(summary.messages)} topics in "
+             f"{summary.seconds:.1f} s"]  # fmt: skip
+    lines += [f"  {topic}  {count}" for topic, count in sorted(summary.messages.items())]
+    lines += [f"  {topic} is not recorded: {why}" for topic, why in sorted(summary.unknown.items())]
+    answer(as_json, {"file": str(output), **vars(summary)}, map(printable, lines))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vlatool.cli._controllers import BUNDLE, ControllerGroup
 from vlatool.cli._document import answer
 from vlatool.cli._options import (
     AsJson,
@@ -24,6 +25,15 @@ if TYPE_CHECKING:
     from vlatool.measurement.dry_run import DryRun
 
 
+app = typer.Typer(cls=ControllerGroup, no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.callback()
+def _group() -> None:
+    """Run a robot controller on a bus; or show the layers between a bundle and a robot (--dry-run)."""
+
+
+@app.command(BUNDLE)
 def run(
     bundle: BundlePath,
     robot: RobotName = "",
@@ -48,8 +58,8 @@ def run(
     """
     if not dry_run:
         raise UsageError(
-            "There is no connection to a robot yet: vlatool cannot send the actions anywhere.",
-            "add --dry-run to see the layers and their times; on the robot, call vlatool.load(..., deadline_ms=...)",
+            "A bundle alone does not say which topics its inputs and actions are.",
+            "run it by a controller: vlatool run policy --bundle BUNDLE --bus BUS; or add --dry-run to see the layers",
         )
     from vlatool.measurement.dry_run import dry_run as measure
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +12,7 @@ import typer
 
 from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson, BundleEngine, BundlePath, Threads
+from vlatool.cli._signals import stopped_by_signals
 from vlatool.errors import DataError, UsageError
 from vlatool.files.printable import one_line, printable
 
@@ -148,7 +147,7 @@ def _serve(
     stop = threading.Event()
     started: list[Endpoint] = []
     addresses: dict[str, str] = {}
-    with _stopped_by_signals(stop):
+    with stopped_by_signals(stop.set):
         try:
             for name, port in chosen.items():
                 kind: Any = registry.load("serving", name)
@@ -163,30 +162,6 @@ def _serve(
             for endpoint in started:
                 endpoint.close()
     return addresses
-
-
-@contextlib.contextmanager
-def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM and SIGHUP set an event; a second one ends the process as always."""
-    before: dict[int, Any] = {}
-
-    def end(number: int, frame: object) -> None:
-        stop.set()
-        _restore(before)
-
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                before[number] = signal.signal(number, end)
-    try:
-        yield
-    finally:
-        _restore(before)
-
-
-def _restore(handlers: dict[int, Any]) -> None:
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
 
 
 def _lines(found: dict[str, Any]) -> Sequence[str]:

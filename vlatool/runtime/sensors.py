@@ -9,6 +9,7 @@ a clock that is set back by less than a minute: its samples count as late from t
 
 from __future__ import annotations
 
+import copy
 import math
 import numbers
 import time
@@ -167,6 +168,13 @@ class SensorBuffer:
     def _sample(self, index: int) -> Sample:
         return Sample(self._values[index], self._times[index], self._times[index])
 
+    def copy(self, clock: Callable[[], float]) -> SensorBuffer:
+        """Return a buffer with the same samples, which goes its own way from now on, by a clock of its own."""
+        other = SensorBuffer(self.limits, clock)
+        other.dropped, other._offset = self.dropped, self._offset.copy()
+        other._times, other._values, other._seen = [*self._times], [*self._values], dict(self._seen)
+        return other
+
     @property
     def newest(self) -> float | None:
         """When the newest sample was measured, by the monotonic clock; None without samples."""
@@ -192,6 +200,12 @@ class _Offset:
         self._least: float | None = None
         self._at = 0.0
         self._settling: list[tuple[float, float]] = []
+
+    def copy(self) -> _Offset:
+        """Return the same, which goes its own way from now on."""
+        other = _Offset(self._gap_s, self._settle_s)
+        vars(other).update({**vars(self), "_settling": [*self._settling]})
+        return other
 
     def lateness(self, stamp: float, arrival: float) -> float | None:
         """Return the seconds that a sample took longer than the fastest; None while the clock settles."""
@@ -261,6 +275,12 @@ class Sensors:
                              'pass {"state": SensorLimits(stale_s=0.1)}')  # fmt: skip
         self.buffers = {name: SensorBuffer(each, clock) for name, each in limits.items()}
         self._skew_s, self._clock = skew_s, clock
+
+    def copy(self, clock: Callable[[], float]) -> Sensors:
+        """Return buffers with the same samples, which go their own way from now on, by a clock of their own."""
+        other = copy.copy(self)
+        other.buffers, other._clock = {name: each.copy(clock) for name, each in self.buffers.items()}, clock
+        return other
 
     def add(self, name: str, value: Any, stamp: float | None = None, arrival: float | None = None) -> bool:
         """Keep a sample of a sensor; see ``SensorBuffer.add``.

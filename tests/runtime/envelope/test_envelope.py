@@ -22,7 +22,7 @@ from _envelope_judge import excesses
 
 import vlatool.runtime.envelope as package
 from vlatool.errors import DataError, UsageError
-from vlatool.runtime.envelope import Box, Envelope, JointLimits, Level, Monitor, RobotLimits
+from vlatool.runtime.envelope import Box, Envelope, JointLimits, KeepApart, Level, Monitor, RobotLimits
 
 T = 0.02
 SLIDE = RobotLimits("slide", (JointLimits("x", "m", 0.0, 1.0, (-0.5, 0.5), 2.0, 40.0),))
@@ -306,6 +306,15 @@ def gripper(make: Make) -> None:
     assert envelope.step(None, elapsed_s=T).command == (0.05, 0.1)
 
 
+def apart(make: Make) -> None:
+    """A command, or a stop behind one, that would bring parts too near is answered with the stop; one away is not."""
+    keep = KeepApart(lambda positions: 0.9 - positions[:, 0], 0.4)
+    envelope = make(SLIDE, T, apart=keep)
+    envelope.start([0.4999])
+    assert envelope.step([0.50001], elapsed_s=T).checks == ("apart",)
+    assert envelope.step([0.4998], elapsed_s=T).checks == ()
+
+
 def attacks(
     limits: RobotLimits, mode: str, kinds: tuple[str, ...] = tuple(KINDS), steps: int = 600
 ) -> Callable[[Make], None]:
@@ -327,6 +336,7 @@ SCENARIOS: dict[str, Callable[[Make], None]] = {
     for scenario in (
         finite, fresh, contract, discontinuity, start, moving_start, late, missed, dead_man, internal, keep_out,
         readings, name_of_a_check, base_while_moving, escalation, clock, bands, behind, gripper,
+        apart,
     )
 } | {
     "positions": attacks(SLIDE, "absolute", HARD),
@@ -359,6 +369,7 @@ MUTATIONS: tuple[tuple[str, str, str, str], ...] = (
     ("internal", "envelope", "        if self._emergency:\n", "        if False:\n"),
     ("keep_out", "envelope", "if self._boxes and self._enters_box(samples):", "if False:"),
     ("keep_out", "axis", "high if high > last else last)", "value)"),
+    ("apart", "envelope", "if self.apart is not None and not", "if False and not"),
     ("readings", "monitor", "if not _is_finite(reading):", "if False:"),
     ("readings", "envelope", "axis.scale_velocity(scale)", "pass"),
     ("name_of_a_check", "envelope", "tuple(sent if slowed else values)", "tuple(values)"),

@@ -127,7 +127,7 @@ class PositionAxis:
 
     def at_rest(self) -> bool:
         """Return whether the stop that is proven has ended."""
-        return self.elapsed >= sum(self._stop_phases()[:3])
+        return self.elapsed >= sum(self.stop_phases()[:3])
 
     def is_discontinuity(self, value: float, tick: Tick) -> bool:
         """Return whether a command is farther from the last one than the axis could go in a few periods.
@@ -151,7 +151,7 @@ class PositionAxis:
 
     def stop(self, tick: Tick) -> Sample:
         """Return the next sample of the proven stop."""
-        value = stop_state(*self.start, self._stop_phases(), self.elapsed + tick.interval)[0]
+        value = stop_state(*self.start, self.stop_phases(), self.elapsed + tick.interval)[0]
         velocity = (value - self.value) * tick.first
         acceleration = (velocity - self.velocity) * tick.second
         return Sample(value, velocity, acceleration, None, self.lowest, self.highest)
@@ -164,7 +164,8 @@ class PositionAxis:
         if start is not None:
             self.start, self.elapsed, self.phases = start, 0.0, None
 
-    def _stop_phases(self) -> Phases:
+    def stop_phases(self) -> Phases:
+        """Return the phases of the stop that is proven, from ``start`` on."""
         if self.phases is None:
             _, velocity, acceleration = self.start
             self.phases = stop_phases(velocity, acceleration, self.max_acceleration, self.max_jerk)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
@@ -13,6 +14,7 @@ from vlatool.errors import DataError, UsageError
 from vlatool.files.validate import short_repr
 from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.envelope.axis import PositionAxis, Sample, Tick
+from vlatool.runtime.envelope.keep_apart import KeepApart
 from vlatool.runtime.envelope.limits import JointLimits, RobotLimits
 from vlatool.runtime.envelope.monitor import Level, Monitor
 from vlatool.runtime.envelope.range_axis import RangeAxis
@@ -47,10 +49,10 @@ class Envelope:
     """Bounds the commands of a robot, so that at each step a stop within its limits is known.
 
     In this order: finite, fresh (age, sequence), contract (shape, dtype), absolute position from the *commanded* state,
-    workspace and keep-out boxes, position, velocity, acceleration, jerk, and a stop that is proven to stay within all
-    of them. A command within the limits passes unchanged. One that is near is slowed, each joint by itself. One that is
-    beyond (a discontinuity, not finite, stale, of another shape) is rejected: the robot follows the stop that was
-    proven last. So it does when a check raises, and when no command comes.
+    workspace, keep-out boxes and distances to keep, position, velocity, acceleration, jerk, and a stop that is proven
+    to stay within all of them. A command within the limits passes unchanged. One that is near is slowed, each joint by
+    itself. One that is beyond (a discontinuity, not finite, stale, of another shape) is rejected: the robot follows the
+    stop that was proven last. So it does when a check raises, and when no command comes.
 
     The state belongs to the robot, not to a policy: keep one envelope for each robot across chunks, episodes, fallbacks
     and policies. It is not a safety-rated function, and limits of velocity and acceleration do not bound torque.
@@ -67,6 +69,8 @@ class Envelope:
         max_age_s: age from which a command is stale; None if ages are not given.
         dead_man: whether each step needs ``enabled=True``.
         escalate_after: rejected steps in a row that become an emergency; 0 for never.
+        apart: distance that parts of the robot keep, such as its two arms: neither a command nor the stop behind it
+            brings them nearer.
         clock: returns seconds.
 
     Raises:
@@ -94,6 +98,7 @@ class Envelope:
         max_age_s: float | None = None,
         dead_man: bool = False,
         escalate_after: int = 0,
+        apart: KeepApart | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         for name, value in (("period_s", period_s), ("near", near)):
@@ -114,6 +119,12 @@ class Envelope:
         self._relative = [mode == "delta" and type(axis) is PositionAxis for axis in self._axes]
         self._check_names(monitors)
         self._boxes = [_sides(limits, box.low, box.high) for box in limits.keep_out]
+        self.apart = apart
+        if apart is not None and any(isinstance(axis, VelocityAxis) for axis in self._axes):
+            raise UsageError(
+                "Distances are kept along positions, and a joint takes velocities.",
+                "command positions, or pass no apart",
+            )
         self.ready = False
         """Whether the envelope was started."""
         self._emergency: tuple[str, ...] = ()
@@ -181,6 +192,12 @@ class Envelope:
         except Exception as error:  # whatever a check raises, the robot stops
             self._emergency = ("internal", type(error).__name__)
             return self._stop(interval or self.period_s, self._emergency)
+
+    def copy(self) -> Envelope:
+        """Return an envelope that goes on from here by itself, as this one would."""
+        twin = copy.copy(self)
+        twin._axes = [copy.copy(axis) for axis in self._axes]
+        return twin
 
     def emergency(self, reason: str = "emergency") -> None:
         """Stop the robot, from the next step until ``clear``."""
@@ -289,6 +306,8 @@ class Envelope:
             samples.append(sample)
         if self._boxes and self._enters_box(samples):
             return self._reject(interval, (*checks, "keep-out"))
+        if self.apart is not None and not self.apart.allows(self._axes, samples, interval):
+            return self._reject(interval, (*checks, "apart"))
         self._rejections = 0
         sent = self._commit(samples, interval)
         for axis, wanted in slowed:

@@ -31,7 +31,7 @@ class VelocityAxis(PositionAxis):
 
     def stop(self, tick: Tick) -> Sample:
         """Return the next sample of the proven stop."""
-        value = stop_state(*self.start, self._stop_phases(), self.elapsed + tick.interval)[1]
+        value = stop_state(*self.start, self.stop_phases(), self.elapsed + tick.interval)[1]
         return Sample(value, value, (value - self.value) * tick.first, None, self.lowest, self.highest)
 
     def commit(self, sample: Sample, interval: float) -> None:

@@ -1,0 +1,115 @@
+"""A run from its plan to its summary, over the bus of one process."""
+
+from __future__ import annotations
+
+import json
+import threading
+from dataclasses import replace
+
+import pytest
+
+from tests._point_robot import GoTo, PointWorld
+from vlatool import registry
+from vlatool.buses import QoS, open_bus
+from vlatool.errors import BusError, OutputError, UsageError
+from vlatool.messages.geometry_msgs import Twist
+from vlatool.messages.std_msgs import String
+from vlatool.nodes import session
+from vlatool.nodes.launch import PolicyOptions
+from vlatool.nodes.replay import replay
+from vlatool.nodes.run_log import read_log
+from vlatool.nodes.session import RunPlan, dry_run, run_on_bus
+from vlatool.nodes.world_node import WorldNode
+
+
+@pytest.fixture
+def plan(monkeypatch, request):
+    load = registry.load
+    monkeypatch.setattr(registry, "load", lambda kind, name: GoTo if name == "go-to" else load(kind, name))
+    return RunPlan("go-to", {"rate_hz": 50, "goal_x": 0.05, "goal_y": 0}, bus=f"sim:{request.node.name}", seconds=0.6,
+                   wait_s=0.3, settle_s=0.0)  # fmt: skip
+
+
+@pytest.fixture
+def world(plan):
+    bus = open_bus(plan.bus, "robot")
+    node = WorldNode(PointWorld(), bus)
+    thread = threading.Thread(target=node.run)
+    thread.start()
+    yield node.world
+    node.stop()
+    thread.join()
+    bus.close()
+
+
+def test_run_moves_the_robot_and_its_log_is_replayed(plan, world, tmp_path):
+    ended = []
+    plan = replace(plan, record=tmp_path / "log", instruction="go there")
+    result = run_on_bus(plan, on_end=lambda *what: ended.append(what))
+    assert world.truth()["x"] == pytest.approx(0.05, abs=0.04)
+    found = result.to_dict()
+    assert (found["controller"], found["node"], found["lost_records"], found["failure"]) == (
+        "go-to",
+        "vlatool_go_to",
+        0,
+        "",
+    )
+    assert found["steps"] + found["skipped"] >= 25
+    assert ended[0][0] is result
+    assert ended[0][1].steps == found["steps"]
+    assert ended[0][1].points[-1].notes["seen"] == 1.0
+    again = replay(GoTo(**plan.settings), read_log(tmp_path / "log"), None)
+    assert (again.equal, again.steps, again.note) == (True, found["steps"], "")
+    json.dumps(found, allow_nan=False)
+
+
+def test_without_a_robot_it_waits_and_says_so(plan):
+    with pytest.warns(UserWarning, match="nobody publishes /odom yet"):
+        result = run_on_bus(replace(plan, seconds=0.1))
+    assert result.summary.status == "waiting for /odom"
+
+
+def test_refusals_come_before_the_bus(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(session, "open_bus", lambda *_: pytest.fail("the bus was opened"))
+    (tmp_path / "there").touch()
+    for changes, error, words in (
+        ({"bus": ""}, UsageError, "No bus is named"),
+        ({"record": tmp_path / "there"}, OutputError, "exists already"),
+        ({"report": tmp_path / "there"}, OutputError, "exists already"),
+        ({"record": tmp_path / "no" / "log"}, OutputError, "is not a directory"),
+        ({"settings": {"goal": 1}}, UsageError, "has no setting 'goal'; did you mean 'goal_y'"),
+        ({"settings": {"goal_x": "far"}}, UsageError, "the setting 'goal_x' is 'far'; allowed: a number"),
+        ({"settings": {"words": "a"}}, UsageError, "allowed: a list, each text"),
+        ({"settings": {"rough": 1}}, UsageError, "allowed: true or false"),
+        ({"policy": PolicyOptions(tmp_path)}, UsageError, "takes no policy"),
+        ({"controller": "vln", "settings": {}}, UsageError, "needs a policy"),
+        ({"controller": "go_too", "settings": {}}, UsageError, "Unknown robot controller 'go_too'"),
+    ):
+        with pytest.raises(error, match=words):
+            run_on_bus(replace(plan, **changes))
+
+
+def test_refusals_of_the_bus(plan):
+    bus = open_bus(plan.bus, "teleop")
+    bus.publisher("/cmd_vel", Twist, QoS())
+    with pytest.raises(BusError, match="/cmd_vel has the publisher teleop already"):
+        run_on_bus(plan)
+    bus.publisher("/words", String, QoS())
+    with pytest.raises(BusError, match="/words carries std_msgs/msg/String"):
+        run_on_bus(replace(plan, shared=True, topics={"odom": "/words"}))
+    with pytest.warns(UserWarning, match="nobody"):
+        run_on_bus(replace(plan, shared=True, seconds=0.05))
+    bus.close()
+
+
+def test_instruction_needs_an_input(plan):
+    with pytest.raises(UsageError, match="takes no instruction"):
+        run_on_bus(replace(plan, controller="roi-tracker", settings={}, instruction="go"))
+
+
+def test_dry_run_says_what_would_run(plan):
+    found = dry_run(replace(plan, bus="", topics={"odom": "/a"}))
+    assert found["rate_hz"] == 50
+    assert found["inputs"][0] == {"name": "odom", "topic": "/a", "type": "nav_msgs/msg/Odometry"}
+    assert found["services"] == [{"name": "halt", "topic": "/halt", "type": "std_msgs/msg/Bool"}]
+    assert found["settings"]["goal_x"] == 0.05
