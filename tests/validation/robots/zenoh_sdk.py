@@ -14,12 +14,14 @@ import subprocess
 import sys
 import venv
 from pathlib import Path
+from typing import Any, cast
 
 from _bus_trials import Row, finish, picture_to_twist, there_and_back
 
 from vlatool.buses import open_bus
 from vlatool.messages.geometry_msgs import Twist
-from vlatool.messages.type_hash import rihs01
+from vlatool.messages.std_srvs import SetBoolRequest, SetBoolResponse
+from vlatool.messages.type_hash import rihs01, service_rihs01
 
 HERE = Path(__file__).parent
 OUT = Path("out/robots/zenoh-sdk")
@@ -46,8 +48,11 @@ def install() -> Path:
 def sdk_trials(python: Path, count: int) -> list[Row]:
     """Twists there and back, what each side lists of the other, and hashes."""
     bus = open_bus(f"zenoh:router/tcp/127.0.0.1:{PORT}", "trial")
+    bus.serve(
+        "/vlatool_set", SetBoolRequest, SetBoolResponse, lambda ask: SetBoolResponse(cast(Any, ask).data, "by vlatool")
+    )
     peer = subprocess.Popen(
-        [str(python), str(HERE / "zenoh_sdk_peer.py"), str(PORT)],
+        [str(python), str(HERE / "zenoh_sdk_peer.py"), str(PORT), service_rihs01(SetBoolRequest, SetBoolResponse)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert peer.stdin
@@ -62,6 +67,13 @@ def sdk_trials(python: Path, count: int) -> list[Row]:
             peer.stdin.flush()
             seen = sorted(node for node, *_ in json.loads(peer.stdout.readline()))
             rows.append(Row(f"nodes that the sdk lists on {topic}", ", ".join(seen), seen == ["sdk_node", "trial"]))
+        answers = [bus.call("/sdk_set", SetBoolRequest(bool(n % 2)), SetBoolResponse, 5.0) for n in range(100)]
+        right = sum((one.success, one.message) == (bool(n % 2), "by the sdk") for n, one in enumerate(answers))
+        rows.append(Row("SetBool of the sdk, called by vlatool", f"{right} of 100", right == 100))
+        peer.stdin.write("call 100\n")
+        peer.stdin.flush()
+        right = int(peer.stdout.readline())
+        rows.append(Row("SetBool of vlatool, called by the sdk", f"{right} of 100", right == 100))
         ours = {info.topic: info for info in bus.topics()}
         nodes = [*ours["/to_peer"].subscribers, *ours["/from_peer"].publishers]
         rows.append(Row("nodes that vlatool lists", ", ".join(nodes), nodes == ["sdk_node", "sdk_node"]))
