@@ -93,8 +93,14 @@ def test_it_holds_what_load_imports_and_nothing_else():
     listed = SETTINGS["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert {source.removeprefix("../") for source in listed} == set(listed.values())
     files = {file for name in listed.values() for file in [ROOT / name, *(ROOT / name).rglob("*.py")] if file.is_file()}
-    rooms = (ROOT / "vlatool/runtime", ROOT / "vlatool/deployment")
-    reached, left = set(), {file for room in rooms for file in room.rglob("*.py")} | {ROOT / "vlatool/__main__.py"}
+    rooms = [ROOT / "vlatool" / name for name in ("runtime", "deployment", "messages", "buses", "controllers")]
+    starts = {ROOT / "vlatool/__main__.py", ROOT / "vlatool/nodes/session.py", ROOT / "vlatool/nodes/topic_survey.py"}
+    starts |= {
+        ROOT / "vlatool/nodes/bus_recorder.py",
+        ROOT / "vlatool/nodes/replay.py",
+        ROOT / "vlatool/nodes/recordings.py",
+    }
+    reached, left = set(), {file for room in rooms for file in room.rglob("*.py")} | starts
     while left:
         file = left.pop()
         names = imported_by(file) - {"vlatool.cli"}
@@ -109,7 +115,17 @@ def test_it_asks_for_numpy_alone_and_for_the_engines_that_vlatool_takes():
     project = SETTINGS["project"]
     assert project["dependencies"] == [line for line in whole["dependencies"] if line.startswith("numpy")]
     assert project["optional-dependencies"].items() <= whole["optional-dependencies"].items()
-    assert set(project["optional-dependencies"]) == {"ort", "cuda", "openvino", "text", "sign", "remote"}
+    assert set(project["optional-dependencies"]) == {
+        "ort",
+        "cuda",
+        "openvino",
+        "text",
+        "sign",
+        "remote",
+        "zenoh",
+        "dds",
+        "bags",
+    }
 
 
 def test_its_files_are_those_of_the_whole_wheel(wheels: dict[str, Path]):
