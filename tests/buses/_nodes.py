@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -148,6 +150,19 @@ class NetworkBus:
             assert caller.call("/trigger", TriggerRequest(), TriggerResponse, WAIT_S).message == "done"
             with pytest.raises(BusError, match=r"Nobody served /none within 0.05 s"):
                 caller.call("/none", TriggerRequest(), TriggerResponse, 0.05)
+
+    def test_two_requests_are_answered_at_once(self, open_node: Open) -> None:
+        both = threading.Barrier(2)
+
+        def handler(ask: Any) -> SetBoolResponse:
+            both.wait(WAIT_S)
+            return SetBoolResponse(ask.data, "met")
+
+        with opened(open_node, "robot", "caller") as (robot, caller), ThreadPoolExecutor(2) as callers:
+            robot.serve("/meet", SetBoolRequest, SetBoolResponse, handler)
+            asked = [SetBoolRequest(True), SetBoolRequest(False)]
+            calls = [callers.submit(caller.call, "/meet", ask, SetBoolResponse, WAIT_S) for ask in asked]
+            assert [call.result().success for call in calls] == [True, False]
 
     def test_service_that_raises_goes_on(self, open_node: Open) -> None:
         def handler(ask: Any) -> SetBoolResponse:

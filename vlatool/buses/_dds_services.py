@@ -37,10 +37,14 @@ def serve_requests(
     handler: Callable[[Message], M],
     faults: Faults,
 ) -> tuple[bytes, bytes]:
-    """Answer a service until the endpoints are closed; return the identifiers of its reader and its writer."""
+    """Answer a service, each request in a thread, until the endpoints are closed.
+
+    Returns:
+        The identifiers of its reader and its writer.
+    """
     write = endpoints.writer(f"rr{service}Reply", describe_service_part(response), SERVICE_QOS, rihs01(response))
 
-    def handle(data: bytes, _: float) -> None:
+    def answer_request(data: bytes) -> None:
         try:
             header, asked = _split(data, request)
             answer = encode(handler(asked))
@@ -48,6 +52,9 @@ def serve_requests(
             write(HEADER + header + answer[len(HEADER) :])
         except Exception as error:  # a handler may raise anything; the bus goes on
             faults.add_raised(service, error)
+
+    def handle(data: bytes, _: float) -> None:
+        threading.Thread(target=answer_request, args=(data,), name=f"vlatool {service}", daemon=True).start()
 
     topic = f"rq{service}Request"
     reader = endpoints.reader(topic, describe_service_part(request), SERVICE_QOS, rihs01(request), handle)

@@ -99,7 +99,7 @@ class Dds:
         return send
 
     def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
-        """Answer a service, one request at a time, in a thread of the service."""
+        """Answer a service, each request in a thread of its own."""
         name = full_name(service, self._node)
         self._check_open(name)
         reader, writer = serve_requests(self._endpoints, name, request, response, handler, self._faults)

@@ -108,7 +108,7 @@ class Zenoh:
         return send
 
     def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
-        """Answer a service, one request at a time, in a thread of the service."""
+        """Answer a service, each request in a thread of its own."""
         name = full_name(service, self._node)
         type_name, type_hash = _service_type(request, response)
         key = data_key(self._domain, name, type_name, type_hash)
@@ -122,7 +122,10 @@ class Zenoh:
                     self._faults.add_raised(name, error)
                     query.reply_err(str(error).encode())
 
-        self._keep(self._session.declare_queryable(key, answer, complete=True))
+        def hear(query: Any) -> None:
+            threading.Thread(target=answer, args=(query,), name=f"vlatool {name}", daemon=True).start()
+
+        self._keep(self._session.declare_queryable(key, hear, complete=True))
         self._announce(SERVICE, name, type_name, type_hash, SERVICE_QOS)
 
     def call(self, service: str, request: Message, response: type[M], timeout_s: float) -> M:
