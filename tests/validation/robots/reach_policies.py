@@ -129,6 +129,7 @@ class Hostile:
         self.random, self.kind, self.count = np.random.default_rng(seed), KINDS[seed % len(KINDS)], 0
         joints = robot.limits(built.speed).joints
         self.low, self.high = (np.array([joint.bounds[side] for joint in joints]) for side in (0, 1))
+        self.beyond = np.where([joint.command == "range" for joint in joints], 0.0, 0.1)  # farther is a discontinuity
         self.step = np.array([joint.velocity[1] or 1.0 for joint in joints]) / built.rate
         self.goal, self.asked, self.late = self.high, self.low, [self.low]
 
@@ -141,7 +142,7 @@ class Hostile:
         if self.count % 150 == 0 or np.abs(self.asked - state).max() > 0.5:
             self.asked = state
         if self.count % int(random.integers(5, 90)) == 0:
-            ends = np.where(random.random(len(state)) < 0.5, self.low - 0.1, self.high + 0.1)
+            ends = np.where(random.random(len(state)) < 0.5, self.low - self.beyond, self.high + self.beyond)
             self.goal = ends if self.kind != "random" else random.uniform(self.low, self.high)
         self.count += 1
         step = self.step * (random.uniform(0.1, 2.5) if self.kind != "bang-bang" else 2.5)
