@@ -123,8 +123,12 @@ def commands(words: tuple[str, ...] = (), current: Any = None) -> Iterator[str]:
 
 ONE_OF_MANY = {"run": ("bundle", "roi-tracker"), "sim": ("turtlebot4",)}
 """Groups whose commands one function makes, from a class each -> those that stand for all."""
-ALL = [command for command in commands()
-       if command.partition(" ")[2] in ONE_OF_MANY.get(command.partition(" ")[0], (command.partition(" ")[2],))]  # fmt: skip
+ALL = [
+    command
+    for command in commands()
+    for group, _, name in [command.partition(" ")]
+    if name in ONE_OF_MANY.get(group, (name,))
+]
 ALIKE = {"export opset", "prune sparsegpt", "prune structured", "prune wanda", "quantize dynamic-int8",
          "quantize float16", "quantize smooth-quant"}  # fmt: skip
 """Commands that write their bundle and its document as others of their group do."""
