@@ -200,7 +200,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
 
 def test_an_absent_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
-    with pytest.raises(MissingExtra, match=r"rosbags.*data"):
+    with pytest.raises(MissingExtra, match=r"rosbags.*bags"):
         Bag(f":{tmp_path}/new", "node")
 
 

@@ -292,3 +292,34 @@ def test_a_goal_is_canceled_by_its_client_by_a_newer_one_and_by_the_end(node: No
     robot.close()
     assert last.result(WAIT_S).status == GOAL_CANCELED
     assert traceback == ["no such place"]
+
+
+def test_nodes_that_come_and_go_in_several_threads_block_nobody(request: pytest.FixtureRequest) -> None:
+    address, failures = request.node.nodeid, []
+
+    def live(seed: int) -> None:
+        draw = np.random.default_rng(seed)
+        try:
+            for step in range(40):
+                bus = Sim(address, f"node_{seed}_{step}")
+                bus.subscribe("/cmd_vel", Twist, lambda each: None, QoS(depth=2))
+                bus.serve(f"/ask_{seed}", String, Bool, lambda each: Bool(True))
+                send = bus.publisher("/cmd_vel", Twist, QoS(latched=True))
+                for number in range(int(draw.integers(5))):
+                    send(numbered(number))
+                assert bus.call(f"/ask_{seed}", String(), Bool, WAIT_S).data
+                assert bus.topics()[0].topic == "/cmd_vel"
+                bus.close()
+        except Exception as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=live, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(WAIT_S)
+    assert not any(thread.is_alive() for thread in threads)
+    assert not failures
+    last = Sim(address, "last")
+    assert last.topics() == []
+    last.close()

@@ -88,7 +88,10 @@ LINES = {
     "sign": "{toy} --key {key} --force",
     "verify-signature": "{toy} --key {key}.pub",
     "doctor": "",
-    "run": "{bundle} --dry-run --steps 20",
+    "run bundle": "{bundle} --dry-run --steps 20",
+    "run": "--bus sim --seconds 0.1 --wait 0",
+    "sim": "--bus sim --seconds 0.1 --only odom",
+    "topics": "--bus sim --seconds 0",
     "serve": "{bundle} --port 0 --seconds 0.1",
     "record": "{bundle} -o {out} --steps 2",
     "replay": "{recorded} {bundle}",
@@ -118,7 +121,14 @@ def commands(words: tuple[str, ...] = (), current: Any = None) -> Iterator[str]:
         yield from commands((*words, name), current.get_command(None, name))
 
 
-ALL = list(commands())
+ONE_OF_MANY = {"run": ("bundle", "roi-tracker"), "sim": ("turtlebot4",)}
+"""Groups whose commands one function makes, from a class each -> those that stand for all."""
+ALL = [
+    command
+    for command in commands()
+    for group, _, name in [command.partition(" ")]
+    if name in ONE_OF_MANY.get(group, (name,))
+]
 ALIKE = {"export opset", "prune sparsegpt", "prune structured", "prune wanda", "quantize dynamic-int8",
          "quantize float16", "quantize smooth-quant"}  # fmt: skip
 """Commands that write their bundle and its document as others of their group do."""
@@ -276,7 +286,10 @@ BAD = {
     "verify": "{nothing} --against {nothing}:act",
     "inspect": "{nothing}",
     "rebuild": "{nothing} --check",
-    "run": "{nothing} --dry-run",
+    "run bundle": "{nothing} --dry-run",
+    "run": "--bus sim --settings {nothing}",
+    "sim": "--bus sim --settings {nothing}",
+    "topics": "--bus nothing",
     "record": "{nothing} -o {out}",
     "replay": "{nothing} {nothing}",
     "deploy": "{nothing} --store {out}",

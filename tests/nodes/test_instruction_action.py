@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from vlatool.buses import ABORTED, CANCELED, SUCCEEDED, QoS, open_bus
+from vlatool.buses import GOAL_ABORTED, GOAL_CANCELED, GOAL_SUCCEEDED, QoS, open_bus
 from vlatool.controllers import Command, Input
 from vlatool.messages.std_msgs import String
 from vlatool.messages.vlatool_msgs import RunInstructionGoal
@@ -62,19 +62,19 @@ def send(client, text, timeout_s=0.0, feedback=None):
 def test_goals_end_by_the_status(client):
     told = []
     outcome = send(client, " go to the ball ", feedback=told.append).result(5)
-    assert (outcome.status, outcome.result.success, outcome.result.message) == (SUCCEEDED, True, "arrived there")
+    assert (outcome.status, outcome.result.success, outcome.result.message) == (GOAL_SUCCEEDED, True, "arrived there")
     assert told
     assert told[0].elapsed_s >= 0
     outcome = send(client, "fall").result(5)  # the status before it was arrived: that of the last goal does not count
-    assert (outcome.status, outcome.result.message) == (ABORTED, "failed it fell")
-    assert send(client, "go").result(5).status == SUCCEEDED
+    assert (outcome.status, outcome.result.message) == (GOAL_ABORTED, "failed it fell")
+    assert send(client, "go").result(5).status == GOAL_SUCCEEDED
 
 
 def test_cancel_and_time_out_end_the_motion(client):
     goal = send(client, "walk on")
     time.sleep(0.1)
     goal.cancel()
-    assert goal.result(5).status == CANCELED
+    assert goal.result(5).status == GOAL_CANCELED
     outcome = send(client, "walk on", 0.1).result(5)
-    assert (outcome.status, outcome.result.message) == (ABORTED, "not done in 0.1 s: running on")
+    assert (outcome.status, outcome.result.message) == (GOAL_ABORTED, "not done in 0.1 s: running on")
     assert send(client, " ").result(5).result.message == "The goal has no instruction."

@@ -93,7 +93,7 @@ def test_it_holds_what_load_imports_and_nothing_else():
     listed = SETTINGS["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert {source.removeprefix("../") for source in listed} == set(listed.values())
     files = {file for name in listed.values() for file in [ROOT / name, *(ROOT / name).rglob("*.py")] if file.is_file()}
-    rooms = (ROOT / "vlatool/runtime", ROOT / "vlatool/deployment")
+    rooms = [ROOT / "vlatool" / name for name in ("runtime", "deployment", "messages", "buses", "controllers")]
     reached, left = set(), {file for room in rooms for file in room.rglob("*.py")} | {ROOT / "vlatool/__main__.py"}
     while left:
         file = left.pop()
@@ -109,7 +109,7 @@ def test_it_asks_for_numpy_alone_and_for_the_engines_that_vlatool_takes():
     project = SETTINGS["project"]
     assert project["dependencies"] == [line for line in whole["dependencies"] if line.startswith("numpy")]
     assert project["optional-dependencies"].items() <= whole["optional-dependencies"].items()
-    assert set(project["optional-dependencies"]) == {"ort", "cuda", "openvino", "text", "sign", "remote"}
+    assert set(project["optional-dependencies"]) == {"ort", "cuda", "openvino", "text", "sign", "remote", "bags"}
 
 
 def test_its_files_are_those_of_the_whole_wheel(wheels: dict[str, Path]):

@@ -43,7 +43,7 @@ class BagReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         first = path.suffix == ".bag"
-        library: Any = require("rosbags.rosbag1" if first else "rosbags.rosbag2", "data")
+        library: Any = require("rosbags.rosbag1" if first else "rosbags.rosbag2", "bags")
         if not path.exists():
             raise BusError(
                 f"There is no bag {path}.", "name a .bag, .mcap or .db3 file, or the directory of a ROS 2 bag"

@@ -41,7 +41,7 @@ class BagWriter:
     def __init__(self, path: Path) -> None:
         self._first = path.suffix == ".bag"
         self.path = path if self._first or path.suffix not in (".mcap", ".db3") else path.with_suffix("")
-        library: Any = require("rosbags.rosbag1" if self._first else "rosbags.rosbag2", "data")
+        library: Any = require("rosbags.rosbag1" if self._first else "rosbags.rosbag2", "bags")
         if self.path.exists():
             raise OutputError(f"{self.path} exists already.", ANOTHER_PATH)
         self.lost = 0

@@ -12,7 +12,6 @@ NAME = re.compile(r"(?:~/?|/)?[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*",
 """What ROS 1 and ROS 2 both take: parts of letters, digits and ``_``, with a slash between them."""
 
 
-TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 DDS_TYPE = re.compile(r"(\w+)::(msg|srv|action)::dds_::(\w+)_")
 MAX_DOMAIN = 232
 """Largest domain whose ports are below 65536 (DDSI-RTPS 2.2, section 9.6.1.1)."""
@@ -47,22 +46,6 @@ def resolve(name: str, node: str) -> str:
     if name.startswith("~"):
         return f"/{node}/{name.lstrip('~/')}"
     return name if name.startswith("/") else f"/{name}"
-
-
-def full_topic(topic: str) -> str:
-    """Return a topic's or a service's full name, which starts with a slash.
-
-    Raises:
-        UsageError: for what is not a name of ROS 2.
-    """
-    name = topic if topic.startswith("/") else f"/{topic}"
-    if TOPIC.fullmatch(name):
-        return name
-    raise UsageError(
-        f"'{topic}' is not a name of a topic or a service: letters, digits and '_', parts with '/' between them, no "
-        "digit first in a part.",
-        "write it as ROS 2 does, such as /camera/image_raw",
-    )
 
 
 def dds_type(name: str) -> str:

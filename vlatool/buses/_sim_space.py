@@ -10,15 +10,24 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from vlatool.buses._goals import Goals
 from vlatool.buses._interface import ActionType, Outcome, Reception, TopicInfo
 from vlatool.errors import BusError
 from vlatool.messages import Message
 
-if TYPE_CHECKING:
-    from vlatool.buses.sim import Sim
+
+class Member(Protocol):
+    """A node on the address, as those see it that share it; compared by identity."""
+
+    node: str
+
+    def is_behind(self) -> bool:
+        """Return whether messages wait for handlers of this node, or one is at work."""
+
+    def record_fault(self, topic: str, error: Exception) -> None:
+        """Count what a handler of a topic or service raised."""
 
 
 class Subscription:
@@ -33,7 +42,7 @@ class Subscription:
     """
 
     def __init__(
-        self, owner: Sim, topic: str, ready: deque[Subscription], handler: Callable[[Reception], None], depth: int
+        self, owner: Member, topic: str, ready: deque[Subscription], handler: Callable[[Reception], None], depth: int
     ) -> None:
         self.owner, self._topic, self._ready, self._handler = owner, topic, ready, handler
         self.waiting: deque[Reception] = deque(maxlen=max(1, depth))
@@ -57,7 +66,7 @@ class Topic:
 
     def __init__(self, name: str, message: type[Message]) -> None:
         self.name, self.message = name, message
-        self.publishers: list[Sim] = []
+        self.publishers: list[Member] = []
         self.subscriptions: list[Subscription] = []
         self.latched: Message | None = None
 
@@ -75,7 +84,12 @@ class Served:
     """A service of an address."""
 
     def __init__(
-        self, owner: Sim, name: str, request: type[Message], response: type[Message], handler: Callable[[Any], Message]
+        self,
+        owner: Member,
+        name: str,
+        request: type[Message],
+        response: type[Message],
+        handler: Callable[[Any], Message],
     ) -> None:
         self.owner, self.request, self.response = owner, request, response
         self._name, self._handler = name, handler
@@ -100,7 +114,7 @@ class Served:
 class ServedAction(NamedTuple):
     """An action of an address."""
 
-    owner: Sim
+    owner: Member
     kind: ActionType
     goals: Goals
 
@@ -139,7 +153,7 @@ class Space:
     def __init__(self, address: str) -> None:
         self.address = address
         self.changed = threading.Condition()
-        self.nodes: list[Sim] = []
+        self.nodes: list[Member] = []
         self.topics: dict[str, Topic] = {}
         self.services: dict[str, Served] = {}
         self.actions: dict[str, ServedAction] = {}
@@ -149,7 +163,7 @@ class Space:
         """Return the simulated time, or that of ``time.monotonic`` where none is set, in seconds."""
         return time.monotonic() if self.clock_s is None else self.clock_s
 
-    def leave(self, node: Sim) -> None:
+    def leave(self, node: Member) -> None:
         """Take away all that a node has here; the last one leaves nothing behind, not even a latched message."""
         for topic in self.topics.values():
             topic.publishers = [each for each in topic.publishers if each is not node]
@@ -167,7 +181,7 @@ _LOCK = threading.Lock()
 _SPACES: dict[str, Space] = {}
 
 
-def join(address: str, node: Sim) -> Space:
+def join(address: str, node: Member) -> Space:
     """Return what the nodes of an address share, this one now among them; called without the lock."""
     with _LOCK:
         found = _SPACES.setdefault(address, Space(address))

@@ -14,8 +14,7 @@ from vlatool.buses._dds_services import Client, serve_requests
 from vlatool.buses._dds_types import describe
 from vlatool.buses._faults import Faults
 from vlatool.buses._interface import Fault, QoS, Reception, TopicInfo
-from vlatool.buses._names import ros_type
-from vlatool.buses._ros_names import check_node, resolve
+from vlatool.buses._names import check_node, resolve, ros_type
 from vlatool.errors import BusError, require
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time

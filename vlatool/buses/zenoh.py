@@ -12,8 +12,7 @@ from vlatool.buses._faults import Faults
 from vlatool.buses._graph import CLIENT, PUBLISHER, SERVICE, SUBSCRIBER, Entity
 from vlatool.buses._inbox import Inbox
 from vlatool.buses._interface import Fault, QoS, Reception, TopicInfo
-from vlatool.buses._names import domain_id
-from vlatool.buses._ros_names import check_node, resolve
+from vlatool.buses._names import check_node, domain_id, resolve
 from vlatool.buses._zenoh_graph import ZenohGraph
 from vlatool.buses._zenoh_keys import ATTACHMENT, attachment, data_key, entity_token, gid_of, node_token
 from vlatool.buses._zenoh_session import open_session

@@ -184,7 +184,7 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
     """Run a controller as its command line says."""
     from vlatool.nodes.launch import PolicyOptions
     from vlatool.nodes.map_file import split_maps
-    from vlatool.nodes.session import RunPlan, dry_run, run_on_bus
+    from vlatool.nodes.session import RunPlan, dry_run, run_on_bus, waiting
     from vlatool.nodes.settings import read_settings
 
     names = ("bundle", "robot", "deadline_ms", "neutral", "engine", "threads", "seed")
@@ -201,7 +201,12 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
         found = dry_run(plan)
         answer(as_json, found, _plan_lines(found))
         return
-    result = run_on_bus(plan, lambda about: _say(about.node, about.topics), lambda *ended: _write_report(plan, *ended))
+    result = run_on_bus(
+        plan,
+        lambda about: _say(about.node, about.topics),
+        lambda *ended: _write_report(plan, *ended),
+        lambda topics: typer.echo(f"... {printable(waiting(topics))}", err=True),
+    )
     answer(as_json, result.to_dict(), _lines(result))
 
 

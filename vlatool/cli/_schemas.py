@@ -50,7 +50,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "verify-signature": ("signature",),
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
-    "run": ("controller_run", "planned_run", "dry_run"),
+    "run": ("controller_run", "planned_run"),
+    "run bundle": ("dry_run",),
     "sim": ("simulated_robot",),
     "topics": ("bus_topics",),
     "serve": ("served",),
@@ -149,8 +150,8 @@ def _documents_of_robots() -> dict[str, Schema]:
         "controller_run": document(
             "A run of a robot controller; times of its steps in ms.",
             controller=TEXT, node=TEXT, topics=by_name(TEXT), steps=INTEGER, skipped=INTEGER, seconds=NUMBER,
-            status=TEXT, late_ms=SPREAD, compute_ms=SPREAD, overhead_ms=SPREAD, overwritten=by_name(INTEGER), lost_records=INTEGER,
-            log_full=FLAG, failure=TEXT,
+            status=TEXT, late_ms=SPREAD, compute_ms=SPREAD, overhead_ms=SPREAD, overwritten=by_name(INTEGER),
+            lost_records=INTEGER, log_full=FLAG, failure=TEXT,
         ),
         "planned_run": document(
             "What a run of a robot controller would be.", controller=TEXT, node=TEXT, rate_hz=NUMBER, inputs=many(end),

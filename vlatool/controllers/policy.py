@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.spec import PolicySpec
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
 from vlatool.controllers._policy_inputs import stamp_of, value_of
 from vlatool.controllers._policy_map import (
@@ -24,6 +25,7 @@ from vlatool.controllers._policy_map import (
     read_output,
 )
 from vlatool.controllers._policy_outputs import message_of, stop_of
+from vlatool.controllers._policy_proposal import propose
 from vlatool.controllers._settings import check_range, check_rate
 from vlatool.errors import BusError, UsageError, VlatoolError
 from vlatool.messages.builtin_interfaces import Time
@@ -112,6 +114,15 @@ class Policy:
         if self._output.mode == "delta" and not found:
             raise UsageError("The actions are differences, and no input of the map is a JointState.", PRINT)
         return found
+
+    @staticmethod
+    def propose(spec: PolicySpec) -> dict[str, Any]:
+        """Return a map proposed by the names, units and modes of a spec, for a person to check against the robot.
+
+        Raises:
+            UsageError: for an input that no topic can be.
+        """
+        return propose(spec)
 
     @property
     def rate_hz(self) -> float:

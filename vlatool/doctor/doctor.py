@@ -31,6 +31,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "build": ("torch", "onnx", "onnxscript", "onnx-ir", "safetensors"),
     "openvino": ("openvino",),
     "data": ("pillow", "pyarrow", "av", "h5py", "zarr", "rosbags", "google-crc32c"),
+    "bags": ("rosbags",),
     "sim": ("gymnasium", "minigrid"),
     "metaworld": ("metaworld", "mujoco"),
     "text": ("tokenizers",),

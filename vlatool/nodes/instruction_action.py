@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from vlatool.buses import ABORTED, CANCELED, SUCCEEDED, ActionBus, ActionType, Goal, Outcome
+from vlatool.buses import GOAL_ABORTED, GOAL_CANCELED, GOAL_SUCCEEDED, ActionBus, ActionType, Goal, Outcome
 from vlatool.messages.std_msgs import String
 from vlatool.messages.vlatool_msgs import (
     RunInstructionFeedback,
@@ -24,7 +24,7 @@ from vlatool.nodes.stepper import StepReport
 KIND = ActionType(
     "vlatool_msgs/action/RunInstruction", RunInstructionGoal, RunInstructionFeedback, RunInstructionResult
 )
-ENDS: Mapping[str, str] = {"arrived": SUCCEEDED, "done": SUCCEEDED, "failed": ABORTED}
+ENDS: Mapping[str, str] = {"arrived": GOAL_SUCCEEDED, "done": GOAL_SUCCEEDED, "failed": GOAL_ABORTED}
 """First word of a status -> how it ends a goal."""
 LOOK_S, FEEDBACK_S = 0.02, 0.2
 
@@ -57,7 +57,7 @@ class InstructionAction:
         message: Any = goal.message
         text = message.instruction.strip()
         if not text:
-            return Outcome(ABORTED, RunInstructionResult(False, "The goal has no instruction."))
+            return Outcome(GOAL_ABORTED, RunInstructionResult(False, "The goal has no instruction."))
         began, told_s = time.monotonic(), -FEEDBACK_S
         self._say(String(text))
         first = self._now()[1] + 2  # the step that is at work now may not have read it
@@ -66,12 +66,14 @@ class InstructionAction:
             status, steps = self._now()
             word = (status.split() or [""])[0]
             if steps >= first and word in ENDS:
-                return Outcome(ENDS[word], RunInstructionResult(ENDS[word] == SUCCEEDED, status))
+                return Outcome(ENDS[word], RunInstructionResult(ENDS[word] == GOAL_SUCCEEDED, status))
             if message.timeout_s > 0 and elapsed > message.timeout_s:
                 self._say(String(""))
-                return Outcome(ABORTED, RunInstructionResult(False, f"not done in {message.timeout_s:g} s: {status}"))
+                return Outcome(
+                    GOAL_ABORTED, RunInstructionResult(False, f"not done in {message.timeout_s:g} s: {status}")
+                )
             if elapsed - told_s >= FEEDBACK_S:
                 told_s = elapsed
                 goal.feedback(RunInstructionFeedback(status, elapsed))
         self._say(String(""))
-        return Outcome(CANCELED, RunInstructionResult(False, "canceled"))
+        return Outcome(GOAL_CANCELED, RunInstructionResult(False, "canceled"))

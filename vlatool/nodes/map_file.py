@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from vlatool import registry
 from vlatool.errors import DataError, UsageError, require
 from vlatool.files.json import read_json
 from vlatool.nodes.settings import MAX_BYTES
@@ -73,8 +74,10 @@ def read_map(path: Path) -> dict[str, Any]:
 def proposed_text(bundle: Path) -> str:
     """Return a proposed map for a bundle, as YAML."""
     from vlatool.bundle.bundle import Bundle
-    from vlatool.controllers._policy_proposal import propose
 
     yaml: Any = require("yaml", "build")
-    text: str = yaml.safe_dump(propose(Bundle.open(bundle).manifest.spec), sort_keys=False, default_flow_style=None)
+    controller: Any = registry.load("controllers", "policy")
+    text: str = yaml.safe_dump(
+        controller.propose(Bundle.open(bundle).manifest.spec), sort_keys=False, default_flow_style=None
+    )
     return f"# Proposed by the spec of the bundle: check topics, joints and units against the robot.\n{text}"

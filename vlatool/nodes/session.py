@@ -108,11 +108,13 @@ def run_on_bus(
     plan: RunPlan,
     on_start: Callable[[ControllerRecord], None] = lambda about: None,
     on_end: Callable[[RunResult, Trace], None] = lambda result, trace: None,
+    on_missing: Callable[[tuple[str, ...]], None] = lambda topics: warnings.warn(waiting(topics), stacklevel=3),
 ) -> RunResult:
     """Run a controller on a bus until its time is over, or a signal or a failure ends it.
 
     Args:
         on_start: Called with what runs, before its first step.
+        on_missing: Called with topics of required inputs that nobody publishes yet; it warns when not given.
         on_end: Called with what it was and with its trace, however it ended, once the robot is at rest.
 
     Raises:
@@ -146,13 +148,18 @@ def run_on_bus(
         if say is not None and plan.instruction:
             say(String(plan.instruction))
         if missing := runner.missing(plan.wait_s):
-            warnings.warn(f"nobody publishes {', '.join(missing)} yet; the controller waits for it", stacklevel=2)
+            on_missing(missing)
         try:
             runner.run(plan.seconds)
         finally:
             result = _closed(about, runner.summary, background, log)
             on_end(result, trace)
     return result
+
+
+def waiting(topics: tuple[str, ...]) -> str:
+    """Return a sentence on topics that nobody publishes."""
+    return f"nobody publishes {', '.join(topics)} yet; the controller waits for it"
 
 
 def _instructor(
