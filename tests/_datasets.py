@@ -198,23 +198,31 @@ def aloha(folder: Path, *, compress: bool = False) -> Path:
 
 
 def robomimic(file: Path) -> Path:
-    """All episodes in one file, written as robomimic does; the names of its demos do not sort as text."""
+    """All episodes in one file, written as robomimic does; the names of its demos do not sort as text.
+
+    Source: robomimic, ``scripts/dataset_states_to_obs.py`` and ``create_hdf5_filter_key``.
+    """
     import h5py
 
     with h5py.File(file, "w") as opened:
         data = opened.create_group("data")
-        data.attrs.update(total=COUNT, env_args="{}")
         for episode, number in enumerate((2, 9, 10)):
             rows = np.flatnonzero(episode == EPISODES)
             demo = data.create_group(f"demo_{number}")
-            demo.attrs["num_samples"] = len(rows)
+            demo.create_dataset("actions", data=ACTION[rows].astype(np.float64))
+            demo.create_dataset("states", data=np.zeros((len(rows), 32)))
+            demo.create_dataset("rewards", data=np.zeros(len(rows)))
+            demo.create_dataset("dones", data=np.zeros(len(rows), np.int64))
             for group in ("obs", "next_obs"):
                 pixels = np.stack([picture(row) for row in rows.tolist()])
                 demo.create_dataset(f"{group}/agentview_image", data=pixels, compression="gzip")
                 demo.create_dataset(f"{group}/robot0_eef_pos", data=STATE[rows].astype(np.float64))
-            demo.create_dataset("actions", data=ACTION[rows].astype(np.float64))
-            demo.create_dataset("dones", data=np.zeros(len(rows), np.int64))
-        opened.create_dataset("mask/train", data=np.array([b"demo_2", b"demo_9"]))
+            demo.attrs.update(model_file="<mujoco/>", num_samples=len(rows))
+        settings = {"control_freq": HZ, "camera_names": ["agentview"], "camera_heights": HEIGHT}
+        data.attrs["total"] = COUNT
+        data.attrs["env_args"] = json.dumps({"env_name": "Lift", "type": 1, "env_kwargs": settings}, indent=4)
+        opened["mask/train"] = np.array(["demo_2", "demo_10"], dtype="S")
+        opened["mask/valid"] = np.array(["demo_9"], dtype="S")
     return file
 
 

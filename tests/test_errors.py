@@ -26,6 +26,7 @@ EXIT_CODES = {
     "InstallationError": 3,
     "DeploymentError": 3,
     "ServingError": 3,
+    "BusError": 3,
     "SignatureError": 3,
     "PluginError": 3,
     "MissingExtra": 4,

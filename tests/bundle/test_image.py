@@ -51,8 +51,8 @@ def test_a_manifest_with_an_image_is_of_the_second_version_and_any_other_of_the_
     assert Manifest.from_dict(without).to_dict() == without
     with pytest.raises(BundleError, match="schema 1, but what begins with 2, such as 'image'"):
         Manifest.from_dict({**with_image, "schema": 1})
-    with pytest.raises(BundleError, match="schema 3; this vlatool reads up to 2"):
-        Manifest.from_dict({**with_image, "schema": 3})
+    with pytest.raises(BundleError, match="schema 4; this vlatool reads up to 3"):
+        Manifest.from_dict({**with_image, "schema": 4})
 
 
 @pytest.mark.parametrize(

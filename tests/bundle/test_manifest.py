@@ -86,14 +86,14 @@ def test_an_unknown_key_of_noise_or_a_kept_value_is_refused(entry, word):
 
 
 def test_a_newer_schema_asks_for_an_upgrade():
-    with pytest.raises(BundleError, match="schema 3; this vlatool reads up to 2") as caught:
-        Manifest.from_dict({**MANIFESTS[1].to_dict(), "schema": 3})
+    with pytest.raises(BundleError, match="schema 4; this vlatool reads up to 3") as caught:
+        Manifest.from_dict({**MANIFESTS[1].to_dict(), "schema": 4})
     assert caught.value.fix == "upgrade vlatool"
 
 
 @pytest.mark.parametrize("schema", [None, "1", 0, 1.5])
 def test_an_impossible_schema_is_refused(schema):
-    with pytest.raises(BundleError, match="this vlatool reads 1 to 2"):
+    with pytest.raises(BundleError, match="this vlatool reads 1 to 3"):
         Manifest.from_dict({**MANIFESTS[1].to_dict(), "schema": schema})
 
 

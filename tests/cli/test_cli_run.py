@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from _two_systems import two_systems
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Graph, Manifest
@@ -45,6 +46,18 @@ def test_it_shows_the_layers_and_what_is_left_of_the_control_period(vlatool, spe
         assert word in out
     assert out.index("FallbackLadder") < out.index("Deadline")
     assert "main  CPUExecutionProvider: 1 nodes, float32 100.0%" in out
+
+
+def test_of_two_systems_the_fast_part_has_to_be_in_time_and_both_are_shown(vlatool) -> None:
+    code, out, err = vlatool("run", two_systems().path, "--dry-run", "--steps", 20, "--threads", 1, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert [note["layer"] for note in found["layers"]][-2:] == ["DualRate", "BundlePolicy"]
+    assert found["slow"]["samples"] == 20
+    assert found["cadence"]["latent"]["part"] == "latent age"
+    out = vlatool("run", two_systems().path, "--dry-run", "--steps", 20, "--threads", 1)[1]
+    assert "slow part  p50" in out
+    assert "latent age" in out
 
 
 def test_a_robot_and_a_second_bundle_add_theirs(vlatool, speeds: Bundle) -> None:

@@ -264,6 +264,8 @@ def test_without_environment_or_tasks_the_remedy_is_named(int8_bundle):
         ({"controller": "rtc:delay=-1"}, "delay is -1; allowed: a whole number from 0"),
         ({"controller": "start_pose"}, "0 inputs have the"),
         ({"controller": "rtc:background=true"}, "depends on the speed of this machine"),
+        ({"controller": "dual_rate"}, "has no slow part"),
+        ({"controller": "dual_rate:thread=true"}, "depends on the speed of this machine"),
         ({"controller": "asynchronous:memory=3:background=true"}, "depends on the speed of this machine"),
         ({"controller": "deadline:deadline_ms=5,late"}, "What a deadline does depends on the speed of this machine"),
         ({"controller": "rtc:background=true", "latency_in_the_loop": True}, "depends on the speed of this machine"),

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from _arithmetic import weights_of_this_host
 
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.data import recorded_observations
@@ -60,7 +61,8 @@ def test_the_bundle_beside_it_is_loaded_as_before(made: Result, float_bundle: Bu
 @pytest.mark.parametrize("layout", ["openvino", "qdq", "ort"])
 def test_int8_pairs_are_converted_and_run(float_bundle: Bundle, tmp_path: Path, layout: str) -> None:
     (tmp_path / "int8").mkdir()
-    int8 = StaticInt8(layout=layout).run(float_bundle, tmp_path / "int8", Context()).bundle
+    stage = StaticInt8(layout=layout, **weights_of_this_host("openvino"))
+    int8 = stage.run(float_bundle, tmp_path / "int8", Context()).bundle
     result = converted(int8, tmp_path)
     weights = (result.bundle.path / "openvino/main.bin").stat().st_size
     assert 0 < weights < 0.6 * (float_bundle.path / "graphs/main.onnx").stat().st_size

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ import onnx_ir
 import onnxruntime
 import pytest
 
-from vlatool.bundle.program import ProgramStep, check_program
+from vlatool.bundle.program import ProgramStep, check_program, latent_names
 from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.graph.graph_cut import GraphCut
 from vlatool.graph.loop_invariants import changing_feeds, compute_once, cut_loop_invariants
 from vlatool.runtime.program import Program
 
@@ -163,6 +165,26 @@ def test_a_branch_reads_what_is_computed_once():
 )
 def test_the_program_says_what_changes(step, changing):
     assert changing_feeds([step], "step") == changing
+
+
+def test_what_follows_from_a_slow_part_alone_is_computed_with_it():
+    slow = {"max_age_ms": 500.0}
+    think = ProgramStep("think", {"image": "image"}, {"context": "context"}, slow=slow)
+    see = ProgramStep("see", {"state": "state"}, {"seen": "seen"})
+    act = ProgramStep("act", {"k": "context", "s": "seen", "x": "x"}, {"y": "x_next"}, 4, {"x_next": "x"},
+                      noise={"x": {"shape": [1, 2]}})  # fmt: skip
+    of_context = GraphCut(None, ("k",), ("keys",), ("s", "x"))
+    of_both = GraphCut(None, ("k", "s"), ("keys",), ("x",))
+    program = compute_once((think, see, act), "act", "once", of_context)
+    assert [(step.graph, step.slow) for step in program] == [("think", slow), ("once", slow), ("see", {}), ("act", {})]
+    assert program[3].feeds == {"keys": "once.keys", "s": "seen", "x": "x"}
+    spec = PolicySpec((TensorSpec("image", (1, 2)), TensorSpec("state", (1, 2))), (TensorSpec("x_next", (1, 2)),), 10.0)
+    check_program(program, ["think", "once", "see", "act"], spec)
+    assert latent_names(program, spec) == {"once.keys"}
+    program = compute_once((think, see, act), "act", "once", of_both)
+    assert [step.graph for step in program if not step.slow] == ["see", "once", "act"]
+    program = compute_once((replace(think, slow={}), see, act), "act", "once", of_context)
+    assert [step.graph for step in program] == ["think", "see", "once", "act"]
 
 
 def test_noise_that_stays_is_drawn_before_it_is_read():

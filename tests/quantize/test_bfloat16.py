@@ -28,7 +28,7 @@ def test_a_processor_without_bfloat16_refuses_by_name(quantized: Callable[..., B
     if computes_bfloat16():
         assert quantized(Bfloat16()).manifest.graphs["main"].compute == "bfloat16"
     else:
-        with pytest.raises(GraphError, match=r"OpenVINO computes .* in f32 on this processor; wanted bf16"):
+        with pytest.raises(GraphError, match=r"OpenVINO computes .* in f32 on this CPU; wanted bf16"):
             quantized(Bfloat16())
 
 

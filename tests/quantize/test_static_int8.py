@@ -79,7 +79,7 @@ def test_both_layouts_compute_the_same_numbers(quantized, drift, int8_bundle, op
 )
 def test_every_option_gives_a_policy_near_float(quantized, drift, options):
     if options.get("compute") == "bfloat16" and not computes_bfloat16():
-        with pytest.raises(GraphError, match=r"OpenVINO computes .* in f32 on this processor; wanted bf16"):
+        with pytest.raises(GraphError, match=r"OpenVINO computes .* in f32 on this CPU; wanted bf16"):
             quantized(StaticInt8(samples=8, **options))
         return
     options = options | (full_range_or_less() if options.get("layout") == "openvino" else {})

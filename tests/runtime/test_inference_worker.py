@@ -86,7 +86,7 @@ def test_results_and_errors_come_from_one_thread_that_is_kept():
 def test_what_does_not_end_in_time_is_stopped_and_taken_back(result: object):
     worker, task = Worker(), Steps(result, ends=False)
     with pytest.raises(TimeoutError, match="it was stopped"):
-        worker.call(task, soon(0.02))
+        worker.call(task, soon(0.2))
     assert free(worker)
     assert task.calls == ["begin", "stop", "undo"][: 3 if result == 1 else 2]
     assert worker.call(Steps(2), soon()) == 2

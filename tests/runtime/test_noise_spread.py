@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from _two_systems import observations, two_systems
 from _written import written
 
 from vlatool.bundle.program import ProgramStep
@@ -50,6 +51,20 @@ def test_the_policy_acts_as_without_it(bundle: Path, more: dict[str, Any]):
     assert watched == plain
     assert len(scores) == 1, "every twentieth step that plays a chunk"
     assert 0.005 < scores[0] < 1.0
+
+
+def test_a_policy_of_two_systems_acts_as_without_it_too():
+    episode = observations(6 * LOOK_PERIOD)
+    acts, found = [], []
+    for controllers in ([], ["anomaly:spread=5"]):
+        named = ["dual_rate:every=3", "chunked:execute=4", *controllers]
+        stack: Any = build_stack(load(two_systems().path, threads=1, seed=3), controllers=named)
+        acts.append([stack.act(seen).tolist() for seen in episode])
+        spread = getattr(stack.controller, "_spread", None)
+        found.append(spread and spread.measure(episode[0], (1, 2)))
+        stack.close()
+    assert acts[0] == acts[1]
+    assert found[1] > 0.01
 
 
 def test_a_policy_without_noise_has_none(tmp_path: Path):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError, DeadlineMissed, ProfileError, ServingError, UsageError
 from vlatool.runtime.interface import Action
 from vlatool.serving import Access, ChunkEnvelope, ObservationNames, RequestLog, RequestRecord, Service
+from vlatool.serving._request_log import _Lines
 
 JOINTS = tuple(f"joint{number}" for number in range(1, 8))
 PANDA = PolicySpec(
@@ -266,13 +270,65 @@ def test_a_key_admits_who_knows_it():
     assert Access("::1").admits_header(None)
 
 
+def request(number: int) -> RequestRecord:
+    return RequestRecord("a", number, 0.0, 5.0, False, "", ())
+
+
+def test_a_disk_that_does_not_answer_keeps_no_request_and_no_end_waiting(tmp_path: Path):
+    """A pipe that nobody reads: its 64 KiB are written, the rest is counted."""
+    path, count = tmp_path / "requests", 3000
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    log = RequestLog(path, waiting=100)
+    for number in range(count):
+        log(request(number))
+    log.close(0.1)
+    written = os.read(reader, 1 << 16).splitlines()
+    assert log.lost_count == count - len(written) > 0
+    assert [json.loads(line)["client"] for line in written[:5]] == ["a"] * 5
+    log(request(0))  # after the end: nobody takes it
+    while log._telemetry.outlets[0]._thread.is_alive():
+        with contextlib.suppress(BlockingIOError):
+            os.read(reader, 1 << 16)
+    os.close(reader)
+
+
+def test_records_that_a_full_disk_does_not_take_are_counted():
+    log = RequestLog(Path("/dev/full"))
+    for number in range(5):
+        log(request(number))
+    assert log._telemetry.flush()
+    assert log.lost_count == 5
+    log.close()
+    assert log.lost_count == 5
+
+
+def test_a_line_after_one_that_was_cut_off_begins_anew(tmp_path: Path):
+    lines = _Lines(tmp_path / "requests")
+    whole = lines._file
+
+    class Full:
+        def write(self, content: bytes) -> int:
+            return int(whole.write(content[:20]))
+
+    lines._file = Full()
+    with pytest.raises(OSError, match="20 of"):
+        lines(request(0))
+    lines._file = whole
+    lines(request(1))
+    lines.close()
+    assert json.loads((tmp_path / "requests").read_text().splitlines()[1])["number"] == 1
+    assert lines.written == 1
+
+
 def test_requests_are_written_as_lines(tmp_path: Path):
     log = RequestLog(tmp_path / "requests.jsonl")
     for number in range(3):
-        log(RequestRecord("a", number, 0.0, 5.0 + number, False, "", ()))
+        log(request(number)._replace(answer_ms=5.0 + number))
     log.close()
+    assert not [thread for thread in threading.enumerate() if thread is log._telemetry.outlets[0]._thread]
     assert (tmp_path / "requests.jsonl").read_text().count('"client": "a"') == 3
-    assert (log.times_ms()["p50"], log.lost) == (6.0, 0)
+    assert (log.times_ms()["p50"], log.lost_count) == (6.0, 0)
     assert RequestLog().times_ms() == {}
     with pytest.raises(Exception, match="cannot be written"):
         RequestLog(tmp_path)

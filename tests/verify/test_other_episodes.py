@@ -14,7 +14,6 @@ from vlatool.data import Recording, build_recording
 from vlatool.runtime.statistics import Normaliser
 from vlatool.stage.base import Context
 from vlatool.verify._distributions import explain_statistics
-from vlatool.verify._model import upper_bound
 from vlatool.verify._other_episodes import Judge, Outcome
 from vlatool.verify._reading import is_dense, names_of
 from vlatool.verify._texts import unknown_texts
@@ -201,9 +200,3 @@ def test_texts_are_told_by_case_by_word_and_by_rarity():
     assert "nor was the word 'lever'" in said["press the lever"][0]
     assert "the nearest that was is" in said["open the button"][0]
     assert list(unknown_texts("t", ["go to a key"], ["go to a ball", "to the key"], ([0], [0, 1]))) == []
-
-
-def test_the_bound_is_above_all_right_episodes():
-    assert upper_bound([0.0] * 20) == pytest.approx(np.log(1000))
-    assert upper_bound([0.0, 3.0, 5.0, 20.0]) > 20
-    assert upper_bound([]) > upper_bound([0.0] * 20)

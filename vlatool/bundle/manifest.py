@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
-from vlatool.bundle.program import ProgramStep, check_graph_name, check_program, program_from
+from vlatool.bundle.program import ProgramStep, check_graph_name, check_program, program_from, slow_part
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import BundleError
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values, to_json
 from vlatool.files.validate import finite_number, integer, mapping, path_problem, sequence, short_repr, text
 
-SCHEMA = 2
+SCHEMA = 3
 """The newest version; a manifest has the first one that has all that it says, so that older readers take it."""
 GOLDEN_TOLERANCE = 0.05
 """Allowed relative L2 difference from the golden action if the manifest does not set one."""
@@ -89,7 +89,8 @@ class Manifest:
         description: one sentence.
         license: SPDX identifier of the policy's licence.
         engine: engine that the graphs were made for; ONNX Runtime on the CPU when empty.
-        schema: version of this format: 2 with an ``image``, an ``epsilon`` or ``quantile10``, else 1.
+        schema: version of this format: 3 with a ``slow`` part in the program, 2 with an ``image``, an ``epsilon`` or
+            ``quantile10``, else 1.
     """
 
     name: str
@@ -115,7 +116,7 @@ class Manifest:
     schema: int = 1
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "schema", max(self.schema, self.spec.schema))
+        object.__setattr__(self, "schema", max(self.schema, self.spec.schema, _program_schema(self.program)))
         check_limit("files", len(self.files), "The manifest", BundleError)
         check_limit("graphs", len(self.graphs), "The manifest", BundleError)
         for path in (*self.files, *(graph.file for graph in self.graphs.values())):
@@ -161,6 +162,11 @@ class Manifest:
             )
         values["graphs"] = {name: _graph(name, graph) for name, graph in values.get("graphs", {}).items()}
         values["program"] = program_from(values.get("program", []))
+        if (needed := _program_schema(values["program"])) > values["schema"]:
+            raise BundleError(
+                f"The manifest has the schema {values['schema']}, but a program with 'slow', which begins with "
+                f"{needed}."
+            )
         values["build"] = _entries(values.get("build", ()), "build", ("stage",))
         values["findings"] = _entries(values.get("findings", ()), "findings", ("name", "message"))
         values["files"] = {path: _record(path, record) for path, record in values.get("files", {}).items()}
@@ -200,6 +206,11 @@ def check_schema(schema: Any) -> None:
             f"The bundle has the manifest schema {short_repr(schema)}; this vlatool reads up to {SCHEMA}.",
             "upgrade vlatool",
         )
+
+
+def _program_schema(program: Iterable[ProgramStep]) -> int:
+    """Return the first version that has all that a program says."""
+    return 1 if slow_part(program) is None else 3
 
 
 def _check_type(name: str, value: Any, item: Any) -> None:

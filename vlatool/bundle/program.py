@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from vlatool.bundle.spec import DTYPES, PolicySpec
 from vlatool.errors import SpecError, suggest
@@ -35,7 +35,7 @@ def check_step(step: ProgramStep) -> None:
     """Refuse wrong types, and values beyond the limits, in an entry; raises SpecError with the word and the graph."""
     text(step.graph, "The graph of a step", SpecError, empty=False)
     check_graph_name(step.graph, SpecError)
-    for word in ("feeds", "gives", "carry", "schedule", "noise", "keep"):
+    for word in ("feeds", "gives", "carry", "schedule", "noise", "keep", "slow"):
         mapping(getattr(step, word), f"'{word}' of '{step.graph}'", SpecError)
     for word in ("feeds", "gives", "carry"):
         for value in getattr(step, word).values():
@@ -45,6 +45,8 @@ def check_step(step: ProgramStep) -> None:
         _check_noise(value, noise)
     for value, kept in step.keep.items():
         _check_kept(value, kept)
+    if step.slow:
+        _check_slow(step)
 
 
 def drawn_and_kept(step: ProgramStep) -> int:
@@ -96,6 +98,21 @@ def _check_kept(value: str, kept: Any) -> None:
     check_limit("elements", elements, f"The kept value '{value}'", SpecError)
 
 
+def _check_slow(step: ProgramStep) -> None:
+    where = f"'slow' of '{step.graph}'"
+    known_keys(step.slow, ("max_age_ms", "hz"), where, SpecError)
+    if "max_age_ms" not in step.slow:
+        raise SpecError(
+            f"{where} has no 'max_age_ms': how old its values may be when they are used, in milliseconds.",
+            "write it as slow: {max_age_ms: 500}, or slow: {max_age_ms: 500, hz: 5}",
+        )
+    for name, unit in (("max_age_ms", "milliseconds"), ("hz", "Hz")):
+        if name in step.slow and finite_number(step.slow[name], f"'{name}' in {where}", SpecError) <= 0:
+            raise SpecError(
+                f"'{name}' in {where} is {short_repr(step.slow[name])}; allowed: a number of {unit} above 0."
+            )
+
+
 @dataclass(frozen=True)
 class ProgramStep:
     """One entry of a program: run a graph, once or several times.
@@ -109,6 +126,9 @@ class ProgramStep:
         schedule: value -> one number for each repeat, presented as an array of shape (1,).
         noise: value -> {shape, distribution}; drawn once before the first repeat, from the seedable generator.
         keep: value -> {shape, dtype}; zero after ``reset``, else what the last inference gave under that name.
+        slow: {max_age_ms, hz} of a step of the slow part of a policy of two systems: how old what it gives may be when
+            the fast part uses it, in milliseconds, and how often it runs; without ``hz`` whenever it is ready. Empty
+            for a step that runs at each inference.
     """
 
     graph: str
@@ -119,6 +139,7 @@ class ProgramStep:
     schedule: dict[str, list[float]] = field(default_factory=dict)
     noise: dict[str, dict[str, Any]] = field(default_factory=dict)
     keep: dict[str, dict[str, Any]] = field(default_factory=dict)
+    slow: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_step(self)
@@ -126,6 +147,33 @@ class ProgramStep:
     def sources(self) -> set[str]:
         """Values that this entry creates before its graph runs."""
         return {*self.schedule, *self.noise, *self.keep}
+
+
+class SlowPart(NamedTuple):
+    """How the slow part of a policy of two systems runs, beside the fast part, which uses its newest values.
+
+    Args:
+        max_age_ms: Age above which its values are not used, in milliseconds, from the observation that they answer.
+        hz: Rate at which it runs in Hz; whenever it is ready when None.
+    """
+
+    max_age_ms: float
+    hz: float | None
+
+
+def slow_part(program: Iterable[ProgramStep]) -> SlowPart | None:
+    """Return how the slow part of a program runs; None for a program without one."""
+    found = next((step.slow for step in program if step.slow), None)
+    return None if found is None else SlowPart(float(found["max_age_ms"]), found.get("hz"))
+
+
+def latent_names(program: Iterable[ProgramStep], spec: PolicySpec) -> set[str]:
+    """Return the values that the fast part of a program, or an output of the spec, takes from its slow part."""
+    program = tuple(program)
+    parts = [step for step in program if step.slow], [step for step in program if not step.slow]
+    slow, own = ({*_given(part), *(name for step in part for name in step.sources())} for part in parts)
+    fast = {name for step in parts[1] for name in step.feeds.values()}
+    return slow & (fast | {tensor.name for tensor in spec.outputs} - own)
 
 
 def keeps_values(program: Iterable[ProgramStep]) -> bool:
@@ -178,6 +226,42 @@ def check_program(program: Iterable[ProgramStep], graphs: Iterable[str], spec: P
             if source not in step.gives.values():
                 raise SpecError(f"Step {number} carries '{source}', which '{step.graph}' does not give.")
         values |= set(step.gives.values())
+    if slow_part(program) is not None:
+        _check_two_parts(program, spec)
     for tensor in spec.outputs:
         if tensor.name not in values:
             raise SpecError(f"No step of the program gives the output '{tensor.name}'; {suggest(tensor.name, values)}.")
+
+
+def _check_two_parts(program: tuple[ProgramStep, ...], spec: PolicySpec) -> None:
+    """Refuse a slow part that cannot run beside the fast one; raises SpecError naming the step."""
+    slow, fast = [step for step in program if step.slow], [step for step in program if not step.slow]
+    graph = slow[0].graph
+    if list(program) != slow + fast or not fast:
+        raise SpecError(
+            f"The slow part ('{graph}') is not followed by a fast part alone: its steps stand first, together.",
+            "order the program so, with the steps without 'slow' last",
+        )
+    for step in slow:
+        if step.slow != slow[0].slow:
+            raise SpecError(f"'slow' of '{step.graph}' is {step.slow}, that of '{graph}' {slow[0].slow}.",
+                            "write the same in each step of the slow part")  # fmt: skip
+    if shared := {step.graph for step in slow} & {step.graph for step in fast}:
+        raise SpecError(f"Both parts run the graph '{min(shared)}', perhaps at once.",
+                        "give each part a graph of its own")  # fmt: skip
+    for ours, others in ((slow, fast), (fast, slow)):
+        own, given = _given(ours), _given(others)
+        kept = {name for step in ours for name in step.keep}
+        if foreign := sorted((kept - own) & given):
+            raise SpecError(f"'{foreign[0]}' is kept by one part and given by the other.", "keep a part's own values")
+    drawn = [{name for step in part for name in step.noise} for part in (slow, fast)]
+    if both := drawn[0] & drawn[1]:
+        raise SpecError(f"Both parts draw the noise '{min(both)}'.", "give each part noise with a name of its own")
+    if spec.action.name not in _given(fast):
+        raise SpecError(f"The fast part does not give the action '{spec.action.name}'.", "leave 'slow' out")
+    if not latent_names(program, spec):
+        raise SpecError(f"The fast part uses nothing of the slow part ('{graph}').", "feed it what that gives")
+
+
+def _given(steps: Iterable[ProgramStep]) -> set[str]:
+    return {name for step in steps for name in (*step.gives.values(), *step.carry.values())}

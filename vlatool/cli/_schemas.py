@@ -269,7 +269,8 @@ def _documents_of_machines() -> dict[str, Schema]:
             bundle=TEXT, robot=TEXT, period_ms=NUMBER, deadline_ms=NUMBER, layers=many(record(layer=TEXT, does=TEXT)),
             inference=SPREAD, answer=SPREAD, missed=NUMBER,
             rungs=many(record(source=TEXT, time={"anyOf": [SPREAD, {"type": "null"}]})),
-            cadence=record(parts=many(PART_TIME), misses=INTEGER), engine=ANY_OBJECT,
+            cadence=record(parts=many(PART_TIME), misses=INTEGER, latent={"anyOf": [PART_TIME, {"type": "null"}]}),
+            engine=ANY_OBJECT, slow={"anyOf": [SPREAD, {"type": "null"}]},
         ),
         "served": document(
             "What was served; times until an answer in ms where there were answers.",

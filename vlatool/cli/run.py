@@ -89,6 +89,8 @@ def lines(found: DryRun) -> Iterator[str]:
     yield from found.engine.lines()
     yield f"control period {found.period_ms:g} ms, deadline {found.deadline_ms:g} ms"
     yield f"  inference  p50 {found.inference.p50:.3f} ms, p99 {found.inference.p99:.3f} ms"
+    if (slow := found.slow) is not None:
+        yield f"  slow part  p50 {slow.p50:.3f} ms, p99 {slow.p99:.3f} ms, in a thread beside the inferences"
     share = f"{found.missed:.1%} of {found.answer.samples} steps without an action of the policy in time"
     yield f"  act        p50 {found.answer.p50:.3f} ms, p99 {found.answer.p99:.3f} ms; {share}"
     yield from cadence_lines(found.cadence)

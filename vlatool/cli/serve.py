@@ -101,7 +101,7 @@ def _counts(service: Service, log: RequestLog) -> dict[str, Any]:
     """Return what became of the requests."""
     return {
         "requests": service.requests, "missed": service.missed, "failed": service.failed, "times": log.times_ms(),
-        "lost_records": log.lost + service.failed_records,
+        "lost_records": log.lost_count + service.failed_records,
     }  # fmt: skip
 
 

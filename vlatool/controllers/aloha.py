@@ -33,7 +33,7 @@ class Aloha(ArmController):
     their commands is within that.
     """
 
-    speed: float = 0.3
+    speed: float = 0.25
 
     ROBOT: ClassVar[ArmRobot] = ArmRobot("aloha", JOINTS, JOINTS, POSE * 2, CHAINS)
 

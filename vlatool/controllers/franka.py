@@ -22,6 +22,8 @@ class Franka(ArmController):
     pose is that of franka_ros: 0, -pi/4, 0, -3 pi/4, 0, pi/2, pi/4.
     """
 
+    margin_rad: float = 0.05
+
     ROBOT: ClassVar[ArmRobot] = ArmRobot(
         "franka-panda",
         JOINTS,

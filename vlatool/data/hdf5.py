@@ -11,10 +11,21 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.spec import PolicySpec
 from vlatool.data._lazy_rows import LazyRows
 from vlatool.data._pictures import decode_picture, library_errors, stack_pictures
-from vlatool.data._recording import Values
-from vlatool.data._step_reader import StepReader
+from vlatool.data._recording import Recording, Values
+from vlatool.data._robomimic import (
+    INSTRUCTION,
+    MASK,
+    check_samples,
+    chosen_by,
+    filter_keys,
+    instruction_of,
+    notes_on,
+    rate_of,
+)
+from vlatool.data._step_reader import StepReader, recording_of
 from vlatool.data._steps import Steps
 from vlatool.errors import DataError, require
 from vlatool.files.limits import check_limit
@@ -53,14 +64,37 @@ class Hdf5(StepReader):
             DataError: when one is corrupt, refers to other files, or holds other names than the first.
             MissingExtra: when h5py is not installed.
         """
-        files = list(_files(path)) if path.is_dir() else [path]
-        episodes = [episode for file in files for episode in _episodes(file)]
-        if not episodes:
-            raise DataError(f"{path} holds no episodes.", RECORD_AGAIN)
-        lengths = [episode.length for episode in episodes]
-        columns = {name: _column(path, name, episodes, lengths) for name in _names(path, episodes)}
-        action = next((name for name in ACTIONS if name in columns), "")
-        return Steps(path, columns, np.repeat(np.arange(len(episodes)), lengths), action=action)
+        return _steps(path, "")
+
+    def open(self, path: Path, spec: PolicySpec, names: Mapping[str, str]) -> Recording:
+        """Open a recording, of robomimic's filter key alone that ``names`` has for ``mask``; see ``recording_of``.
+
+        Raises:
+            DataError: when it is corrupt, has no such filter key, or does not fit the spec.
+            MissingExtra: when h5py is not installed.
+        """
+        key = "" if any(tensor.name == MASK for tensor in spec.inputs) else names.get(MASK, "")
+        others = {name: each for name, each in names.items() if not (key and name == MASK)}
+        return recording_of(_steps(path, key), spec, others)
+
+
+def _steps(path: Path, key: str) -> Steps:
+    """Return what files hold, of the episodes of a filter key; of all when it is empty."""
+    files = list(_files(path)) if path.is_dir() else [path]
+    found = [_episodes(file, key) for file in files]
+    episodes = [episode for content in found for episode in content.episodes]
+    if not episodes:
+        raise DataError(f"{path} holds no episodes.", RECORD_AGAIN)
+    lengths = [episode.length for episode in episodes]
+    columns = {name: _column(path, name, episodes, lengths) for name in _names(path, episodes)}
+    action = next((name for name in ACTIONS if name in columns), "")
+    texts = [episode.instruction for episode in episodes]
+    if any(texts) and INSTRUCTION not in columns:
+        columns[INSTRUCTION] = np.repeat(np.array(texts), lengths)
+    rates = {content.rate for content in found}
+    notes = dict.fromkeys(note for content in found for note in content.notes)
+    return Steps(path, columns, np.repeat(np.arange(len(episodes)), lengths), action=action,
+                 hz=rates.pop() if len(rates) == 1 else 0.0, notes=tuple(notes))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -71,6 +105,7 @@ class _Episode:
         group: its group in the file; empty for the whole file.
         columns: name -> shape and dtype of its dataset.
         compressed: whether pictures are JPEG, padded to one length.
+        instruction: text of an attribute; empty without.
     """
 
     file: Path
@@ -78,6 +113,7 @@ class _Episode:
     length: int
     columns: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
     compressed: bool
+    instruction: str = ""
 
     @property
     def where(self) -> str:
@@ -102,13 +138,27 @@ def _open(file: Path) -> Any:
         return library.File(str(file), "r", locking=False)
 
 
-def _episodes(file: Path) -> Iterator[_Episode]:
+@dataclass(frozen=True)
+class _Content:
+    """Episodes of a file, the rate in Hz that it names, and sentences on what is unusual."""
+
+    episodes: list[_Episode]
+    rate: float = 0.0
+    notes: tuple[str, ...] = ()
+
+
+def _episodes(file: Path, key: str) -> _Content:
     with _open(file) as opened, library_errors(str(file), RECORD_AGAIN):
-        if "data" in opened and hasattr(opened["data"], "keys"):
-            for name in sorted(opened["data"], key=_natural):
-                yield _episode(file, opened, f"data/{name}")
-        else:
-            yield _episode(file, opened, "")
+        if "data" not in opened or not hasattr(opened["data"], "keys"):
+            if key:
+                raise DataError(
+                    f"{file} is not a file of robomimic: only those have filter keys.", f"leave --map mask={key} out"
+                )
+            return _Content([_episode(file, opened, "")])
+        names = sorted(opened["data"], key=_natural)
+        chosen = chosen_by(filter_keys(opened), key, names, str(file))
+        episodes = [_episode(file, opened, f"data/{name}") for name in chosen]
+        return _Content(episodes, rate_of(opened), notes_on(opened, key, sum(each.length for each in episodes)))
 
 
 def _episode(file: Path, opened: Any, group: str) -> _Episode:
@@ -128,7 +178,11 @@ def _episode(file: Path, opened: Any, group: str) -> _Episode:
     odd = {name: lengths[name] for name in columns if lengths[name] != length}
     if odd:
         raise DataError(f"{where} has {length} steps of '{action}', and of others {odd}.", RECORD_AGAIN)
-    return _Episode(file, group, length, columns, bool(opened.attrs.get("compress", False)))
+    compressed = bool(opened.attrs.get("compress", False))
+    if not group:
+        return _Episode(file, group, length, columns, compressed)
+    check_samples(opened[group], length, where)
+    return _Episode(file, group, length, columns, compressed, instruction_of(opened, opened[group]))
 
 
 def _datasets(file: Path, group: Any, prefix: str) -> Iterator[tuple[str, tuple[tuple[int, ...], np.dtype[Any]]]]:
@@ -144,7 +198,7 @@ def _datasets(file: Path, group: Any, prefix: str) -> Iterator[tuple[str, tuple[
         if isinstance(value, library.Group):
             if prefix.count("/") < 8:
                 yield from _datasets(file, value, f"{name}/")
-        elif value.shape:
+        elif value.shape and (prefix or value.shape[0]):  # robomimic's states are empty where nothing is simulated
             _check(file, name, value)
             yield name, (tuple(value.shape), value.dtype)
 

@@ -18,6 +18,7 @@ from vlatool.accuracy.episode_choice import with_episode
 from vlatool.accuracy.success_comparison import Outcome, compare_success, repeated_starts, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.bundle.manifest import Manifest
+from vlatool.bundle.program import slow_part
 from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
@@ -381,11 +382,13 @@ class ClosedLoop(Measure):
 def _refuse_real_time(controllers: Sequence[str]) -> None:
     """Refuse controllers whose actions depend on the speed of this machine; raises UsageError naming the first."""
     for entry, options in options_of(controllers).items():
-        if options.get("background") or entry is Deadline:
-            what = f"a {entry.__name__} with background=true" if entry is not Deadline else "a deadline"
+        beside = next((name for name in ("background", "thread") if options.get(name)), "")
+        if beside or entry is Deadline:
+            what = f"a {entry.__name__} with {beside}=true" if beside else "a deadline"
             raise UsageError(
                 f"What {what} does depends on the speed of this machine, which says nothing of a robot.",
-                "give the delay in control steps, such as rtc:delay=8, or add --latency-in-the-loop",
+                "give the delay in control steps, such as rtc:delay=8, or in inferences, such as "
+                "dual_rate:every=4:late=2, or add --latency-in-the-loop",
             )
 
 
@@ -394,6 +397,12 @@ class _Unopened:
 
     def __init__(self, manifest: Manifest) -> None:
         self.spec, self.program = manifest.spec, manifest.program
+        self.slow = slow_part(manifest.program)
+        self.names = tuple(tensor.name for tensor in manifest.spec.inputs)
+        self.noise = set[str]()
+
+    def parts(self) -> tuple[_Unopened, _Unopened]:
+        return self, self
 
     def infer(self, observation: Mapping[str, Any], *, noise: Any = None) -> Action:
         raise NotImplementedError

@@ -42,7 +42,7 @@ def split_phases(
         if step.graph != name:
             steps_after.append(step)
             continue
-        before = {key: getattr(step, key) for key in ("schedule", "noise", "keep")}
+        before = {key: getattr(step, key) for key in ("schedule", "noise", "keep", "slow")}
         feeds = {key: step.feeds[key] for key in cut.kept}
         steps_after.append(ProgramStep(other, {key: step.feeds[key] for key in cut.inputs}, values, **before))
         steps_after.append(replace(step, feeds={**feeds, **values}, schedule={}, noise={}, keep={}))

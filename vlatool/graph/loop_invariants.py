@@ -42,20 +42,30 @@ def name_of_once(program: Sequence[ProgramStep], name: str) -> str:
 
 
 def compute_once(program: Iterable[ProgramStep], name: str, once: str, cut: GraphCut) -> tuple[ProgramStep, ...]:
-    """Return the program in which the graph ``once`` runs before each loop over the graph ``name``."""
+    """Return the program in which the graph ``once`` runs before each loop over the graph ``name``.
+
+    Of a policy of two systems, what follows from the values of the slow part alone is computed with them, once for each
+    of its runs.
+    """
+    program = tuple(program)
+    slow = next((step.slow for step in program if step.slow), {})
+    given = [{value for step in program if bool(step.slow) == part for value in step.gives.values()}
+             for part in (True, False)]  # fmt: skip
     steps: list[ProgramStep] = []
     for step in program:
         if step.graph != name:
             steps.append(step)
             continue
         values = {value: f"{once}.{value}" for value in cut.values}
-        first = ProgramStep(once, {feed: step.feeds[feed] for feed in cut.inputs}, values)
+        first = ProgramStep(once, {feed: step.feeds[feed] for feed in cut.inputs}, values, slow=step.slow)
         rest = replace(step, feeds={**{feed: step.feeds[feed] for feed in cut.kept}, **values})
         if not step.sources().isdisjoint(first.feeds.values()):
             first = replace(first, noise=step.noise, keep=step.keep)
             rest = replace(rest, noise={}, keep={})
+        elif first.feeds and not step.slow and {*first.feeds.values()} <= given[0] - given[1]:
+            first = replace(first, slow=slow)
         steps += [first, rest]
-    return tuple(steps)
+    return tuple(sorted(steps, key=lambda step: slow != {} and not step.slow))
 
 
 def cut_loop_invariants(model: Any, changing: Collection[str]) -> GraphCut | None:

@@ -19,9 +19,11 @@ from vlatool.runtime.arguments import RECORD
 from vlatool.runtime.engine_record import EngineRecord
 from vlatool.runtime.interface import POLICY, Policy
 from vlatool.runtime.loading import is_remote, open_remote
+from vlatool.runtime.policy import BundlePolicy
 from vlatool.runtime.rungs import PolicyRung
 from vlatool.runtime.stack import Fallback, Stack, rate_factor
 from vlatool.runtime.telemetry.cadence import Cadence, CadenceReport
+from vlatool.runtime.two_parts import parts_of
 
 OBSERVATIONS = 16
 
@@ -82,12 +84,13 @@ class DryRun:
         period_ms: Control period of the robot.
         deadline_ms: Time in which a control step is answered.
         layers: Layers from the robot to the graphs, each with what it does.
-        inference: Times of ``infer`` of the open bundle alone.
+        inference: Times of ``infer`` of the open bundle alone; of its fast part alone where it has a slow one.
         answer: Times of ``act`` of all layers, called at the rate of the robot.
         missed: Share of the control steps at which the policy had no action in time.
         engine: What the engine ran of the bundle, on what and in which precision.
         rungs: What answers a control step, in the order in which it is asked, each with the time of an answer.
         cadence: Where the time of the control steps went, all but the first.
+        slow: Times of the slow part of a policy of two systems; None for another policy.
     """
 
     bundle: str
@@ -101,6 +104,7 @@ class DryRun:
     engine: EngineRecord
     rungs: tuple[RungNote, ...]
     cadence: CadenceReport
+    slow: Spread | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
@@ -151,7 +155,7 @@ def dry_run(
         raise TypeError("a deadline makes a stack")
     bundle = Bundle.open(path)
     observations = observations_for(bundle, OBSERVATIONS)
-    inference = Spread.of(_times(plain.infer, observations, steps))
+    inference, slow = _spreads(plain, observations, steps)
     others = [] if second is None else [Spread.of(_times(second.infer, observations, steps))]
     answers = play_paced(stack, observations, steps, rate)
     stack.close()
@@ -167,7 +171,17 @@ def dry_run(
         plain.engine_record(),
         tuple(_rungs(stack, [inference, *others])),
         cadence.report(),
+        slow,
     )
+
+
+def _spreads(policy: BundlePolicy, observations: Sequence[Any], count: int) -> tuple[Spread, Spread | None]:
+    """Return the times of an inference, and of the slow part where there is one, which the first leaves out."""
+    if policy.slow is None:
+        return Spread.of(_times(policy.infer, observations, count)), None
+    slow, fast = parts_of(policy)
+    fast.latent = slow.run(observations[0])
+    return Spread.of(_times(fast.infer, observations, count)), Spread.of(_times(slow.run, observations, count))
 
 
 def _second(named: str, spec: PolicySpec, threads: int | None) -> Policy:

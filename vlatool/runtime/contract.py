@@ -228,7 +228,7 @@ def written_as_declared(manifest: Manifest, sessions: Mapping[str, Any]) -> set[
     """
     makers: dict[str, list[bool]] = {}
     for step in manifest.program:
-        bound = getattr(sessions[step.graph], "bound", False)
+        bound = getattr(sessions.get(step.graph), "bound", False)
         for name in step.gives.values():
             makers.setdefault(name, []).append(bound)
         for name in (*step.carry.values(), *sources_of(step)):

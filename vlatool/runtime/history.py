@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,16 @@ class History:
 
     An inference in one thread and an observation in another may come at once, as on a robot that moves while its
     policy infers.
+
+    Args:
+        inputs: Inputs whose moments it holds; all that have a ``history`` when None.
     """
 
-    def __init__(self, spec: PolicySpec) -> None:
-        self.lengths = {tensor.name: tensor.history for tensor in spec.inputs if tensor.history}
+    def __init__(self, spec: PolicySpec, inputs: Collection[str] | None = None) -> None:
+        self.lengths = {
+            tensor.name: tensor.history for tensor in spec.inputs
+            if tensor.history and (inputs is None or tensor.name in inputs)
+        }  # fmt: skip
         self._before: dict[str, Array] = {}
         self._count = 0
         self._turn = threading.RLock()

@@ -31,11 +31,14 @@ class Origin(NamedTuple):
         age_ms: Time from the observation that it answers to the return of the action, in milliseconds; None where
             nobody says.
         checks: Names of the checks and limits that altered it, in the order in which they did.
+        latent_age_ms: Of a policy of two systems, time from the observation that the slow part's values answer to the
+            return of the action, in milliseconds; None where there is none, or nobody says.
     """
 
     source: str = POLICY
     age_ms: float | None = None
     checks: tuple[str, ...] = ()
+    latent_age_ms: float | None = None
 
     def altered_by(self, *checks: str) -> Origin:
         """Return the same with further checks that altered the action."""
@@ -54,6 +57,8 @@ class Action(NamedTuple):
         source: What computed the chunk: ``POLICY`` and the words beside it.
         age_ms: Time from the observation that it answers to this result, in milliseconds.
         checks: Names of the checks and limits that altered it, in the order in which they did.
+        latent_age_ms: Of a policy of two systems, time from the observation that the slow part's values answer to this
+            result, in milliseconds; None where both parts ran for it.
     """
 
     chunk: Array
@@ -64,10 +69,12 @@ class Action(NamedTuple):
     source: str = POLICY
     age_ms: float = 0.0
     checks: tuple[str, ...] = ()
+    latent_age_ms: float | None = None
 
     def origin(self, later_ms: float = 0.0) -> Origin:
         """Return where an action of this chunk comes from that is returned ``later_ms`` milliseconds after it."""
-        return Origin(self.source, self.age_ms + later_ms, self.checks)
+        latent = None if self.latent_age_ms is None else self.latent_age_ms + later_ms
+        return Origin(self.source, self.age_ms + later_ms, self.checks, latent)
 
 
 @runtime_checkable

@@ -26,15 +26,16 @@ class NoiseSpread:
     Args:
         policy: What infers, the deadline included.
         bundle: The open bundle inside it.
+        state: What of these layers has ``snapshot`` and ``restore``: the bundle, or what runs its two parts.
         limit: Score above which it raises an alarm.
         scale: Statistics of the action; its own units without.
     """
 
     name = "spread"
 
-    def __init__(self, policy: Any, bundle: BundlePolicy, limit: float, scale: Scale | None) -> None:
+    def __init__(self, policy: Any, bundle: BundlePolicy, state: Any, limit: float, scale: Scale | None) -> None:
         self.limit = limit
-        self._policy, self._bundle = policy, bundle
+        self._policy, self._state = policy, state
         self._deviation = np.array(1.0 if scale is None else scale.deviation)
         self._noise = {name: entry for step in bundle.program.steps for name, entry in step.noise.items()}
         self._steps = 0
@@ -46,7 +47,8 @@ class NoiseSpread:
         looks_back = any(tensor.history for tensor in spec.inputs)
         if not isinstance(bundle, BundlePolicy) or player is None or looks_back or spec.action.kind == "discrete":
             return None
-        found = cls(player.policy, bundle, limit, Scale.of(spec.action, bundle.bundle))
+        state = next(layer for layer in layers if hasattr(layer, "restore"))
+        found = cls(player.policy, bundle, state, limit, Scale.of(spec.action, bundle.bundle))
         return found if found._noise else None
 
     def score(self, observation: Mapping[str, Any]) -> float | None:
@@ -58,13 +60,13 @@ class NoiseSpread:
 
     def measure(self, observation: Mapping[str, Any], seeds: tuple[int, int]) -> float | None:
         """Return the difference between the chunks of two seeds; None where an inference fails or is late."""
-        before = self._bundle.snapshot
+        before = self._state.snapshot
         try:
             one, other = (self._policy.infer(observation, noise=self._drawn(seed)).chunk for seed in seeds)
         except VlatoolError:
             return None
         finally:
-            self._bundle.restore(before)
+            self._state.restore(before)
         return float(np.sqrt(np.mean(((one - other) / self._deviation) ** 2)))
 
     def _drawn(self, seed: int) -> dict[str, Array]:

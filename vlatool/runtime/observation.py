@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -44,22 +44,31 @@ class ObservationEncoder:
         assets: Directory of statistics and tokenizers, or the bundle that has them.
         history: Earlier moments of inputs that hold several, which may then be given as one moment; without it, they
             are given whole.
+        inputs: Inputs that it encodes, with what their prompts have in them; all when None.
 
     Raises:
         SpecError: when statistics or a tokenizer are missing or do not fit.
     """
 
-    def __init__(self, spec: PolicySpec, assets: Assets, history: History | None = None) -> None:
-        self.names = [tensor.name for tensor in spec.inputs]
+    def __init__(
+        self,
+        spec: PolicySpec,
+        assets: Assets,
+        history: History | None = None,
+        inputs: Collection[str] | None = None,
+    ) -> None:
+        encoded = _with_prompts(spec, inputs)
+        self.names = [tensor.name for tensor in encoded]
         states = [tensor.name_in_prompt for tensor in spec.inputs]
         encoders = [
             (tensor.name, _encoder(tensor, assets, history, exact=tensor.name in states), tensor.name_in_prompt)
-            for tensor in spec.inputs
+            for tensor in encoded
         ]
         self._encoders = sorted(encoders, key=lambda each: bool(each[2]))  # what a prompt has stands before it
         self._dtypes = {tensor.name: tensor.dtype for tensor in spec.inputs}
-        self._reference = spec.reference
-        self._of_reference = Converter(spec.reference, assets) if spec.reference else None
+        reference = spec.reference
+        self._reference = reference if reference is not None and reference.name in self.names else None
+        self._of_reference = Converter(self._reference, assets) if self._reference else None
 
     def __call__(self, observation: Mapping[str, Any]) -> EncodedObservation:
         """Return one array with a batch axis for each input of the spec; those of an encoded observation as they are.
@@ -124,6 +133,14 @@ class ObservationEncoder:
         written = ", ".join(f'"{name}": ...' for name in self.names)
         only = "the policy has one input: " if len(self.names) == 1 else ""
         return f"{only}pass {{{written}}}"
+
+
+def _with_prompts(spec: PolicySpec, inputs: Collection[str] | None) -> list[TensorSpec]:
+    """Return the inputs of these names, and those that are written into their prompts."""
+    if inputs is None:
+        return list(spec.inputs)
+    wanted = {*inputs, *(tensor.name_in_prompt for tensor in spec.inputs if tensor.name in inputs)}
+    return [tensor for tensor in spec.inputs if tensor.name in wanted]
 
 
 def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None, *, exact: bool = False) -> Encoder:

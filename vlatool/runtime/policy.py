@@ -7,7 +7,7 @@ import functools
 import math
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
 from vlatool.bundle.module_bundle import no_graph_error
+from vlatool.bundle.program import SlowPart, slow_part
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import BundleError, GraphError, UsageError, VlatoolError
 from vlatool.files.printable import printable
@@ -67,15 +68,18 @@ class BundlePolicy:
     to overlap, while a lock costs less than a microsecond. For a policy that keeps values from step to step,
     overlapping calls are refused, because they would mix two episodes in any order. With one policy for each thread,
     no thread has to wait.
+
+    Args:
+        inputs: Inputs that its program takes; those of the spec when None.
     """
 
-    def __init__(self, bundle: Bundle, program: Program, engine: str) -> None:
+    def __init__(self, bundle: Bundle, program: Program, engine: str, *, inputs: Collection[str] | None = None) -> None:
         self.bundle = bundle
         self.engine = engine
         self.spec: PolicySpec = bundle.manifest.spec
         self.program = program
-        self._history = History(self.spec)
-        self.encode = ObservationEncoder(self.spec, bundle, self._history)
+        self._history = History(self.spec, inputs)
+        self.encode = ObservationEncoder(self.spec, bundle, self._history, inputs)
         self._decode = Decoder(self.spec, bundle)
         certain = written_as_declared(bundle.manifest, program.sessions)
         self._outputs = Outputs(self.spec.outputs, action=False, certain=certain)
@@ -131,6 +135,14 @@ class BundlePolicy:
     def identity(self) -> str:
         """``sha256:...`` over all that decides how a robot behaves with this policy: for telemetry and logs."""
         return policy_identity(self.bundle)
+
+    @property
+    def slow(self) -> SlowPart | None:
+        """How the slow part of a policy of two systems runs beside the fast one; None for a policy without one.
+
+        ``infer`` runs both, one after the other; ``control.dual_rate`` runs the slow part beside the fast one.
+        """
+        return slow_part(self.bundle.manifest.program)
 
     def engine_record(self) -> EngineRecord:
         """Return what the engine ran of each graph, on what and in which precision, against what the bundle promises.
@@ -223,15 +235,11 @@ class BundlePolicy:
 
         An engine stops between two nodes of a graph. It does so from the first call of ``resume`` on.
         """
-        for session in self.program.sessions.values():
-            if hasattr(session, "stop"):
-                session.stop()
+        self.program.stop()
 
     def resume(self) -> None:
         """Allow inferences again after ``stop``."""
-        for session in self.program.sessions.values():
-            if hasattr(session, "resume"):
-                session.resume()
+        self.program.resume()
 
     @property
     def snapshot(self) -> tuple[Any, ...]:

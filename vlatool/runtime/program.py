@@ -35,7 +35,8 @@ class Program:
     """Runs the steps of a program over open sessions.
 
     Args:
-        seed: Seed of the noise; fresh entropy when None.
+        seed: Seed of the noise; fresh entropy when None. The slow part of a policy of two systems draws from a
+            generator of its own, so that a program of either part alone draws the same.
         outputs: Values that the caller takes from ``run``; what only one graph gives another then stays in the memory
             of their engine, where that can do so (``leave_on_device``). All values are arrays when None.
     """
@@ -51,10 +52,11 @@ class Program:
         self.sessions = sessions
         if outputs is not None:
             leave_between_graphs(self.steps, sessions, outputs)
-        self._seed = seed
+        self.seed = seed
         self._schedules = [schedule_arrays(step) for step in self.steps]
         self._plain = self._plain_step()
-        self._noisy = any(step.noise for step in self.steps)
+        self._parts_with_noise = {bool(step.slow) for step in self.steps if step.noise}
+        self._noisy = bool(self._parts_with_noise)
         self.reset()
 
     def _plain_step(self) -> tuple[Run, list[tuple[str, str]], list[tuple[str, str]]] | None:
@@ -68,8 +70,11 @@ class Program:
 
     def reset(self, seed: int | None = None) -> None:
         """Zero the kept values and restart the noise: from this seed, or from that of the program when None."""
-        if self._noisy:  # NumPy imports its generators here, for which a robot without noise need not wait
-            self._random = np.random.default_rng(self._seed if seed is None else seed)
+        chosen = self.seed if seed is None else seed
+        self._random = {  # NumPy imports its generators here, for which a robot without noise need not wait
+            slow: np.random.default_rng([chosen, 1] if slow and chosen is not None else chosen)
+            for slow in self._parts_with_noise
+        }
         self._kept = {
             name: np.zeros(kept["shape"], kept.get("dtype", "float32"))
             for step in self.steps
@@ -98,13 +103,35 @@ class Program:
     @property
     def snapshot(self) -> tuple[dict[str, Array], Any]:
         """What ``restore`` takes: the kept values, and the state of the noise where any is drawn."""
-        return self._kept, self._random.bit_generator.state if self._noisy else None
+        return self._kept, self._noise_states() if self._noisy else None
 
     def restore(self, snapshot: tuple[dict[str, Array], Any]) -> None:
         """Go back to the kept values and the noise of a snapshot."""
         self._kept, noise = snapshot
         if noise is not None:
-            self._random.bit_generator.state = noise
+            self._restore_noise(noise)
+
+    def _noise_states(self) -> dict[bool, Any]:
+        return {part: random.bit_generator.state for part, random in self._random.items()}
+
+    def _restore_noise(self, states: Mapping[bool, Any]) -> None:
+        for part, state in states.items():
+            self._random[part].bit_generator.state = state
+
+    def stop(self) -> None:
+        """End the run in progress, from another thread; it and later ones raise TimeoutError until ``resume``.
+
+        An engine stops between two nodes of a graph. It does so from the first call of ``resume`` on.
+        """
+        for session in self.sessions.values():
+            if hasattr(session, "stop"):
+                session.stop()
+
+    def resume(self) -> None:
+        """Allow runs again after ``stop``."""
+        for session in self.sessions.values():
+            if hasattr(session, "resume"):
+                session.resume()
 
     def run(
         self,
@@ -130,14 +157,14 @@ class Program:
             for name, value in gives:
                 values[value] = results[name]
             return values if finish is None else finish(values)
-        before = self._random.bit_generator.state if self._noisy else None
+        before = self._noise_states() if self._noisy else None
         try:
             self._run_steps(values, drawn)
             kept = {name: _checked(name, values[name], zero) for name, zero in self._kept.items()}
             result = values if finish is None else finish(values)
         except BaseException as error:
             if before is not None:
-                self._random.bit_generator.state = before
+                self._restore_noise(before)
             if isinstance(error, VlatoolError) and (before or self._kept):
                 _note_rollback(error)
             raise
@@ -148,7 +175,7 @@ class Program:
         values.update(self._kept)
         for step, schedules in zip(self.steps, self._schedules, strict=True):
             for name, noise in step.noise.items():
-                values[name] = drawn[name] if name in drawn else draw(noise, self._random)
+                values[name] = drawn[name] if name in drawn else draw(noise, self._random[bool(step.slow)])
             self._run_step(step, schedules, values)
 
     def _run_step(self, step: ProgramStep, schedules: dict[str, list[Array]], values: dict[str, Any]) -> None:

@@ -27,6 +27,7 @@ from vlatool.runtime.control import build_layer, check_order, layers, options_of
 from vlatool.runtime.control.action_check import CheckedPolicy
 from vlatool.runtime.control.chunked import ChunkQueue
 from vlatool.runtime.control.deadline import Deadline
+from vlatool.runtime.control.dual_rate import DualRate
 from vlatool.runtime.control.fallback import HOLD_S, FallbackLadder
 from vlatool.runtime.interface import FALLBACK, STOP, Array, Controller, Origin, Policy, layers_of, origin_of
 from vlatool.runtime.policy import BundlePolicy
@@ -245,9 +246,10 @@ class Stack:
             self.controller.reset(seed)
 
     def close(self) -> None:
-        """End the threads of the deadlines and of the telemetry, which writes what is left."""
-        for deadline in self.deadlines:
-            deadline.close()
+        """End the threads of the deadlines, of a slow part and of the telemetry, which writes what is left."""
+        for layer in self._all():
+            if isinstance(layer, Deadline | DualRate):
+                layer.close()
         if self.telemetry is not None:
             self.telemetry.close()
         if self.recorder is not None:
@@ -283,6 +285,7 @@ def build_stack(
         SpecError: when the rate of the spec is unknown, and something needs it.
     """
     _check_layers(controllers, envelope, telemetry)
+    controllers = with_slow_part(policy, controllers)
     options = fallback if isinstance(fallback, Fallback) else Fallback(fallback)
     entries, chosen = layers(controllers), options_of(controllers)
     waits, factor = not any(given.get("background") for given in chosen.values()), rate_factor(controllers)
@@ -297,7 +300,7 @@ def build_stack(
     inner: Any = policy
     reader = clock if recorder is None else recorder.follow(clock)
     for entry in wrappers:
-        inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry))
+        inner = build_layer(entry, inner, spec=policy.spec, options=chosen.get(entry), clock=clock)
     limited = _limited(inner, None if deadline_ms is None else deadline_ms - own_ms, clock, recorder)
     inner = build_layer(player, limited, spec=policy.spec, options=chosen.get(player), clock=reader)
     ladder = _ladder(inner, policy.spec, options, deadline_ms, clock, recorder) if falls_back else None
@@ -313,6 +316,14 @@ def build_stack(
     if recorder is not None:
         _record_layers(recorder, layers_of(inner))
     return Stack(inner, telemetry=telemetry, recorder=recorder, clock=clock)
+
+
+def with_slow_part(policy: Policy, controllers: Sequence[str]) -> list[str]:
+    """Return controllers with a thread for the slow part of a policy of two systems, where none says how it runs."""
+    named = [name.partition(":")[0] for name in controllers]
+    if not isinstance(policy, BundlePolicy) or policy.slow is None or "dual_rate" in named:
+        return list(controllers)
+    return ["dual_rate:thread=true", *controllers]
 
 
 def header_of(

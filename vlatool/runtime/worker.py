@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import _thread
-import atexit
 import contextlib
 import os
 import select
@@ -14,13 +13,10 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from vlatool.errors import UsageError
+from vlatool.runtime.process_end import EXIT_S, close_at_exit
 
-EXIT_S = 1.0
-"""Seconds for which the process, when it ends, waits for a task that was stopped: a run of ONNX Runtime that returns
-while Python shuts down ends the process with SIGABRT."""
 MOST_HANDLES = 1024
 """Descriptors below this are the only ones that ``select()`` takes."""
-_WORKERS: weakref.WeakSet[Worker] = weakref.WeakSet()
 
 
 class Task(Protocol):
@@ -89,14 +85,32 @@ def _signal() -> _EventSignal | _LockSignal:
         return _LockSignal()
 
 
-class _Call:
-    """One task on its way: who waits for it, and what became of it."""
+class Call:
+    """One task on its way: who waits for it, and what became of it.
 
-    def __init__(self, task: Task, due: float) -> None:
-        self.task, self.due = task, due
+    Args:
+        due: Time of the clock by which it has to end.
+        left: Seconds until then, when it started.
+    """
+
+    def __init__(self, task: Task, due: float, left: float) -> None:
+        self.task, self.due, self.left = task, due, left
         self.began = self.abandoned = self.in_time = self.ended = False
         self.result: Any = None
         self.error: BaseException | None = None
+
+    def outcome(self) -> Any:
+        """Return the result of a call that has ended.
+
+        Raises:
+            TimeoutError: when it ended too late; the task has no effect then.
+            Exception: what the task raised.
+        """
+        if self.error is not None:
+            raise self.error
+        if not self.in_time:
+            raise TimeoutError("it ended too late")
+        return self.result
 
 
 class _Desk:
@@ -108,7 +122,7 @@ class _Desk:
         self.wake.acquire()
         self.ended = _signal()
         """Sent when a call has ended, perhaps one before that which is waited for."""
-        self.call: _Call | None = None
+        self.call: Call | None = None
         self._clock = clock
         self._left = False
 
@@ -145,7 +159,33 @@ class _Desk:
         self.ended.send()
         return True
 
-    def wait(self, call: _Call, seconds: float) -> bool:
+    @property
+    def busy(self) -> bool:
+        """Whether a task is running."""
+        return self.call is not None
+
+    def abandon(self, call: Call) -> bool:
+        """Give a call up unless it has ended; see ``Worker.abandon``."""
+        with self.lock:
+            if self.call is not call:
+                return False
+            call.abandoned = True
+            if call.began:
+                call.task.stop()
+            return True
+
+    def end_call(self, seconds: float) -> None:
+        """Stop the task that runs, and wait until it has ended, but no longer than this."""
+        if (call := self.call) is not None:
+            self.abandon(call)
+            self.wait(call, seconds)
+
+    def close(self, seconds: float = EXIT_S) -> None:
+        """End the thread before Python shuts down, also where nobody has its worker any more."""
+        self.end_call(seconds)
+        self.leave()
+
+    def wait(self, call: Call, seconds: float) -> bool:
         """Return whether a call ends within a time."""
         end = time.monotonic() + seconds
         while not call.ended and self.ended.wait(max(0.0, seconds)):
@@ -169,12 +209,12 @@ class Worker:
         self._name, self._clock = name, clock
         self._desk = _Desk(clock)
         self._thread: threading.Thread | None = None
-        weakref.finalize(self, self._desk.leave).atexit = False  # ``_close_all`` waits for the thread
+        weakref.finalize(self, self._desk.leave).atexit = False  # ``process_end`` waits for the thread
 
     @property
     def busy(self) -> bool:
         """Whether a task is running."""
-        return self._desk.call is not None
+        return self._desk.busy
 
     def call(self, task: Task, due: float) -> Any:
         """Return the result of a task that ends by a time of the clock.
@@ -183,30 +223,42 @@ class Worker:
             TimeoutError: when it does not, or an abandoned task still runs; the task has no effect then.
             UsageError: when another caller is waiting.
         """
+        call = self.start(task, due)
+        try:
+            in_time = self._desk.wait(call, call.left)
+        except BaseException:  # Ctrl-C: nobody waits for it any more
+            self.abandon(call)
+            raise
+        if not in_time and self.abandon(call):
+            raise TimeoutError("it was stopped")
+        return call.outcome()
+
+    def start(self, task: Task, due: float) -> Call:
+        """Start a task beside the caller, who looks at the call until it has ended.
+
+        Args:
+            due: Time of the clock by which it has to end, or it has no effect; the caller abandons it then.
+
+        Raises:
+            TimeoutError, UsageError: as ``call`` does.
+        """
         left = due - self._clock()
         with self._desk.lock:
             if self._desk.call is not None:
                 self._refuse(self._desk.call)
             if left <= 0:
                 raise TimeoutError("no time is left for it")
-            call = self._desk.call = _Call(task, due)
+            call = self._desk.call = Call(task, due, left)
         if self._thread is None:
             self._start()
         self._desk.wake.release()
-        try:
-            in_time = self._desk.wait(call, left)
-        except BaseException:  # Ctrl-C: nobody waits for it any more
-            self._abandon(call)
-            raise
-        if not in_time and self._abandon(call):
-            raise TimeoutError("it was stopped")
-        if call.error is not None:
-            raise call.error
-        if not call.in_time:
-            raise TimeoutError("it ended too late")
-        return call.result
+        return call
 
-    def _refuse(self, call: _Call) -> None:
+    def wait(self, call: Call, seconds: float) -> bool:
+        """Return whether a call ends within a time of the process's clock."""
+        return self._desk.wait(call, seconds)
+
+    def _refuse(self, call: Call) -> None:
         """Say why no task can be taken now; a task that should have ended is stopped again."""
         if not call.abandoned:
             raise UsageError("Another caller waits for this policy.", "open one policy for each thread")
@@ -214,36 +266,20 @@ class Worker:
             call.task.stop()
         raise TimeoutError("one that was stopped before has not ended yet")
 
-    def _abandon(self, call: _Call) -> bool:
-        """Give a call up unless it has ended; returns whether it was."""
-        with self._desk.lock:
-            if self._desk.call is not call:
-                return False
-            call.abandoned = True
-            if call.began:
-                call.task.stop()
-            return True
+    def abandon(self, call: Call) -> bool:
+        """Give a call up unless it has ended: its task is stopped, and has no effect; returns whether it was."""
+        return self._desk.abandon(call)
 
     def _start(self) -> None:
-        _WORKERS.add(self)
+        close_at_exit(self._desk)
         self._thread = threading.Thread(target=self._desk.serve, name=self._name, daemon=True)
         self._thread.start()
 
     def close(self, seconds: float = EXIT_S) -> None:
         """End the thread; the next call starts another. A task that runs is stopped, and waited for so many seconds."""
-        call, thread = self._desk.call, self._thread
-        if call is not None:
-            self._abandon(call)
-            self._desk.wait(call, seconds)
+        thread = self._thread
+        self._desk.end_call(seconds)
         if not self.busy and thread is not None:
             self._thread = None
             self._desk.wake.release()
             thread.join()
-
-
-def _close_all() -> None:
-    for worker in list(_WORKERS):
-        worker.close()
-
-
-atexit.register(_close_all)

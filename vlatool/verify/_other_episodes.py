@@ -12,8 +12,9 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import Recording
 from vlatool.files.rows import in_memory
 from vlatool.verify._appearance import CHANGES, MAX_FRAMES, RIGHT, Appearance, Looks, Verdict
+from vlatool.verify._diagnosis import Scales, explain
 from vlatool.verify._explanation import Explanation
-from vlatool.verify._model import Model, Scales, explain
+from vlatool.verify._model import Model
 from vlatool.verify._reading import Changes, Names, Reader, rows_of
 from vlatool.verify._search import (
     DELAY_KIND,
@@ -26,6 +27,7 @@ from vlatool.verify._search import (
     episodes_of,
 )
 from vlatool.verify._series import Series
+from vlatool.verify._tasks import Tasks
 from vlatool.verify._texts import explain_empty, unknown_texts
 from vlatool.verify._vectors import FACTORS
 
@@ -55,6 +57,7 @@ class Judge:
 
     Args:
         images: image -> classifier of how it looks.
+        tasks: input of text -> classifier of the tasks that it names.
     """
 
     spec: PolicySpec
@@ -63,6 +66,7 @@ class Judge:
     images: Mapping[str, Appearance]
     texts: Mapping[str, Sequence[str]]
     series: Series
+    tasks: Mapping[str, Tasks]
 
     @classmethod
     def of(cls, spec: PolicySpec, names: Names, reference: Recording) -> Judge:
@@ -73,7 +77,10 @@ class Judge:
         shown = _spread(len(rows))
         looks = _looks(spec, names, reference, rows[shown])
         images = {name: Appearance.of(_of_size(looks, name), name, groups[shown], episodes[shown]) for name in looks}
-        return cls(spec, reader, model, images, _texts(spec, reference, rows), series)
+        texts = _texts(spec, reference, rows[shown])
+        found = {name: Tasks.of(looks, each, episodes[shown]) for name, each in texts.items()}
+        tasks = {name: each for name, each in found.items() if each is not None}
+        return cls(spec, reader, model, images, _texts(spec, reference, rows), series, tasks)
 
     def explain(self, log: Recording, scales: Scales) -> Outcome:
         """Say what is wrong with a log."""
@@ -81,9 +88,10 @@ class Judge:
         looks = _looks(self.spec, self.reader.names, log, rows[_spread(len(rows))])
         verdicts = {name: self.images[name].judge(looks[name]) for name in looks}
         (series, *_), _ = self.reader.variants(log, _changes(verdicts))
-        model = self.model.for_log(series)
+        model = self.model.for_log(series, known=self._is_known(log, rows))
         found, right = explain(model, series, scales)
-        explanations = [*_of_images(verdicts, len(rows)), *self._of_texts(log, rows)]
+        wrong = list(_of_images(verdicts, len(rows)))
+        explanations = [*wrong, *self._of_texts(log, rows), *(() if wrong else self._of_tasks(log, looks, rows))]
         for name, finding in found:
             explanations += self._of_signal(model, name, finding, len(rows))
         suspicious = [*_odd_images(verdicts), *self._odd_texts(log, rows, episodes), *self._odd_levels(right)]
@@ -94,10 +102,17 @@ class Judge:
         components = tuple((name, each) for name in unseen for each in unseen[name])
         return Outcome(tuple(explanations), tuple(suspicious), tuple(sentences), components)
 
+    def _is_known(self, log: Recording, rows: Indices) -> bool:
+        """Return whether the reference has each text of the log, and other episodes with it."""
+        mine = _texts(self.spec, log, rows)
+        return bool(mine) and all({*mine[name]} <= {*self.texts[name]} for name in mine)
+
     def labels(self, name: str) -> Sequence[str]:
         """Return a name for each element of a signal."""
         tensor = next((each for each in (*self.spec.inputs, self.spec.action) if each.name == name), None)
         width = self.series.values[name].shape[1]
+        if name in self.reader.codes:
+            return [f"{value:g}" for value in self.reader.codes[name].tolist()]
         own = tensor.labels if tensor is not None else ()
         return own if len(own) == width else [f"[{index}]" for index in range(width)]
 
@@ -115,6 +130,12 @@ class Judge:
     def _of_texts(self, log: Recording, rows: Indices) -> Iterator[Explanation]:
         for name, mine in _texts(self.spec, log, rows).items():
             yield from explain_empty(name, mine, self.texts[name])
+
+    def _of_tasks(self, log: Recording, looks: Mapping[str, Looks], rows: Indices) -> Iterator[Explanation]:
+        """Yield texts of another task than the images are of, where the images look right."""
+        for name, mine in _texts(self.spec, log, rows[_spread(len(rows))]).items():
+            if name in self.tasks:
+                yield from self.tasks[name].explain(name, looks, mine)
 
     def _odd_texts(self, log: Recording, rows: Indices, episodes: Indices) -> Iterator[str]:
         for name, mine in _texts(self.spec, log, rows).items():

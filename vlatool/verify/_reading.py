@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import Recording
@@ -24,6 +25,8 @@ SHIFT = (0, 1)
 """Blocks by which a camera may see all elsewhere: up or down, and sideways."""
 SAME_ACTION = 0.1
 """Share of the largest difference of actions that two of the same moment have at most."""
+MAX_CODES = 64
+"""Values of an input of integers, above which it does not number something."""
 WHOLE = 8
 """Parts into which a recording without episodes is divided."""
 Changes = Mapping[str, tuple[str, Callable[[Array], Array]]]
@@ -35,6 +38,7 @@ class Names:
     """Which signals there are: vectors of floats, images, and the commands; empty without.
 
     Args:
+        codes: inputs of integers, where the commands are integers, too.
         dense: whether rows follow each other by a control step: without that, nothing follows from anything in time.
     """
 
@@ -42,6 +46,7 @@ class Names:
     images: tuple[str, ...]
     commands: str
     dense: bool = True
+    codes: tuple[str, ...] = ()
 
 
 def names_of(spec: PolicySpec, log: Recording, reference: Recording, width: int) -> Names:
@@ -57,7 +62,17 @@ def names_of(spec: PolicySpec, log: Recording, reference: Recording, width: int)
             vectors.append(tensor.name)
     both = log.actions is not None and reference.actions is not None
     dense = all(is_dense(each, spec) for each in (log, reference))
-    return Names(tuple(vectors), tuple(images), spec.action.name if both else "", dense)
+    commands = spec.action.name if both else ""
+    found = _codes(spec, log, reference, width) if commands and spec.action.kind == "discrete" else ()
+    return Names(tuple(vectors), tuple(images), commands, dense, tuple(found))
+
+
+def _codes(spec: PolicySpec, log: Recording, reference: Recording, width: int) -> Iterator[str]:
+    for tensor in spec.inputs:
+        mine, other = log.inputs[tensor.name], reference.inputs[tensor.name]
+        integers = tensor.kind != "text" and not is_image(tensor) and np.dtype(tensor.dtype).kind in "iu"
+        if integers and mine.shape[1:] == other.shape[1:] and int(np.prod(mine.shape[1:])) <= width:
+            yield tensor.name
 
 
 def is_dense(recording: Recording, spec: PolicySpec) -> bool:
@@ -82,11 +97,13 @@ class Reader:
 
     Args:
         motions: image -> what turns it into numbers.
+        codes: input of integers -> the values that its last element has, ascending.
     """
 
     spec: PolicySpec
     names: Names
     motions: Mapping[str, Motion] = field(default_factory=dict)
+    codes: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def variants(self, recording: Recording, changes: Changes | None = None) -> tuple[list[Series], Reader]:
         """Return the signals of a recording, with more noise, and of moved cameras; and a reader that knows images."""
@@ -100,6 +117,14 @@ class Reader:
             means = blocks(tensor, recording.inputs[source], chosen)
             grey[tensor.name] = (change(means) if change else means).mean(axis=-1)
         reader = replace(self, motions=self.motions or {name: Motion.of(images) for name, images in grey.items()})
+        last = {
+            name: in_memory(recording.inputs[name])[chosen].reshape(len(chosen), -1)[:, -1] for name in self.names.codes
+        }
+        known = {name: np.unique(each) for name, each in last.items()}
+        reader = replace(
+            reader, codes=self.codes or {name: each for name, each in known.items() if len(each) <= MAX_CODES}
+        )
+        values |= {name: (last[name][:, None] == each).astype(np.float64) for name, each in reader.codes.items()}
         series = Series(values, episodes, groups)
         moved = {name: np.roll(images, SHIFT, axis=(1, 2)) for name, images in grey.items()}
         seen = ((series, grey), _with_noise(series, self.names, grey), (series, moved))

@@ -184,6 +184,15 @@ class Tables:
 
     by_delay: Mapping[int, Array]
 
+    @classmethod
+    def sum_of(cls, parts: Sequence[Tables]) -> Tables:
+        """Return what several logs say together."""
+        return cls({delay: np.sum([each.by_delay[delay] for each in parts], axis=0) for delay in parts[0].by_delay})
+
+    def plus(self, more: Mapping[int, Array]) -> Tables:
+        """Return tables with what else speaks for the elements, (A, A) for each delay, with any sign and factor."""
+        return Tables({delay: table + more[delay] for delay, table in self.by_delay.items()})
+
     def without_signs(self) -> Tables:
         """Return the same for indices, which have neither sign nor unit."""
         return Tables({delay: np.where(COSTS == 0, table, -1e6) for delay, table in self.by_delay.items()})
@@ -195,15 +204,21 @@ class Tables:
 
 
 def tables(
-    predictions: Sequence[Prediction], levels: Levels | None, series: Series, name: str, *, only_delay: bool = False
+    predictions: Sequence[Prediction],
+    levels: Levels | None,
+    series: Series,
+    name: str,
+    delays: Sequence[int],
+    *,
+    only_delay: bool,
 ) -> Tables:
-    """Return what speaks for each change of a signal."""
+    """Return what speaks for each change of a signal, some steps late."""
     values = series.values[name]
     width = values.shape[1]
     level = levels.support(values, series) if levels else np.zeros((len(SIGNS_FACTORS), width, width))
     predicted = [(each, each.predict(series)) for each in predictions]
     found = {}
-    for delay in DELAYS:
+    for delay in delays:
         found[delay] = level + sum(_association(each, rows, series, delay) for each, rows in predicted)
     if only_delay:
         found = {
@@ -329,7 +344,7 @@ def search(found: Tables, needed: Mapping[str, float], *, only_delay: bool = Fal
     width = table.shape[1]
     order, _ = _assigned(table)
     taken = np.arange(width)
-    for cycle in _cycles(order):
+    for cycle in cycles(order):
         value = (table - COSTS).max(axis=0)
         gain = sum(value[i, order[i]] - value[i, i] for i in cycle) - PRIOR * (len(cycle) - 1)
         if gain > needed[ORDER_KIND]:
@@ -397,7 +412,7 @@ def _assigned(table: Array) -> tuple[NDArray[np.int64], float]:
     return order, float(value[rows, order].sum())
 
 
-def _cycles(order: NDArray[np.int64]) -> list[list[int]]:
+def cycles(order: Sequence[int] | NDArray[np.int64]) -> list[list[int]]:
     """Return the cycles of a permutation that move something."""
     found, seen = [], set[int]()
     for start in range(len(order)):

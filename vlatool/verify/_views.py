@@ -92,14 +92,18 @@ class Basis:
         return cls(values[chosen], values.std(axis=0) + 1e-9, lead)
 
     def features(self, series: Series, sources: Sequence[str]) -> Array:
-        """Return how near the arm comes to each place in a step, and how fast it moves there: (N, 2 K)."""
+        """Return how near the arm comes to each place, how fast it moves there, and each element: (N, 2 (K + A)).
+
+        Of how fast an element moves also the root, since the motion in a part of an image is measured as a root.
+        """
         values = np.concatenate([series.values[name] for name in sources], axis=1) / self.scale
         centres = self.centres / self.scale
         squares = (values**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2 * values @ centres.T
         near = np.exp(-np.maximum(squares, 0) / values.shape[1])
         ahead = series.rows(1)
-        speed = np.sqrt(((values[ahead] - values) ** 2).sum(axis=1, keepdims=True))
-        found = np.concatenate([near[ahead] - near, speed * near], axis=1)
+        moved = np.abs(values[ahead] - values)
+        speed = np.sqrt((moved**2).sum(axis=1, keepdims=True))
+        found = np.concatenate([near[ahead] - near, speed * near, moved, np.sqrt(moved)], axis=1)
         share = abs(self.lead)
         return (1 - share) * found + share * found[series.rows(1 if self.lead > 0 else -1)] if share else found
 
@@ -200,8 +204,14 @@ def _log_slopes(outcome: Array, predicted: Array) -> Array:
         return np.log(np.where((slopes > 0) & (_correlations(one, other) > 0.3), slopes, np.nan))
 
 
-def views_of(vectors: Sequence[str], images: Sequence[str], commands: str, *, dense: bool) -> list[View]:
-    """Return what is predicted from what: vectors from the commands, or the others, and images from the vectors."""
+def views_of(
+    vectors: Sequence[str], images: Sequence[str], commands: str, *, dense: bool, discrete: bool = False
+) -> list[View]:
+    """Return what is predicted from what: vectors from the commands, or the others, and images from the vectors.
+
+    Args:
+        discrete: whether the commands are indices, which images have other witnesses for.
+    """
     found = [View(name, PLACE, tuple(f"{image}{PLACES}" for image in images)) for name in vectors if images]
     if not dense:
         return found
@@ -211,9 +221,9 @@ def views_of(vectors: Sequence[str], images: Sequence[str], commands: str, *, de
     for name in images:
         if vectors:
             found.append(View(name, MOTION, tuple(vectors)))
-        elif commands:
+        elif commands and not discrete:
             found.append(View(name, VALUE, (commands,), commands=True))
-    if commands and (sources := tuple(vectors) or tuple(images)):
+    if commands and (sources := tuple(vectors) or (() if discrete else tuple(images))):
         found.append(View(commands, VALUE, sources))
     return found
 

@@ -23,13 +23,14 @@ from vlatool.runtime.statistics import Normaliser, load_normaliser
 from vlatool.stage.base import Context
 from vlatool.stage.identity import with_identity
 from vlatool.verify._actions import explain_actions, in_memory
+from vlatool.verify._diagnosis import Scales
 from vlatool.verify._distributions import explain_statistics, scales_of
 from vlatool.verify._explanation import Explanation
 from vlatool.verify._images import explain_images, is_image
-from vlatool.verify._model import Scales
 from vlatool.verify._other_episodes import Judge, Outcome
 from vlatool.verify._pairing import Pairs, pair_rows
 from vlatool.verify._reading import names_of
+from vlatool.verify._texts import explain_paired
 from vlatool.verify._vectors import BETTER, MAX_UNLIKE, Match, explain_vector, match_vectors
 
 Array = NDArray[np.float64]
@@ -210,6 +211,12 @@ def _of_pairs(signals: Signals) -> Iterator[Explanation]:
         labels = signals.labels(tensor, mine.shape[1])
         yield from explain_vector(
             tensor.name, labels, mine, right, signals.pairings, matches[tensor.name], signals.normaliser(tensor)
+        )
+    for name in (tensor.name for tensor in signals.tensors if tensor.kind == "text"):
+        both = signals.pairings[0]
+        sides = (signals.log, both.log), (signals.reference, both.reference)
+        yield from explain_paired(
+            name, *(in_memory(each.inputs[name])[rows].astype(str).tolist() for each, rows in sides)
         )
     for name, (explanation, unlike) in signals.explained_images.items():
         if explanation is not None:

@@ -148,7 +148,7 @@ def test_an_entry_that_is_neither_is_said():
 def test_all_of_vlatools_controllers_are_made_of_a_policy_alone():
     place = TensorSpec("place", (1, 2), labels=MOVES.labels)
     spec = PolicySpec((*spec_of().inputs, place), (MOVES,), 20, 2)
-    for name in {*registry.names("control")} - {"envelope", "zero_noise"}:  # which need the envelope of a robot, noise
+    for name in {*registry.names("control")} - {"envelope", "zero_noise", "dual_rate"}:  # not of this policy
         made = build_controller(NumberedPolicy(spec), (name,))
         assert isinstance(made, Controller)
         np.testing.assert_array_equal(made.act({"t": 0, "place": np.zeros(2)}), [0, 0.5])

@@ -10,9 +10,11 @@ from _numbered import NumberedPolicy, spec_of
 from _records import record
 
 from vlatool.bundle.spec import TensorSpec
+from vlatool.runtime.interface import POLICY, Origin
 from vlatool.runtime.stack import build_stack
 from vlatool.runtime.telemetry import PARTS, Delivery
 from vlatool.runtime.telemetry.cadence import Cadence, cadence_lines
+from vlatool.runtime.telemetry.json_lines import as_dict
 
 
 def test_parts_sum_to_the_whole():
@@ -30,6 +32,20 @@ def test_parts_sum_to_the_whole():
     assert (parts[1].p99_ms, parts[1].max_ms, parts[-1].max_ms) == (9, 9, 3)
     assert "infer" in "\n".join(cadence_lines(report))
     assert cadence_lines(report.to_dict()) == cadence_lines(report)
+
+
+def test_the_age_of_a_slow_part_is_beside_the_parts():
+    cadence = Cadence()
+    for step in range(4):
+        cadence(record(step, origin=Origin(POLICY, 3.5, (), None if step == 3 else 100.0 * step)))
+    report = cadence.report()
+    assert report.latent is not None
+    assert (report.latent.steps, report.latent.p50_ms, report.latent.max_ms) == (3, 100, 200)
+    assert report.parts[-1].max_ms < 10, "no part of a step"
+    assert "latent age" in cadence_lines(report)[-1]
+    assert cadence_lines(report.to_dict()) == cadence_lines(report)
+    assert as_dict(record(origin=Origin(POLICY, latent_age_ms=5.0)))["latent_age_ms"] == 5
+    assert "latent_age_ms" not in as_dict(record())
 
 
 def test_what_nobody_says_is_left_out():

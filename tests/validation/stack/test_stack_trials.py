@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+import two_systems
+from _two_systems import two_systems as bundle_of_two_systems
 from bad_outputs import graph_outputs, wrong_outputs
 from damaged_files import trials
 from endless import endless
@@ -28,6 +30,15 @@ def test_by_the_clock_of_this_machine_too():
 def test_a_graph_without_end_is_stopped():
     found = endless(2)
     assert (found["stopped"], found["right afterwards"]) == (2, 2)
+
+
+def test_a_fast_part_acts_on_values_of_a_bounded_age_beside_a_slow_part(capsys: pytest.CaptureFixture[str]):
+    bundle = two_systems.slowed(bundle_of_two_systems().path, 300, 20.0, 2000.0)
+    beside, together = two_systems.run(bundle, 0.75)
+    assert len(beside["answers"]) == len(together["answers"]) == 15
+    assert beside["sources"].get("policy", 0) >= 1
+    assert 0 < beside["ages"].max() <= 2000 + 50
+    assert "slow part in a thread: answers within 45 ms" in capsys.readouterr().out
 
 
 def test_no_wrong_output_reaches_the_robot():

@@ -7,20 +7,23 @@ import queue
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 import numpy as np
 
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import DataError
-from vlatool.runtime.interface import Array, Policy, observer_of
+from vlatool.runtime.interface import Action, Array, Policy, observer_of
+from vlatool.runtime.process_end import EXIT_S, close_at_exit
 
 
 class Inference(Protocol):
     """One inference at a time, beside the control steps."""
 
     running: bool
+    lead_ms: float | None
+    """How much older the observation is that the values of a slow part answer than that of the last chunk, in ms."""
 
     def start(self, observation: Mapping[str, Any]) -> None:
         """Start an inference with the observation of this control step."""
@@ -50,11 +53,12 @@ class PlayedInference:
 
     def __init__(self, policy: Policy, delay: int) -> None:
         self.running = False
+        self.lead_ms: float | None = None
         self._policy, self._delay, self._observer = policy, delay, observer_of(policy)
 
     def start(self, observation: Mapping[str, Any]) -> None:
         """Infer."""
-        self._chunk = self._policy.infer(observation).chunk
+        self._action = self._policy.infer(observation)
         self.running = True
 
     def observe(self, observation: Mapping[str, Any]) -> None:
@@ -68,8 +72,8 @@ class PlayedInference:
 
     def wait(self) -> Array:
         """Return the chunk."""
-        self.running = False
-        return self._chunk
+        self.running, self.lead_ms = False, _lead_ms(self._action)
+        return self._action.chunk
 
     def cancel(self) -> None:
         """Discard the chunk."""
@@ -77,7 +81,7 @@ class PlayedInference:
 
 
 class BackgroundInference:
-    """Infers in a thread of its own, which ends when this object is collected.
+    """Infers in a thread of its own, which ends when this object is collected, or with the process.
 
     An observation is copied before the thread gets it. Inputs that hold several moments are given whole, since the
     policy itself might see the moments in another order than they came.
@@ -85,11 +89,10 @@ class BackgroundInference:
 
     def __init__(self, policy: Policy) -> None:
         self.running = False
+        self.lead_ms: float | None = None
         self._moments = Moments(policy.spec)
-        self._work: queue.SimpleQueue[Mapping[str, Any] | None] = queue.SimpleQueue()
-        self._answers: queue.SimpleQueue[Array | BaseException] = queue.SimpleQueue()
-        arguments = policy.infer, self._work, self._answers
-        threading.Thread(target=_infer_all, args=arguments, name="vlatool-inference", daemon=True).start()
+        thread = _InferenceThread(policy.infer)
+        self._work, self._answers = thread.work, thread.answers
         weakref.finalize(self, self._work.put, None)
 
     def start(self, observation: Mapping[str, Any]) -> None:
@@ -114,7 +117,8 @@ class BackgroundInference:
         self.running = False
         if isinstance(answer, BaseException):
             raise answer
-        return answer
+        self.lead_ms = _lead_ms(answer)
+        return answer.chunk
 
     def cancel(self) -> None:
         """Wait for the thread and discard what it answers."""
@@ -124,16 +128,34 @@ class BackgroundInference:
         self._moments.clear()
 
 
-def _infer_all(
-    infer: Callable[..., Any],
-    work: queue.SimpleQueue[Mapping[str, Any] | None],
-    answers: queue.SimpleQueue[Array | BaseException],
-) -> None:
-    while (observation := work.get()) is not None:
-        try:
-            answers.put(infer(observation).chunk)
-        except BaseException as error:  # the control loop raises it
-            answers.put(error)
+class _InferenceThread:
+    """The thread of a ``BackgroundInference``, which it does not hold; it ends after a None of ``work``."""
+
+    def __init__(self, infer: Callable[..., Any]) -> None:
+        self.work: queue.SimpleQueue[Mapping[str, Any] | None] = queue.SimpleQueue()
+        self.answers: queue.SimpleQueue[Action | BaseException] = queue.SimpleQueue()
+        self.busy = False
+        """Whether it infers."""
+        self._infer = infer
+        self._thread = threading.Thread(target=self._infer_all, name="vlatool-inference", daemon=True)
+        self._thread.start()
+        close_at_exit(self)
+
+    def _infer_all(self) -> None:
+        while (observation := self.work.get()) is not None:
+            self.busy = True
+            answer: Action | BaseException
+            try:
+                answer = self._infer(observation)
+            except BaseException as error:  # the control loop raises it
+                answer = error
+            self.busy = False
+            self.answers.put(answer)
+
+    def close(self, seconds: float = EXIT_S) -> None:
+        """End it after the inference in progress, which is waited for so many seconds."""
+        self.work.put(None)
+        self._thread.join(seconds)
 
 
 class Moments:
@@ -141,12 +163,14 @@ class Moments:
 
     Args:
         spec: of the policy; ``lengths`` has its inputs with a ``history`` and how many moments they hold.
+        inputs: Names of the inputs that are wanted; all when None.
     """
 
-    def __init__(self, spec: PolicySpec) -> None:
-        self._names = [tensor.name for tensor in spec.inputs]
-        self.lengths = {tensor.name: tensor.history for tensor in spec.inputs if tensor.history}
-        self._axes = {tensor.name: len(tensor.observation.moment.shape) for tensor in spec.inputs if tensor.history}
+    def __init__(self, spec: PolicySpec, inputs: Collection[str] | None = None) -> None:
+        wanted = [tensor for tensor in spec.inputs if inputs is None or tensor.name in inputs]
+        self._names = [tensor.name for tensor in wanted]
+        self.lengths = {tensor.name: tensor.history for tensor in wanted if tensor.history}
+        self._axes = {tensor.name: len(tensor.observation.moment.shape) for tensor in wanted if tensor.history}
         self._before: deque[Mapping[str, Any]] = deque(maxlen=max(self.lengths.values(), default=1))
 
     def add(self, observation: Mapping[str, Any]) -> dict[str, Any]:
@@ -170,6 +194,10 @@ class Moments:
     def clear(self) -> None:
         """Start a new episode."""
         self._before.clear()
+
+
+def _lead_ms(action: Action) -> float | None:
+    return None if action.latent_age_ms is None else action.latent_age_ms - action.age_ms
 
 
 def _copied(value: Any) -> Any:

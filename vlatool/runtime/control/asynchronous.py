@@ -130,7 +130,9 @@ class AsynchronousController(ChunkQueue):
             return self._last.copy()
 
     def _next(self) -> Array:
-        self.origin = Origin(POLICY if self._pending else HOLD, (self._clock() - self._observed) * 1e3)
+        age_ms, lead_ms = (self._clock() - self._observed) * 1e3, self._inference.lead_ms
+        latent_ms = None if lead_ms is None else age_ms + lead_ms
+        self.origin = Origin(POLICY if self._pending else HOLD, age_ms, latent_age_ms=latent_ms)
         if not self._pending:
             if self._last is None:
                 raise UsageError("The policy gives a chunk without actions.", "let it give one action at least")

@@ -11,7 +11,7 @@ import numpy as np
 from vlatool.runtime.telemetry.record import PARTS, Delivery, TickRecord
 
 BEFORE, AFTER = ("sensor age", "wait"), ("transport",)
-WHOLE = "whole"
+WHOLE, LATENT = "whole", "latent age"
 
 
 class Stopwatch:
@@ -82,10 +82,13 @@ class CadenceReport:
         parts: From the measurement that an action answers to the robot; the last is the whole step. The means of the
             parts sum to that of the whole.
         misses: Steps at which the policy had no action.
+        latent: Of a policy of two systems, the age of the values of its slow part when an action was returned, which
+            belongs to no control step (share 0); None where no action says it.
     """
 
     parts: tuple[PartTime, ...]
     misses: int
+    latent: PartTime | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
@@ -103,6 +106,7 @@ class Cadence:
         self._rows = np.zeros((steps, len(BEFORE) + len(PARTS) + len(AFTER)), np.float32)
         self._told = np.zeros(self._rows.shape[1], bool)
         self._steps = np.full(steps, -1, np.int64)
+        self._latent = np.full(steps, np.nan, np.float32)
         self._count = self.misses = 0
 
     def __call__(self, record: Any) -> None:
@@ -117,6 +121,8 @@ class Cadence:
             return
         row = (record.sensed_ms or 0.0, record.waited_ms, *record.parts_ms, 0.0)
         self._rows[record.step % size], self._steps[record.step % size] = row, record.step
+        latent = record.origin.latent_age_ms
+        self._latent[record.step % size] = np.nan if latent is None else latent
         self._told[: len(row) - 1] |= [record.sensed_ms is not None, *[True] * (len(row) - 2)]
         self._count += 1
         self.misses += record.missed
@@ -128,8 +134,9 @@ class Cadence:
             return CadenceReport((), 0)
         whole = rows.sum(1)
         columns = [(name, rows[:, index]) for index, name in enumerate((*BEFORE, *PARTS, *AFTER)) if self._told[index]]
+        ages = self._latent[np.isfinite(self._latent)].astype(np.float64)
         return CadenceReport(tuple(_part(name, times, whole.mean()) for name, times in [*columns, (WHOLE, whole)]),
-                             self.misses)  # fmt: skip
+                             self.misses, _part(LATENT, ages, 0.0) if len(ages) else None)  # fmt: skip
 
 
 def _part(name: str, times: Any, whole: float) -> PartTime:
@@ -140,9 +147,12 @@ def _part(name: str, times: Any, whole: float) -> PartTime:
 
 def cadence_lines(report: Mapping[str, Any] | CadenceReport) -> list[str]:
     """Return a table for a person: each part with its median, 99th percentile, largest and share."""
-    parts = report.parts if isinstance(report, CadenceReport) else [PartTime(**each) for each in report["parts"]]
+    if not isinstance(report, CadenceReport):
+        latent = report.get("latent")
+        parts = tuple(PartTime(**each) for each in report["parts"])
+        report = CadenceReport(parts, report["misses"], None if latent is None else PartTime(**latent))
     lines = [f"  {'where a control step went':<26}{'mean':>9}{'p50':>9}{'p99':>9}{'max ms':>9}{'share':>8}"]
-    for each in parts:
+    for each in (*report.parts, *filter(None, [report.latent])):
         numbers = "".join(f"{value:9.3f}" for value in (each.mean_ms, each.p50_ms, each.p99_ms, each.max_ms))
-        lines.append(f"  {each.part:<26}{numbers}{each.share:>8.1%}")
+        lines.append(f"  {each.part:<26}{numbers}{'' if each is report.latent else f'{each.share:>8.1%}'}")
     return lines

@@ -138,6 +138,8 @@ def as_dict(record: Any) -> dict[str, Any]:
         values["sensed_ms"] = round(record.sensed_ms, 4)
     parts = {f"{name}_ms": round(time, 4) for name, time in zip(PARTS, record.parts_ms, strict=True)}
     origin = record.origin
+    if origin.latent_age_ms is not None:
+        parts["latent_age_ms"] = round(origin.latent_age_ms, 4)
     return {
         **values, **parts, "missed": record.missed, "rung": record.rung, "level": record.level,
         "source": origin.source, "age_ms": None if origin.age_ms is None else round(origin.age_ms, 4),

@@ -12,6 +12,8 @@ from vlatool.runtime.interface import POLICY
 from vlatool.runtime.telemetry.histogram import Histogram
 from vlatool.runtime.telemetry.record import PARTS, Delivery, TickRecord
 
+TIMES = ("answer", "wait", "sensor age", "age", "latent age", "transport", *PARTS)
+"""What is timed of a control step."""
 NAMES = 64
 """Most reasons of one kind that are told apart; later ones count as ``OTHER_REASON``."""
 OTHER_REASON = "other"
@@ -26,7 +28,7 @@ class Metrics:
         self.lock = threading.Lock()
         """Held while a record is counted, and by who reads several numbers."""
         self.steps = self.misses = self.level = 0
-        self.times = {name: Histogram() for name in ("answer", "wait", "sensor age", "age", "transport", *PARTS)}
+        self.times = {name: Histogram() for name in TIMES}
         """What was timed -> its times."""
         self.counts: dict[str, Counter[str]] = {kind: Counter() for kind in ("source", "check", "error", "alarm")}
         """Kind -> reason -> number of control steps."""
@@ -46,7 +48,8 @@ class Metrics:
         self.misses += record.missed
         self.level = record.level
         named = {"answer": record.answer_ms, "wait": record.waited_ms, "sensor age": record.sensed_ms,
-                 "age": record.origin.age_ms, **dict(zip(PARTS, record.parts_ms, strict=True))}  # fmt: skip
+                 "age": record.origin.age_ms, "latent age": record.origin.latent_age_ms,
+                 **dict(zip(PARTS, record.parts_ms, strict=True))}  # fmt: skip
         for name, time_ms in named.items():
             if time_ms is not None:
                 self.times[name].add(time_ms)

@@ -113,7 +113,8 @@ class Recorder:
                                   "reason": getattr(error, "message", str(error))})  # fmt: skip
             return
         self._answers.append({
-            "policy": index, "latency_ms": answer.latency_ms, "age_ms": answer.age_ms, "sequence": answer.sequence,
+            "policy": index, "latency_ms": answer.latency_ms, "age_ms": answer.age_ms,
+            "latent_age_ms": answer.latent_age_ms, "sequence": answer.sequence,
             "source": answer.source, "checks": list(answer.checks), "outputs": list(answer.outputs),
         })  # fmt: skip
         self._arrays[f"chunk.{number}"] = np.array(answer.chunk)
@@ -221,7 +222,7 @@ class _NotedPolicy:
 
 
 def refuse_background(layers: Any) -> None:
-    """Refuse to record a player whose inferences run beside the control steps.
+    """Refuse to record a player whose inferences, or a policy whose slow part, run beside the control steps.
 
     Raises:
         UsageError: naming it.
@@ -232,6 +233,12 @@ def refuse_background(layers: Any) -> None:
                 f"{type(layer).__name__} infers in a thread of its own: what it does depends on when that is done, "
                 "and cannot be replayed bit by bit.",
                 "record with delay=N in the place of background=true, or without this controller",
+            )
+        if getattr(layer, "thread", False):
+            raise UsageError(
+                f"The slow part of the policy runs in a thread of its own ({type(layer).__name__}): which of its "
+                "values an action uses depends on when they are there, and cannot be replayed bit by bit.",
+                'record with the slow part at each k-th inference: controllers=["dual_rate:every=4"]',
             )
 
 

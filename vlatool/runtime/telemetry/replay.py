@@ -285,4 +285,5 @@ def _form(array: Array) -> str:
 
 def _as_late(action: Action, values: Mapping[str, Any]) -> Action:
     """Return an action with the times that were recorded."""
-    return action._replace(latency_ms=values["latency_ms"], age_ms=values["age_ms"])
+    return action._replace(latency_ms=values["latency_ms"], age_ms=values["age_ms"],
+                           latent_age_ms=values.get("latent_age_ms"))  # fmt: skip
