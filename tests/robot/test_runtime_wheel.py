@@ -94,12 +94,8 @@ def test_it_holds_what_load_imports_and_nothing_else():
     assert {source.removeprefix("../") for source in listed} == set(listed.values())
     files = {file for name in listed.values() for file in [ROOT / name, *(ROOT / name).rglob("*.py")] if file.is_file()}
     rooms = [ROOT / "vlatool" / name for name in ("runtime", "deployment", "messages", "buses", "controllers")]
-    starts = {ROOT / "vlatool/__main__.py", ROOT / "vlatool/nodes/session.py", ROOT / "vlatool/nodes/topic_survey.py"}
-    starts |= {
-        ROOT / "vlatool/nodes/bus_recorder.py",
-        ROOT / "vlatool/nodes/replay.py",
-        ROOT / "vlatool/nodes/recordings.py",
-    }
+    runs = ("session", "topic_survey", "bus_recorder", "replay", "recordings", "map_file")
+    starts = {ROOT / "vlatool/__main__.py", *(ROOT / f"vlatool/nodes/{name}.py" for name in runs)}
     reached, left = set(), {file for room in rooms for file in room.rglob("*.py")} | starts
     while left:
         file = left.pop()
