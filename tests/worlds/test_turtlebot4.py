@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ctypes.util
 import math
 from itertools import pairwise
 from typing import Any
@@ -13,6 +14,10 @@ from vlatool.messages.geometry_msgs import Twist, Vector3
 from vlatool.worlds import World, open_world
 
 QUIET = {"noise": "0", "pillars": 0}
+RENDERS = pytest.mark.skipif(
+    not any(map(ctypes.util.find_library, ("EGL", "OSMesa"))),
+    reason="neither EGL nor OSMesa is installed: nothing renders",
+)
 
 
 def twist(linear: float, angular: float = 0.0) -> Twist:
@@ -58,6 +63,7 @@ def test_speeds_are_those_of_the_base_and_a_command_of_nan_is_none():
     assert world.truth()["velocity"] == pytest.approx((0.0, 0.0))
 
 
+@RENDERS
 def test_the_same_seed_gives_the_same_messages_and_another_another_room():
     first, again, other = ([] for _ in range(3))
     world = open_world("turtlebot4", people=1, movers=1, cliffs=1, drop="0.1", delay="scan=0.2")
@@ -72,6 +78,7 @@ def test_the_same_seed_gives_the_same_messages_and_another_another_room():
     assert not np.array_equal(scans[0], scans[2])
 
 
+@RENDERS
 def test_camera_lidar_and_cloud_see_the_same_walls():
     world = open_world("turtlebot4", only="depth,cloud,scan,info,color", **QUIET)
     world.reset(2)
@@ -104,6 +111,7 @@ def test_odometry_slips_by_the_share_that_is_asked_for():
     assert 0.01 < np.std(errors) < 0.12
 
 
+@RENDERS
 def test_the_target_is_where_the_region_says_and_hidden_when_it_is_taken_away():
     world = open_world("turtlebot4", only="roi,color,depth", **QUIET)
     world.reset(5)
@@ -140,6 +148,7 @@ def test_a_collision_counts_once_while_it_drives_and_a_motor_that_pushes_draws_c
     assert world.truth()["collisions"] == 1
 
 
+@RENDERS
 def test_a_pit_is_a_hole_for_the_camera_and_driving_over_it_is_a_fall():
     world = open_world("turtlebot4", only="depth", cliffs=1, **QUIET)
     world.reset(1)

@@ -10,7 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from vlatool.errors import MissingExtra, require
+from vlatool.errors import MissingExtra
+from vlatool.worlds._simulation import load_mujoco
 
 VARIABLE = "VLATOOL_MODELS"
 """Environment variable: a folder with unpacked packages, as ``pip install --target`` makes it."""
@@ -69,7 +70,7 @@ def compile_model(path: Path, contacts: bool) -> Any:
     Raises:
         MissingExtra: without MuJoCo.
     """
-    mujoco = require("mujoco", "worlds")
+    mujoco = load_mujoco()
     model = mujoco.MjModel.from_xml_path(str(path))
     if not contacts:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT

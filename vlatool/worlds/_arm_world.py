@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import BusError, UsageError, require
+from vlatool.errors import BusError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.joints import joint_values
 from vlatool.messages.sensor_msgs import JointState
@@ -20,6 +20,7 @@ from vlatool.worlds._arm_model import ModelFile, compile_model
 from vlatool.worlds._arm_servos import PositionServos, Setpoint, TorqueServos
 from vlatool.worlds._faults import Outbox, read_knob, time_of
 from vlatool.worlds._interface import Channel
+from vlatool.worlds._simulation import advance_model, load_mujoco
 
 Array = NDArray[Any]
 SENSORS = {"joints": Channel("/joint_states", JointState)}
@@ -103,7 +104,7 @@ class ArmWorld:
             raise UsageError(f"rate is {self.rate!r}; allowed: 1 to 500 Hz.", "change rate, for example to 100")
         if not 0.0 <= self.spread <= 1.0:
             raise UsageError(f"spread is {self.spread!r}; allowed: 0 to 1 rad.", "change spread")
-        self._mujoco = require("mujoco", "worlds")
+        self._mujoco = load_mujoco()
         self._model = compile_model(self.SETUP.file.find(self.models), self.contacts)
         self._names = tuple(self.SETUP.joints)
         self._joints = [self._joint(name) for name in self.SETUP.joints.values()]
@@ -168,7 +169,7 @@ class ArmWorld:
             positions = np.append(positions, [factor * positions[of] for _, of, factor in self._mirrors])
             velocities = np.append(velocities, [factor * velocities[of] for _, of, factor in self._mirrors])
         self._servos.control(data, positions, velocities)
-        self._mujoco.mj_step(self._model, data)
+        advance_model(self._mujoco, self._model, data)
         self._ticks += 1
         reached = data.qpos[self._places]
         self._lowest, self._highest = np.minimum(self._lowest, reached), np.maximum(self._highest, reached)

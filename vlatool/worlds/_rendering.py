@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import ctypes.util
-import os
 import weakref
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import InstallationError, require
+from vlatool.errors import InstallationError
 
 Array = NDArray[Any]
 SYSTEM_PACKAGES = "apt-get install libegl1 libosmesa6"
-
-
-def load_mujoco() -> Any:
-    """Import MuJoCo, with a way to render that this machine has, unless ``MUJOCO_GL`` names one.
-
-    Raises:
-        MissingExtra: when it is not installed.
-    """
-    if "MUJOCO_GL" not in os.environ:
-        found = next((name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name)), "")
-        if found:
-            os.environ["MUJOCO_GL"] = found.lower()
-    return require("mujoco", "worlds")
 
 
 class Camera:

@@ -16,7 +16,7 @@ from vlatool.worlds._differential_drive import DifferentialDrive
 from vlatool.worlds._faults import Outbox, read_knob
 from vlatool.worlds._indoor_scene import Scene, Thing, draw_scene, model_text
 from vlatool.worlds._interface import Channel
-from vlatool.worlds._rendering import load_mujoco
+from vlatool.worlds._simulation import advance_model, load_mujoco
 from vlatool.worlds._turtlebot4_sensors import CAMERA_HEIGHT_M, HFOV_RAD, SENSORS, Sensors
 from vlatool.worlds._walkers import Walkers
 
@@ -192,7 +192,7 @@ class TurtleBot4:
             self._place(name, px, py, 0.0)
         self._intrude(x, y, yaw)
         self._lead(x, y)
-        self._mujoco.mj_step(self._model, data)
+        advance_model(self._mujoco, self._model, data)
         touching = data.ncon > 0
         if touching and not self._contact and abs(drive.linear) > 0.01:
             self._collisions += 1
