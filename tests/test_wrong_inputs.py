@@ -26,6 +26,7 @@ from _full import small_or_full
 from _wrong_inputs import Line, Place, Row, check
 
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle, digest_of, seal
+from vlatool.bundle.manifest import SCHEMA
 from vlatool.errors import VlatoolError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.quantize.static_int8 import StaticInt8
@@ -356,7 +357,7 @@ BUNDLES = [
         lambda at: ["inspect", at.bundle("manifest.json", b"\xff\xfe\x00")]),
     Row("a manifest that is a list", "must be a mapping; got []", 3,
         lambda at: ["inspect", at.bundle("manifest.json", b"[]")]),
-    Row("a newer manifest", "upgrade vlatool", 3, lambda at: ["inspect", at.manifest(put("schema", 3))]),
+    Row("a newer manifest", "upgrade vlatool", 3, lambda at: ["inspect", at.manifest(put("schema", SCHEMA + 1))]),
     Row("a manifest without a spec", "The manifest has no 'spec'", 3,
         lambda at: ["inspect", at.manifest(take("spec"))]),
     Row("a manifest that leads out of the bundle", "'../../etc/passwd', which is not inside the bundle", 3,

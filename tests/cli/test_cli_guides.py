@@ -73,7 +73,7 @@ def test_the_guide_to_verify_runs_as_it_stands(tmp_path: Path, monkeypatch, vlat
 
 def test_the_guide_to_the_runtime_runs_as_it_stands(tmp_path: Path, monkeypatch, vlatool):
     monkeypatch.chdir(tmp_path)
-    (line, out), (run, shown), (record, _), (replay, verdict) = follow(vlatool, "runtime.md")
+    (line, out), (run, shown), (record, _), (replay, verdict) = follow(vlatool, "runtime.md", shown=("yaml",))
     assert line == "vlatool export arm -o out/arm"
     assert "arm 1.0.0" in out
     assert run.startswith("vlatool run out/arm --dry-run")

@@ -88,15 +88,14 @@ def test_step_that_raises_ends_in_rest(exchange, others, error):
 def test_signals_end_in_rest(exchange, others, number, raised):
     sent = collect(others, "/cmd_vel", Twist)
     handler = signal.getsignal(signal.SIGTERM)
-    timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
-    timer.start()
+    waiting = [number]
+    others.subscribe("/cmd_vel", Twist, lambda _: waiting and os.kill(os.getpid(), waiting.pop()), QoS())
     with pytest.raises(raised) as left:
         runner_of(exchange, Failing(at=-1)).run(10)
     assert getattr(left.value, "code", 143) == 143
     assert sent[-1].linear.x == 0
     assert all(message.linear.x == 1 for message in sent[:-1])
     assert signal.getsignal(signal.SIGTERM) is handler
-    timer.join()
 
 
 def test_stop_from_another_thread(exchange, others):

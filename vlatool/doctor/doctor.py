@@ -39,6 +39,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "remote": ("websockets", "msgpack"),
     "serve": ("websockets", "msgpack", "grpcio", "pyzmq"),
     "dds": ("cyclonedds",),
+    "worlds": ("mujoco",),
     "zenoh": ("eclipse-zenoh",),
     "search": ("optuna",),
     "tensorboard": ("tensorboard",),

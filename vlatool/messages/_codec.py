@@ -78,4 +78,6 @@ def octets(buffer: Any) -> memoryview:
     try:
         return memoryview(buffer).cast("B") if len(buffer) else memoryview(b"")
     except (TypeError, BufferError, ValueError):
-        raise BusError(f"A message is decoded from contiguous bytes, not from {type(buffer).__name__}.") from None
+        raise BusError(
+            f"A message is decoded from contiguous bytes, not from {type(buffer).__name__}.", "pass bytes"
+        ) from None

@@ -114,7 +114,10 @@ def rgb(message: Image) -> Array:
     pixels, name = image(message), GENERIC_COLOURS.get(message.encoding, message.encoding)
     if name in YUV422:
         if message.width % 2:
-            raise BusError(f"An image in {name} of {message.width} pixels in a row, which must be even.")
+            raise BusError(
+                f"An image in {name} of {message.width} pixels in a row, which must be even.",
+                "look at the camera's driver, or map a topic with another encoding",
+            )
         return rgb_of_yuv422(pixels, luma=1 if name in YUV422[:2] else 0)
     if pixels.dtype == np.uint16 and (name in COLOURS or name.startswith("bayer_")):
         pixels = (pixels >> 8).astype(np.uint8)

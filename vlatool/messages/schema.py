@@ -142,10 +142,11 @@ def packages() -> list[str]:
 
 
 def all_types() -> list[type[Message]]:
-    """Return the classes of all types, sorted by name."""
+    """Return the classes of all types of this package, sorted by name; others may have defined more."""
     for package in packages():
         importlib.import_module(f"vlatool.messages.{package}")
-    return [_TYPES[name] for name in sorted(_TYPES)]
+    own = (_TYPES[name] for name in sorted(_TYPES))
+    return [cls for cls in own if cls.__module__.startswith("vlatool.messages.")]
 
 
 def same(one: Any, other: Any) -> bool:

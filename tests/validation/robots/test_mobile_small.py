@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes.util
+
 import pytest
 from _full import small_or_full
 from mobile import FOLLOWERS, HOSTILE, collision_episode, step_episode
+
+pytestmark = pytest.mark.skipif(
+    not any(map(ctypes.util.find_library, ("EGL", "OSMesa"))),
+    reason="neither EGL nor OSMesa is installed: nothing renders",
+)
 
 
 @pytest.mark.parametrize("name", FOLLOWERS)
