@@ -79,7 +79,7 @@ def test_a_million_random_events_give_the_levels_and_speeds_of_a_second_model(se
 
 @pytest.mark.parametrize("rule", [rule for rule in TABLE if rule.name != FAILURE], ids=lambda rule: rule.name)
 def test_without_any_condition_the_levels_differ_from_the_second_model(rule: Rule, moments: list[Moment]):
-    limits = SafetyMonitor(fence=FENCED, task_s=TASK_S)._known.limits
+    limits = SafetyMonitor(fence=FENCED, task_s=TASK_S)._robot.limits
 
     def levels(table: tuple[Rule, ...]) -> list[int]:
         status, found = Status(), []

@@ -1,4 +1,4 @@
-"""The server's side of an action, without a transport: one goal at a time, of which the newest wins."""
+"""Both sides of an action, without a transport: the server runs one goal at a time, of which the newest wins."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from vlatool.buses._interface import GOAL_ABORTED, GOAL_CANCELED, Goal, Outcome
+from vlatool.errors import BusError
 from vlatool.messages import Message
 
 
@@ -105,3 +106,30 @@ class Goals:
         except Exception:  # the client learns that its goal is over; who wrote the handler sees the traceback
             threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
             return Outcome(GOAL_ABORTED, self._result())
+
+
+class AwaitedGoal:
+    """The client's side of a goal whose outcome arrives by itself; see ``ClientGoal``.
+
+    Args:
+        action: Name of the action.
+    """
+
+    def __init__(self, action: str) -> None:
+        self._action = action
+        self._ended = threading.Event()
+        self._outcome: Outcome | None = None
+
+    def finish(self, outcome: Outcome) -> None:
+        """Take the outcome."""
+        self._outcome = outcome
+        self._ended.set()
+
+    def result(self, timeout_s: float) -> Outcome:
+        """See ``ClientGoal.result``."""
+        self._ended.wait(timeout_s)
+        if self._outcome is None:
+            raise BusError(
+                f"The action {self._action} gave no result within {timeout_s:g} s.", "wait longer, or cancel it"
+            )
+        return self._outcome

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import threading
-import types
 import uuid
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
@@ -31,7 +30,7 @@ from vlatool.errors import BusError, UsageError
 from vlatool.messages import Message, find_type
 from vlatool.messages.action_msgs import CancelGoalRequest, CancelGoalResponse, GoalInfo, GoalStatus, GoalStatusArray
 from vlatool.messages.builtin_interfaces import Time
-from vlatool.messages.schema import boolean, int8
+from vlatool.messages.schema import boolean, define, int8
 from vlatool.messages.unique_identifier_msgs import UUID
 
 ANSWER_S = 5.0
@@ -78,14 +77,7 @@ def _class(name: str, **fields: Any) -> Any:
     try:
         return find_type(name)
     except UsageError:
-        pass
-
-    def fill(namespace: dict[str, Any]) -> None:
-        namespace["__annotations__"] = fields
-        namespace.update({field: kind() if isinstance(kind, type) else 0 for field, kind in fields.items()})
-
-    bare = types.new_class(name.rpartition("/")[2], (Message,), {"name": name}, fill)
-    return dataclasses.dataclass(frozen=True, eq=False)(bare)
+        return define(name, fields)
 
 
 @dataclasses.dataclass
@@ -141,9 +133,8 @@ class ServiceActionServer:
         self._tell()
         return self._types.send_response(True, stamp)
 
-    def _cancel(self, request: Message) -> CancelGoalResponse:
+    def _cancel(self, request: Any) -> CancelGoalResponse:
         """Cancel as ROS 2 does: the goal of an identifier, those up to a stamp, or all where neither is given."""
-        assert isinstance(request, CancelGoalRequest)
         wanted, before = _name(request.goal_info.goal_id), _nanoseconds(request.goal_info.stamp)
         one, every = int(wanted, 16) != 0, not before and int(wanted, 16) == 0
         with self._lock:

@@ -12,9 +12,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
-from vlatool.buses._goals import Goals
-from vlatool.buses._interface import ActionType, Outcome, Reception, TopicInfo
-from vlatool.errors import BusError
+from vlatool.buses._goals import AwaitedGoal, Goals
+from vlatool.buses._interface import ActionType, Reception, TopicInfo
 from vlatool.messages import Message
 
 
@@ -119,28 +118,13 @@ class ServedAction(NamedTuple):
     goals: Goals
 
 
-class LocalGoal:
+class LocalGoal(AwaitedGoal):
     """A goal that a node of this process sent; see ``ClientGoal``."""
 
     def __init__(self, action: str, goals: Goals) -> None:
+        super().__init__(action)
         self.identifier = uuid.uuid4().hex
-        self._action, self._goals = action, goals
-        self._ended = threading.Event()
-        self._outcome: Outcome | None = None
-
-    def finish(self, outcome: Outcome) -> None:
-        """Take the outcome."""
-        self._outcome = outcome
-        self._ended.set()
-
-    def result(self, timeout_s: float) -> Outcome:
-        """See ``ClientGoal.result``."""
-        self._ended.wait(timeout_s)
-        if self._outcome is None:
-            raise BusError(
-                f"The action {self._action} gave no result within {timeout_s:g} s.", "wait longer, or cancel it"
-            )
-        return self._outcome
+        self._goals = goals
 
     def cancel(self) -> None:
         """See ``ClientGoal.cancel``."""

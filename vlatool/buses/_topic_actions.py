@@ -10,11 +10,10 @@ import functools
 import itertools
 import threading
 import time
-import types
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
-from vlatool.buses._goals import Goals
+from vlatool.buses._goals import AwaitedGoal, Goals
 from vlatool.buses._interface import (
     GOAL_ABORTED,
     GOAL_CANCELED,
@@ -30,6 +29,7 @@ from vlatool.errors import BusError
 from vlatool.messages import Message
 from vlatool.messages.actionlib_msgs import GoalID, GoalStatus, GoalStatusArray
 from vlatool.messages.builtin_interfaces import Time
+from vlatool.messages.schema import define
 from vlatool.messages.std_msgs import Header
 
 STATUS_S = 0.2
@@ -58,29 +58,17 @@ class _Types(NamedTuple):
 @functools.cache
 def _types(name: str, goal: Any, feedback: Any, result: Any) -> _Types:
     package, _, short = name.partition("/action/")
-    top, status = f"{package}/msg/{short}", ("status", GoalStatus)
+    top, reported = f"{package}/msg/{short}", {"header": Header, "status": GoalStatus}
     return _Types(
-        _wrapped(f"{top}ActionGoal", ("goal_id", GoalID), ("goal", goal)),
-        _wrapped(f"{top}ActionFeedback", status, ("feedback", feedback)),
-        _wrapped(f"{top}ActionResult", status, ("result", result)),
+        define(f"{top}ActionGoal", {"header": Header, "goal_id": GoalID, "goal": goal}),
+        define(f"{top}ActionFeedback", {**reported, "feedback": feedback}),
+        define(f"{top}ActionResult", {**reported, "result": result}),
     )
 
 
 def types_of(kind: ActionType) -> _Types:
     """Return the classes that actionlib derives for an action, such as ``RunInstructionActionGoal``."""
     return _types(kind.name, *(cast(Any, each) for each in kind[1:]))  # for mypy, no message class is hashable
-
-
-def _wrapped(name: str, *fields: tuple[str, type[Message]]) -> Any:
-    """Return the class of a message with a header and these fields."""
-    every = (("header", Header), *fields)
-
-    def fill(namespace: dict[str, Any]) -> None:
-        namespace["__annotations__"] = dict(every)
-        namespace.update({field: kind() for field, kind in every})
-
-    bare = types.new_class(name.rpartition("/")[2], (Message,), {"name": name}, fill)
-    return dataclasses.dataclass(frozen=True, eq=False)(bare)
 
 
 @dataclasses.dataclass
@@ -243,30 +231,15 @@ class TopicActionClient:
             sent.finish(Outcome(OUTCOMES.get(got.status.status, GOAL_ABORTED), got.result))
 
 
-class TopicGoal:
+class TopicGoal(AwaitedGoal):
     """A goal that was sent; see ``ClientGoal``."""
 
     def __init__(
         self, client: TopicActionClient, action: str, goal_id: GoalID, feedback: Callable[[Message], None] | None
     ) -> None:
+        super().__init__(action)
         self.feedback = feedback
-        self._client, self._action, self._goal_id = client, action, goal_id
-        self._ended = threading.Event()
-        self._outcome: Outcome | None = None
-
-    def finish(self, outcome: Outcome) -> None:
-        """Take the outcome."""
-        self._outcome = outcome
-        self._ended.set()
-
-    def result(self, timeout_s: float) -> Outcome:
-        """See ``ClientGoal.result``."""
-        self._ended.wait(timeout_s)
-        if self._outcome is None:
-            raise BusError(
-                f"The action {self._action} gave no result within {timeout_s:g} s.", "wait longer, or cancel it"
-            )
-        return self._outcome
+        self._client, self._goal_id = client, goal_id
 
     def cancel(self) -> None:
         """See ``ClientGoal.cancel``."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -12,13 +11,11 @@ from vlatool.buses._dds_endpoints import Endpoints
 from vlatool.buses._dds_graph import DdsGraph
 from vlatool.buses._dds_services import Client, serve_requests
 from vlatool.buses._dds_types import describe
-from vlatool.buses._faults import Faults
-from vlatool.buses._interface import ActionType, Fault, Goal, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, full_name, resolve, ros_type
-from vlatool.buses._service_actions import ServiceActionClient, ServiceActionServer, ServiceGoal
+from vlatool.buses._graph_bus import GraphBus
+from vlatool.buses._interface import QoS, Reception
+from vlatool.buses._names import full_name, ros_type
 from vlatool.errors import BusError, require
 from vlatool.messages import Message
-from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.cdr import decode, encode
 from vlatool.messages.type_hash import rihs01
 
@@ -27,7 +24,7 @@ DISCOVERY_S = 0.5
 """How long the others on this machine or network take to be found; types are compared after it."""
 
 
-class Dds:
+class Dds(GraphBus):
     """A node in a DDS domain.
 
     Args:
@@ -42,10 +39,9 @@ class Dds:
     """
 
     def __init__(self, address: str, node: str) -> None:
-        self._node = check_node(node)
+        super().__init__(node)
         number, interface = parse_address(address)
         require("cyclonedds", "dds")
-        self._faults = Faults()
         self._leave = join_domain(number, interface, self._refused)
         try:
             self._endpoints = Endpoints(number)
@@ -53,12 +49,8 @@ class Dds:
             self._leave()
             raise
         self._opened_s = time.monotonic()
-        self._graph = DdsGraph(self._endpoints, node, self._faults)
-        self._lock = threading.Lock()
+        self._graph: DdsGraph = DdsGraph(self._endpoints, node, self._faults)
         self._clients: dict[str, Client] = {}
-        self._actions: list[ServiceActionServer] = []
-        self._action_clients: dict[str, ServiceActionClient] = {}
-        self._closing = self._closed = False
 
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
         """Call ``handler`` with each message of a topic, in a thread of the subscription.
@@ -89,8 +81,7 @@ class Dds:
 
         def send(value: M) -> None:
             data = encode(value)
-            if self._closed:
-                raise _closed(name)
+            self._check_open(name)
             try:
                 write(data)
             except BusError as error:
@@ -119,60 +110,9 @@ class Dds:
                 self._graph.add_own(client.reader_guid, client.writer_guid)
         return self._clients[name].call(request, response, deadline, timeout_s)
 
-    def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
-        """See ``ActionBus.serve_action``."""
-        self._actions.append(ServiceActionServer(self, resolve(action, self._node), kind, handler))
-
-    def send_goal(
-        self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
-    ) -> ServiceGoal:
-        """See ``ActionBus.send_goal``."""
-        name = resolve(action, self._node)
-        if name not in self._action_clients:
-            self._action_clients[name] = ServiceActionClient(self, name, kind)
-        return self._action_clients[name].send(goal, feedback)
-
-    def topics(self) -> list[TopicInfo]:
-        """Return what is on the bus now, this node's own included, sorted by name."""
-        self._discover()
-        return self._graph.topics()
-
-    def faults(self) -> list[Fault]:
-        """Return what went wrong so far, one entry for each topic or service, sorted by name."""
-        return self._faults.listing()
-
-    def stamp(self) -> Time:
-        """Return the time of day."""
-        return Time(*divmod(time.time_ns(), 1_000_000_000))
-
-    def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
-        """Wait until each topic has a peer: a publisher, or a subscriber; return those without."""
-        names = {topic: full_name(topic, self._node) for topic in topics}
-        self._graph.wait(lambda: all(self._graph.has_peer(name) for name in names.values()), timeout_s)
-        return tuple(topic for topic, name in names.items() if not self._graph.has_peer(name))
-
-    def close(self) -> None:
-        """Leave the bus; what is sent has left this process. Closing twice does nothing."""
-        with self._lock:
-            if self._closing:
-                return
-            self._closing = True
-        for action in self._actions:
-            action.close()
-        self._closed = True
+    def _leave_transport(self) -> None:
         self._endpoints.close()
         self._leave()
-
-    def _check_open(self, topic: str) -> None:
-        if self._closed:
-            raise _closed(topic)
-
-    def _check(self, topic: str, message: type[Message]) -> str:
-        name = full_name(topic, self._node)
-        self._check_open(name)
-        self._discover()
-        self._graph.check_type(name, message.TYPE)
-        return name
 
     def _discover(self) -> None:
         time.sleep(max(0.0, self._opened_s + DISCOVERY_S - time.monotonic()))
@@ -181,7 +121,3 @@ class Dds:
         name = "/" + topic.partition("/")[2]
         problem = f"A malformed {ros_type(type_name)} came on {name}; DDS refused it."
         self._faults.add(name, BusError(problem, "check that the publisher sends messages of this type"))
-
-
-def _closed(topic: str) -> BusError:
-    return BusError(f"The bus of {topic} is closed.", "open it again")

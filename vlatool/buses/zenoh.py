@@ -8,18 +8,16 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any, TypeVar
 
-from vlatool.buses._faults import Faults
 from vlatool.buses._graph import CLIENT, PUBLISHER, SERVICE, SUBSCRIBER, Entity
+from vlatool.buses._graph_bus import GraphBus
 from vlatool.buses._inbox import Inbox
-from vlatool.buses._interface import ActionType, Fault, Goal, Outcome, QoS, Reception, TopicInfo
-from vlatool.buses._names import check_node, domain_id, full_name, resolve
-from vlatool.buses._service_actions import ServiceActionClient, ServiceActionServer, ServiceGoal
+from vlatool.buses._interface import QoS, Reception
+from vlatool.buses._names import domain_id, full_name
 from vlatool.buses._zenoh_graph import ZenohGraph
 from vlatool.buses._zenoh_keys import ATTACHMENT, attachment, data_key, entity_token, gid_of, node_token
 from vlatool.buses._zenoh_session import open_session
 from vlatool.errors import BusError, require
 from vlatool.messages import Message
-from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.cdr import decode, encode
 from vlatool.messages.type_hash import rihs01, service_rihs01
 
@@ -30,7 +28,7 @@ HEARTBEAT_S = 0.5
 """Period at which a latched publisher repeats the number of its last message, so that a lost one is asked for."""
 
 
-class Zenoh:
+class Zenoh(GraphBus):
     """A node on a Zenoh bus; the ROS domain is that of ``ROS_DOMAIN_ID``.
 
     Args:
@@ -45,22 +43,17 @@ class Zenoh:
     """
 
     def __init__(self, address: str, node: str) -> None:
-        check_node(node)
-        self._domain, self._node = domain_id(), node
+        super().__init__(node)
+        self._domain = domain_id()
         self._session = open_session(address)
         self._zenoh: Any = require("zenoh", "zenoh")
         self._advanced: Any = require("zenoh.ext", "zenoh")
-        self._faults = Faults()
         self._id = str(self._session.info.zid())
         self._numbers = count(1)
-        self._lock = threading.Lock()
         self._declared: list[Any] = []
         self._inboxes: list[Inbox] = []
         self._clients: dict[str, bytes] = {}
-        self._actions: list[ServiceActionServer] = []
-        self._action_clients: dict[str, ServiceActionClient] = {}
-        self._closing = self._closed = False
-        self._graph = ZenohGraph(self._zenoh, self._session, self._domain, self._faults)
+        self._graph: ZenohGraph = ZenohGraph(self._zenoh, self._session, self._domain, self._faults)
         self._keep(self._session.liveliness().declare_token(node_token(self._domain, self._id, node)))
 
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
@@ -69,8 +62,7 @@ class Zenoh:
         Raises:
             BusError: when the topic carries another type.
         """
-        name, zenoh = full_name(topic, self._node), self._zenoh
-        self._check(name, message)
+        name, zenoh = self._check(topic, message), self._zenoh
         inbox = Inbox(name, message, handler, qos.depth, lambda payload: payload.to_bytes(), self._faults)
         hear = zenoh.handlers.Callback(lambda sample: inbox.put(sample.payload), indirect=False)
         key = self._key(name, message)
@@ -93,16 +85,14 @@ class Zenoh:
         Raises:
             BusError: when the topic carries another type.
         """
-        name = full_name(topic, self._node)
-        self._check(name, message)
+        name = self._check(topic, message)
         publisher = self._keep(self._declare_publisher(self._key(name, message), qos))
         gid = self._announce(PUBLISHER, name, message.TYPE, rihs01(message), qos)
         sequence = count(1)
 
         def send(value: M) -> None:
             payload = encode(value)
-            if self._closed:
-                raise _closed(name)
+            self._check_open(name)
             publisher.put(payload, attachment=attachment(next(sequence), time.time_ns(), gid))
 
         return send
@@ -160,46 +150,7 @@ class Zenoh:
             raise BusError(f"The service {name} refused: {refusal}.", "see the node that serves it")
         raise BusError(f"{name} did not answer within {timeout_s:g} s.", "see the node that serves it")
 
-    def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
-        """See ``ActionBus.serve_action``."""
-        self._actions.append(ServiceActionServer(self, resolve(action, self._node), kind, handler))
-
-    def send_goal(
-        self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
-    ) -> ServiceGoal:
-        """See ``ActionBus.send_goal``."""
-        name = resolve(action, self._node)
-        if name not in self._action_clients:
-            self._action_clients[name] = ServiceActionClient(self, name, kind)
-        return self._action_clients[name].send(goal, feedback)
-
-    def topics(self) -> list[TopicInfo]:
-        """Return what is on the bus now, this node's own included, sorted by name."""
-        return self._graph.topics()
-
-    def faults(self) -> list[Fault]:
-        """Return what went wrong so far, one entry for each topic or service, sorted by name."""
-        return self._faults.listing()
-
-    def stamp(self) -> Time:
-        """Return the time of day."""
-        return Time(*divmod(time.time_ns(), 1_000_000_000))
-
-    def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
-        """Wait until each topic has a peer: a publisher, or a subscriber; return those without."""
-        names = {topic: full_name(topic, self._node) for topic in topics}
-        self._graph.wait(lambda: all(self._graph.has_peer(name) for name in names.values()), timeout_s)
-        return tuple(topic for topic, name in names.items() if not self._graph.has_peer(name))
-
-    def close(self) -> None:
-        """Leave the bus; what is sent has left this process. Closing twice does nothing."""
-        with self._lock:
-            if self._closing:
-                return
-            self._closing = True
-        for action in self._actions:
-            action.close()
-        self._closed = True
+    def _leave_transport(self) -> None:
         self._graph.close()
         for declared in reversed(self._declared):
             declared.undeclare()
@@ -214,11 +165,6 @@ class Zenoh:
         with self._lock:
             self._declared.append(declared)
         return declared
-
-    def _check(self, topic: str, message: type[Message]) -> None:
-        if self._closed:
-            raise _closed(topic)
-        self._graph.check_type(topic, message.TYPE)
 
     def _announce(self, kind: str, topic: str, type_name: str, type_hash: str, qos: QoS) -> bytes:
         entity = Entity(self._id, kind, self._node, topic, type_name, type_hash)
@@ -256,7 +202,3 @@ def _answered(sent: Any) -> bytes:
     data = sent.to_bytes() if sent is not None else b""
     number, _, _, gid = ATTACHMENT.unpack(data) if len(data) == ATTACHMENT.size else (0, 0, 16, bytes(16))
     return attachment(number, time.time_ns(), gid)
-
-
-def _closed(topic: str) -> BusError:
-    return BusError(f"The bus of {topic} is closed.", "open it again")

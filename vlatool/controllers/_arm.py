@@ -18,7 +18,7 @@ from vlatool.controllers._arm_robot import ArmRobot, driver_names, finite, start
 from vlatool.controllers._arm_state import ACTING, HALT, RETURNING, WAITING, ArmState
 from vlatool.controllers._freshness import age_s, note_changes
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
-from vlatool.controllers._settings import check_range, check_rate
+from vlatool.controllers._settings import check_finite, check_range, check_rate
 from vlatool.errors import BusError, DataError, UsageError, VlatoolError
 from vlatool.messages import Message
 from vlatool.messages.joints import joint_values
@@ -76,6 +76,7 @@ class ArmController:
         cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\n{SETTINGS}"
 
     def __post_init__(self) -> None:
+        check_finite(self)
         check_rate(self.rate)
         if self.output not in OUTPUTS:
             raise UsageError.unknown(f"Unknown output '{self.output}'", self.output, OUTPUTS)
@@ -146,13 +147,14 @@ class ArmController:
         if state.envelope is None:
             if measured is not None:
                 state, problem = self._begin(measured, snapshot.time_s, state)
-            if state.envelope is None:
+            if (envelope := state.envelope) is None:
                 return self._wait(snapshot, state._replace(detail=problem))
         else:
-            state = state._replace(envelope=state.envelope.copy())
+            envelope = state.envelope.copy()
+            state = state._replace(envelope=envelope)
         state = self._listen(snapshot, state)
-        wanted, state = self._wanted(snapshot, state, measured, problem)
-        return self._send(snapshot, state, wanted, measured)
+        wanted, state = self._wanted(snapshot, state, envelope, measured, problem)
+        return self._send(snapshot, state, state.envelope or envelope, wanted, measured)
 
     def rest(self) -> Command:
         """Send nothing: a joint that is commanded by position stays at its last command."""
@@ -216,11 +218,9 @@ class ArmController:
         return state._replace(phase=RETURNING, way=None, attempts=0, calls=(*state.calls, *calls))
 
     def _wanted(
-        self, snapshot: Snapshot, state: ArmState, measured: Array | None, problem: str
+        self, snapshot: Snapshot, state: ArmState, envelope: Envelope, measured: Array | None, problem: str
     ) -> tuple[list[float] | None, ArmState]:
         """Return the positions that are wanted, in the order of the robot, or None for the next step of the stop."""
-        envelope = state.envelope
-        assert envelope is not None
         if measured is None:
             return None, state._replace(way=None, detail=problem)
         late = self._lagging(envelope, measured)
@@ -228,10 +228,10 @@ class ArmController:
             state = self._begin_again(state, measured) if envelope.at_rest() else state
             return None, state._replace(way=None, detail=late)
         if state.phase == RETURNING:
-            return self._return(snapshot, state)
+            return self._return(snapshot, state, envelope)
         if state.phase == HALT:
             return None, state
-        return self._act(snapshot, state, measured)
+        return self._act(snapshot, state, envelope, measured)
 
     def _lagging(self, envelope: Envelope, measured: Array) -> str:
         """Return which joint is far from its command; empty if none is."""
@@ -247,10 +247,8 @@ class ArmController:
         again, _ = self._begin(measured, state.last_s + 1.0 / self.rate, state)
         return again._replace(phase=state.phase, attempts=state.attempts)
 
-    def _return(self, snapshot: Snapshot, state: ArmState) -> tuple[list[float] | None, ArmState]:
-        envelope, now = state.envelope, snapshot.time_s
-        assert envelope is not None
-        way = state.way
+    def _return(self, snapshot: Snapshot, state: ArmState, envelope: Envelope) -> tuple[list[float] | None, ArmState]:
+        way, now = state.way, snapshot.time_s
         if way is None:
             if not envelope.at_rest():
                 return None, state._replace(detail="stopping first")
@@ -260,8 +258,9 @@ class ArmController:
             return list(self._start), state._replace(phase=ACTING, way=None, attempts=0, detail="at the start pose")
         return way.at(now), state._replace(way=way, detail="to the start pose")
 
-    def _act(self, snapshot: Snapshot, state: ArmState, measured: Array) -> tuple[list[float] | None, ArmState]:
-        assert state.envelope is not None
+    def _act(
+        self, snapshot: Snapshot, state: ArmState, envelope: Envelope, measured: Array
+    ) -> tuple[list[float] | None, ArmState]:
         seen, missing = self._sees.observation(snapshot, self.ROBOT, measured)
         if seen is None:
             return None, state._replace(detail=missing)
@@ -269,15 +268,18 @@ class ArmController:
             action = self.policy.act(seen)
         except VlatoolError as error:
             return None, state._replace(detail=error.message)
-        wanted = self._sees.positions(action, state.envelope.position, 1.0 / self.rate)
+        wanted = self._sees.positions(action, envelope.position, 1.0 / self.rate)
         return wanted, state._replace(detail="" if wanted is not None else "an action of another shape")
 
     def _send(
-        self, snapshot: Snapshot, state: ArmState, wanted: list[float] | None, measured: Array | None
+        self,
+        snapshot: Snapshot,
+        state: ArmState,
+        envelope: Envelope,
+        wanted: list[float] | None,
+        measured: Array | None,
     ) -> tuple[Command, ArmState]:
         """Let the envelope answer, and put its positions into messages."""
-        envelope = state.envelope
-        assert envelope is not None
         result = envelope.step(wanted, elapsed_s=snapshot.time_s - state.last_s)
         state = state._replace(last_s=snapshot.time_s)
         if state.way is not None and wanted is not None and result.level >= Level.CRITICAL:

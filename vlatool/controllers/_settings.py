@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any
 
 from vlatool.errors import UsageError
+
+
+def check_finite(controller: Any) -> None:
+    """Raise UsageError unless every setting that is a number is finite: NaN and infinity would switch checks off."""
+    for entry in dataclasses.fields(controller):
+        value = getattr(controller, entry.name, None)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UsageError(f"{entry.name} is {value!r}; allowed: a finite number.", f"change {entry.name}")
 
 
 def check_rate(rate: float) -> None:

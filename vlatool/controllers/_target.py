@@ -43,8 +43,9 @@ def read_roi(text: str) -> RegionOfInterest | None:
     """
     if not text:
         return None
-    parts = text.split(",")
-    if len(parts) != 4 or not all(part.strip().isdigit() for part in parts) or "0" in (p.strip() for p in parts[2:]):
+    parts = [part.strip() for part in text.split(",")]
+    plain = len(parts) == 4 and all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts)
+    if not plain or 0 in map(int, parts[2:]):
         raise UsageError(
             f"The region of interest is '{text}'; allowed: X,Y,WIDTH,HEIGHT in pixels, with a size above 0.",
             "write for example roi='140,100,40,60', or leave it out to take it from the topic /roi",

@@ -7,17 +7,17 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from vlatool.controllers._base_driver import BaseDriver
 from vlatool.controllers._geometry import twist
-from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
+from vlatool.controllers._interface import Command, Input, Snapshot
 from vlatool.controllers._sensor_arrays import points_of
-from vlatool.controllers._settings import check_range, check_rate, check_speeds
+from vlatool.controllers._settings import check_finite, check_range, check_rate, check_speeds
 from vlatool.controllers._smoothing import Motion, within
-from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.sensor_msgs import PointCloud2
 
 
 @dataclass(frozen=True)
-class CloudFollower:
+class CloudFollower(BaseDriver):
     """Keeps a distance from the mean of the points in a box in front of the camera, and turns towards it.
 
     The law is that of ``follower.py`` of Goebel, "ROS by Example", which has it from ``turtlebot_follower``, with the
@@ -68,6 +68,7 @@ class CloudFollower:
     lost_s: float = 0.5
 
     def __post_init__(self) -> None:
+        check_finite(self)
         check_rate(self.rate)
         check_speeds("linear_speed", self.min_linear_speed, self.max_linear_speed)
         check_speeds("angular_speed", self.min_angular_speed, self.max_angular_speed)
@@ -75,24 +76,9 @@ class CloudFollower:
         check_range("lost_s", self.lost_s, 0.0)
 
     @property
-    def rate_hz(self) -> float:
-        """Steps in a second."""
-        return self.rate
-
-    @property
     def inputs(self) -> tuple[Input, ...]:
         """Points in the optical frame of the camera: x to the right, y down, z forward."""
         return (Input("cloud", "/camera/depth/points", PointCloud2),)
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        """Velocity."""
-        return (Output("cmd_vel", "/cmd_vel", Twist),)
-
-    @property
-    def services(self) -> tuple[Service, ...]:
-        """Nothing."""
-        return ()
 
     def start(self) -> Motion:
         """Return the state of a robot that stands and has not seen its target."""
@@ -131,7 +117,3 @@ class CloudFollower:
 
     def _command(self, state: Motion, status: str, notes: dict[str, float | str]) -> Command:
         return Command({"cmd_vel": (twist(state.linear, state.angular),)}, status=status, notes=notes)
-
-    def rest(self) -> Command:
-        """Stand."""
-        return Command({"cmd_vel": (twist(),)}, status="stopped")

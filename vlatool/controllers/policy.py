@@ -26,7 +26,7 @@ from vlatool.controllers._policy_map import (
 )
 from vlatool.controllers._policy_outputs import message_of, stop_of
 from vlatool.controllers._policy_proposal import propose
-from vlatool.controllers._settings import check_range, check_rate
+from vlatool.controllers._settings import check_finite, check_range, check_rate
 from vlatool.errors import BusError, UsageError, VlatoolError
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.joints import joint_values
@@ -84,6 +84,7 @@ class Policy:
     policy: Any = field(default=None, metadata={"setting": False})
 
     def __post_init__(self) -> None:
+        check_finite(self)
         check_map(self.map)
         check_range("skew_s", self.skew_s, 0.0)
         check_range("settle_s", self.settle_s, 0.0)

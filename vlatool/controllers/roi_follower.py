@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.controllers._base_driver import BaseDriver
 from vlatool.controllers._geometry import twist
-from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
+from vlatool.controllers._interface import Command, Input, Snapshot
 from vlatool.controllers._sensor_arrays import depth_of
-from vlatool.controllers._settings import check_range, check_rate, check_speeds
+from vlatool.controllers._settings import check_finite, check_range, check_rate, check_speeds
 from vlatool.controllers._smoothing import Motion, within
 from vlatool.controllers._target import find_target, read_roi, target_inputs
 from vlatool.controllers.roi_tracker import offset_of
-from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.sensor_msgs import CameraInfo, Image, RegionOfInterest
 
 
 @dataclass(frozen=True)
-class RoiFollower:
+class RoiFollower(BaseDriver):
     """Turns towards a region of interest and keeps a distance from it.
 
     The law is that of ``object_follower.py`` of Goebel, "ROS by Example". It turns as ``roi-tracker``, at ``x_scale``.
@@ -73,6 +73,7 @@ class RoiFollower:
     _first: RegionOfInterest | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        check_finite(self)
         check_rate(self.rate)
         check_speeds("linear_speed", self.min_linear_speed, self.max_linear_speed)
         check_speeds("rotation_speed", self.min_rotation_speed, self.max_rotation_speed)
@@ -82,24 +83,9 @@ class RoiFollower:
         object.__setattr__(self, "_first", read_roi(self.roi))
 
     @property
-    def rate_hz(self) -> float:
-        """Steps in a second."""
-        return self.rate
-
-    @property
     def inputs(self) -> tuple[Input, ...]:
         """Size of the image and depth; the region, the image or both."""
         return (*target_inputs(self.roi, self.track), Input("depth", "/camera/depth/image_raw", Image))
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        """Velocity."""
-        return (Output("cmd_vel", "/cmd_vel", Twist),)
-
-    @property
-    def services(self) -> tuple[Service, ...]:
-        """Nothing."""
-        return ()
 
     def start(self) -> Motion:
         """Return the state of a robot that stands and has not seen its target."""
@@ -146,7 +132,3 @@ class RoiFollower:
 
     def _command(self, state: Motion, status: str, notes: dict[str, float | str]) -> Command:
         return Command({"cmd_vel": (twist(state.linear, state.angular),)}, status=status, notes=notes)
-
-    def rest(self) -> Command:
-        """Stand."""
-        return Command({"cmd_vel": (twist(),)}, status="stopped")

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import copysign
 
+from vlatool.controllers._base_driver import BaseDriver
 from vlatool.controllers._geometry import twist
-from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
-from vlatool.controllers._settings import check_rate, check_speeds
+from vlatool.controllers._interface import Command, Input, Snapshot
+from vlatool.controllers._settings import check_finite, check_rate, check_speeds
 from vlatool.controllers._target import Target, find_target, read_roi, target_inputs
-from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.sensor_msgs import CameraInfo, RegionOfInterest
 
 
@@ -23,7 +23,7 @@ def offset_of(roi: RegionOfInterest, image_width: int) -> float:
 
 
 @dataclass(frozen=True)
-class RoiTracker:
+class RoiTracker(BaseDriver):
     """Turns towards a region of interest, in proportion to its distance from the centre of the image.
 
     The law is that of ``object_tracker.py`` of Goebel, "ROS by Example": where the centre of the region is more than
@@ -56,29 +56,15 @@ class RoiTracker:
     _first: RegionOfInterest | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        check_finite(self)
         check_rate(self.rate)
         check_speeds("rotation_speed", self.min_rotation_speed, self.max_rotation_speed)
         object.__setattr__(self, "_first", read_roi(self.roi))
 
     @property
-    def rate_hz(self) -> float:
-        """Steps in a second."""
-        return self.rate
-
-    @property
     def inputs(self) -> tuple[Input, ...]:
         """Size of the image; the region, the image or both."""
         return target_inputs(self.roi, self.track)
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        """Velocity."""
-        return (Output("cmd_vel", "/cmd_vel", Twist),)
-
-    @property
-    def services(self) -> tuple[Service, ...]:
-        """Nothing."""
-        return ()
 
     def start(self) -> Target:
         """Return the state of a target that was not seen yet."""
@@ -100,7 +86,3 @@ class RoiTracker:
             return 0.0
         speed = max(self.min_rotation_speed, min(self.max_rotation_speed, abs(self.gain * offset)))
         return -copysign(speed, offset)
-
-    def rest(self) -> Command:
-        """Stand."""
-        return Command({"cmd_vel": (twist(),)}, status="stopped")

@@ -23,7 +23,7 @@ from vlatool.controllers._safety_table import (
     next_level,
     release,
 )
-from vlatool.controllers._settings import check_range, check_rate
+from vlatool.controllers._settings import check_finite, check_range, check_rate
 from vlatool.errors import UsageError
 from vlatool.messages import Message
 from vlatool.messages.geometry_msgs import Twist
@@ -101,10 +101,11 @@ class SafetyMonitor:
     fence: str = ""
     fence_warning_m: float = 0.3
     task_s: float = 600.0
-    _robot: Robot | None = field(default=None, init=False, repr=False, compare=False)
+    _robot: Robot = field(init=False, repr=False, compare=False)
     _table: tuple[Rule, ...] = field(default=TABLE, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        check_finite(self)
         check_rate(self.rate)
         for name in ("radius_m", "margin_m", "camera_height_m", "top_m", "cliff_m", "max_age_s", "command_s"):
             check_range(name, getattr(self, name), 0.0)
@@ -165,26 +166,21 @@ class SafetyMonitor:
     def step(self, snapshot: Snapshot, state: _State) -> tuple[Command, _State]:
         """Return the velocity for the base at this step; zero, and an EMERGENCY, where the monitor fails."""
         try:
-            facts, memory = measure(snapshot, self._known, state.memory)
+            facts, memory = measure(snapshot, self._robot, state.memory)
             return self._judge(snapshot, facts, _State(state.status, memory))
         except Exception as error:
             return self._judge(snapshot, Facts(failure=True), state, f"{type(error).__name__}: {error}")
 
-    @property
-    def _known(self) -> Robot:
-        assert self._robot is not None
-        return self._robot
-
     def _judge(self, snapshot: Snapshot, facts: Facts, state: _State, failure: str = "") -> tuple[Command, _State]:
         """Return the command and the state for what was measured."""
-        rules = conditions(facts, self._known.limits, self._table)
+        rules = conditions(facts, self._robot.limits, self._table)
         demand = highest(rules)
         status = next_level(state.status, demand, snapshot.time_s)
         responses: dict[int, Message] = {}
         for request in snapshot.requests:
             status, responses[request.number] = self._answer(request.message, status, demand, rules, snapshot.time_s)
         reasons = ", ".join(rule.name for rule in rules) + (f" ({failure})" if failure else "")
-        waiting = [name for name in self._known.expects if name not in snapshot.newest]
+        waiting = [name for name in self._robot.expects if name not in snapshot.newest]
         command = twist() if failure or waiting or not facts.finite else self._scaled(snapshot, status.level)
         if waiting:
             reasons = f"waiting for {', '.join(waiting)}" + (f", {reasons}" if reasons else "")

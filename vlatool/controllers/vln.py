@@ -13,9 +13,9 @@ from vlatool.controllers._discrete_policy import Observed, choose, observation, 
 from vlatool.controllers._freshness import age_s, note_changes
 from vlatool.controllers._geometry import PlanarPose, pose_of, twist
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
-from vlatool.controllers._motions import BACKWARD, FORWARD, STOP, WAIT, Speeds, drive, motions_of, plan
+from vlatool.controllers._motions import BACKWARD, FORWARD, STOP, WAIT, Motion, Speeds, drive, motions_of, plan
 from vlatool.controllers._sensor_arrays import colours_of, depth_of
-from vlatool.controllers._settings import check_range, check_rate
+from vlatool.controllers._settings import check_finite, check_range, check_rate
 from vlatool.controllers._vln_state import (
     ARRIVED_PHASE,
     FAILED_PHASE,
@@ -85,6 +85,7 @@ class Vln:
     policy: Any = field(default=None, metadata={"setting": False})
 
     def __post_init__(self) -> None:
+        check_finite(self)
         check_rate(self.rate)
         check_range("turn_deg", self.turn_deg, 1.0, 180.0)
         check_range("forward_m", self.forward_m, 0.01, 10.0)
@@ -157,7 +158,7 @@ class Vln:
             return self._stand(state._replace(phase=PAUSED_PHASE, detail=trouble))
         state = state._replace(phase=RUNNING_PHASE)
         if state.motion is not None:
-            return self._move(snapshot, state, pose)
+            return self._move(snapshot, state, state.motion, pose)
         return self._decide(snapshot, state, pose)
 
     def rest(self) -> Command:
@@ -189,10 +190,8 @@ class Vln:
                 return f"no {what} yet" if math.isinf(age) else f"{what} {age:.1f} s old"
         return "odometry is not a pose" if pose is None else ""
 
-    def _move(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose) -> tuple[Command, VlnState]:
+    def _move(self, snapshot: Snapshot, state: VlnState, motion: Motion, pose: PlanarPose) -> tuple[Command, VlnState]:
         """Go on with a motion, or end it."""
-        assert state.motion is not None
-        motion = state.motion
         speeds = Speeds(self.max_linear_speed, self.max_angular_speed, self.position_m, math.radians(self.angle_deg))
         linear, angular, over = drive(motion, pose, speeds)
         waypoint = motion.goal
@@ -225,11 +224,12 @@ class Vln:
         except (VlatoolError, IndexError) as error:
             detail = error.message if isinstance(error, VlatoolError) else "the policy chose an action without a label"
             return self._stand(state._replace(phase=FAILED_PHASE, detail=detail))
-        state = state._replace(frames=frames, actions=(*state.actions, index), waypoint=state.waypoint or pose)
-        return self._begin(snapshot, state, kind)
+        waypoint = state.waypoint or pose
+        state = state._replace(frames=frames, actions=(*state.actions, index), waypoint=waypoint)
+        return self._begin(snapshot, state, kind, waypoint)
 
-    def _begin(self, snapshot: Snapshot, state: VlnState, kind: str) -> tuple[Command, VlnState]:
-        """Begin the motion of an action; nothing is driven at this step."""
+    def _begin(self, snapshot: Snapshot, state: VlnState, kind: str, waypoint: PlanarPose) -> tuple[Command, VlnState]:
+        """Begin the motion of an action at a pose; nothing is driven at this step."""
         over = state._replace(ended_s=snapshot.time_s, ended_stamp=self._odometry_stamp(snapshot))
         if kind == STOP:
             return self._stand(state._replace(phase=ARRIVED_PHASE, detail="by its stop label"))
@@ -237,8 +237,7 @@ class Vln:
             return self._stand(over._replace(detail=WAIT))
         if kind == FORWARD and self._ahead(snapshot) < self.forward_m + self.clearance_m:
             return self._stand(over._replace(detail="blocked"))
-        assert state.waypoint is not None
-        motion = plan(kind, state.waypoint, math.radians(self.turn_deg), self.forward_m, snapshot.time_s)
+        motion = plan(kind, waypoint, math.radians(self.turn_deg), self.forward_m, snapshot.time_s)
         return self._stand(state._replace(motion=motion, detail=kind if kind != BACKWARD else "backward"))
 
     def _has_settled(self, snapshot: Snapshot, state: VlnState) -> bool:

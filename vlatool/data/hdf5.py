@@ -123,7 +123,7 @@ class _Episode:
 
 def _natural(text: str) -> list[Any]:
     """Sort ``demo_10`` behind ``demo_9``."""
-    return [int(part) if part.isdigit() else part for part in DIGITS.split(text)]
+    return [int(part) if part.isdecimal() else part for part in DIGITS.split(text)]
 
 
 def _files(folder: Path) -> Iterator[Path]:

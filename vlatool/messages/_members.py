@@ -72,8 +72,7 @@ def _member(attribute: str, name: str, hint: Any) -> Member:
     marker = hint.__metadata__[0]
     if isinstance(marker, Elements):
         return Member(attribute, name, marker.name, sequence=marker.length is None, length=marker.length or 0)
-    assert isinstance(marker, Primitive)
-    return Member(attribute, name, marker.name)
+    return Member(attribute, name, cast(Primitive, marker).name)
 
 
 @cache

@@ -12,6 +12,8 @@ import dataclasses
 import importlib
 import pkgutil
 import struct
+import types
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -164,3 +166,19 @@ def same(one: Any, other: Any) -> bool:
     if isinstance(one, float) and isinstance(other, float):
         return struct.pack("d", one) == struct.pack("d", other) or (one != one and other != other)
     return bool(one == other)
+
+
+def define(name: str, fields: Mapping[str, Any]) -> type[Message]:
+    """Define a type that is derived from others, such as those of an action, and return its class.
+
+    Args:
+        name: ROS 2 name of the type.
+        fields: Field -> its annotation: a class of messages, or an alias of this module for a number.
+    """
+
+    def fill(namespace: dict[str, Any]) -> None:
+        namespace["__annotations__"] = dict(fields)
+        namespace.update({field: kind() if isinstance(kind, type) else 0 for field, kind in fields.items()})
+
+    bare = types.new_class(name.rpartition("/")[2], (Message,), {"name": name}, fill)
+    return dataclass(frozen=True, eq=False)(bare)

@@ -179,7 +179,9 @@ def find(root: Path, folder: str, pattern: str) -> list[str]:
         paths = [path.relative_to(root).as_posix() for path in (root / folder).glob(pattern)]
     except OSError:
         return []
-    return sorted(paths, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path)])
+    return sorted(
+        paths, key=lambda path: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path)]
+    )
 
 
 def run_command(command: Sequence[str]) -> str | None:

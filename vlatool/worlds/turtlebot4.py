@@ -111,7 +111,6 @@ class TurtleBot4:
         if absent := [name for name in self._names if name not in SENSORS]:
             raise UsageError.unknown(f"Unknown sensor '{absent[0]}' in only", absent[0], SENSORS)
         self._mujoco = load_mujoco()
-        self._sensors: Sensors | None = None
         self.reset(0)
 
     @property
@@ -149,9 +148,9 @@ class TurtleBot4:
         )
         self._walkers = Walkers(self._scene, self.yield_m, RADIUS_M, np.random.default_rng([seed, 2]))
         faults = (self._knobs["delay"], self._knobs["drop"], self._knobs["freeze"], np.random.default_rng([seed, 3]))
-        if self._sensors is not None:
+        if hasattr(self, "_sensors"):
             self._sensors.close()
-        self._sensors = Sensors(
+        self._sensors: Sensors = Sensors(
             self._mujoco, self._model, self._names, (self.height, self.width), self._knobs["noise"], self.gaps,
             Outbox(*faults), np.random.default_rng([seed, 4]), self.battery,
         )  # fmt: skip
@@ -176,7 +175,6 @@ class TurtleBot4:
 
     def advance(self, seconds: float) -> None:
         """Simulate this much time, in steps of 10 ms."""
-        assert self._sensors is not None
         for _ in range(round(seconds / TICK_S)):
             self._step()
             self._sensors.sense(self._tick, self._data, self._drive, self._target, self._people_near(), self._contact)
@@ -236,7 +234,6 @@ class TurtleBot4:
 
     def reports(self) -> list[tuple[str, Message]]:
         """Return the messages that arrived since the last call, with their topics, in the order of their sending."""
-        assert self._sensors is not None
         return self._sensors.outbox.take(self.time_s)
 
     def obey(self, topic: str, message: Message) -> None:
