@@ -15,6 +15,7 @@ from vlatool.messages.sensor_msgs import Image
 from vlatool.messages.std_msgs import Bool, String
 from vlatool.nodes.content import digest, from_text, to_text
 from vlatool.nodes.in_world import Event, play
+from vlatool.nodes.recordings import open_recording
 from vlatool.nodes.replay import lines, replay
 from vlatool.nodes.run_log import Background, Received, RunLog, StepPublisher, is_log, read_log
 from vlatool.nodes.step_record import ControllerRecord, StepRecord
@@ -48,6 +49,13 @@ def test_log_is_replayed_bit_for_bit(log, reports):
     assert (found.equal, found.steps, found.differing, found.unused, found.note) == (True, len(reports), 0, 0, "")
     assert found.messages == sum(len(messages) for report in reports for messages in report.command.messages.values())
     assert list(lines(found)) == [f"{found.steps} steps, {found.messages} messages of commands: bit-equal"]
+
+
+def test_log_is_one_by_its_bytes_whatever_its_name(log):
+    named = log.rename(log.with_name("run.mcap"))
+    recording = open_recording(named, ABOUT.controller)
+    assert recording.topics is None
+    assert next(iter(recording.items())) == ABOUT
 
 
 def test_other_settings_differ(log):

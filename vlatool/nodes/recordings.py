@@ -66,9 +66,9 @@ def open_recording(path: Path, controller: str, node: str = "") -> Recording:
     """
     if not path.exists():
         raise DataError(f"There is no recording at {path}.", "check the path")
-    if path.is_dir() or path.suffix in SUFFIXES:
-        return _of_bag(path, controller, node)
-    if not is_log(path):
+    if not is_log(path):  # by its first bytes: a log may be called as a bag is
+        if path.is_dir() or path.suffix in SUFFIXES:
+            return _of_bag(path, controller, node)
         raise DataError(f"{path} is not a recorded run.", "name a file of vlatool run --record, or a bag")
     about = next((item for item in read_log(path) if isinstance(item, ControllerRecord)), None)
     if about is None or not _is(about, controller):
