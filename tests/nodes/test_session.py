@@ -102,9 +102,13 @@ def test_refusals_of_the_bus(plan):
     bus.close()
 
 
-def test_instruction_needs_an_input(plan):
+def test_refused_instruction_leaves_no_log_and_no_thread(plan, tmp_path):
+    threads = {thread.name for thread in threading.enumerate()}
+    plan = replace(plan, controller="roi-tracker", settings={}, instruction="go", record=tmp_path / "log")
     with pytest.raises(UsageError, match="takes no instruction"):
-        run_on_bus(replace(plan, controller="roi-tracker", settings={}, instruction="go"))
+        run_on_bus(plan)
+    assert not plan.record.exists()
+    assert {thread.name for thread in threading.enumerate()} <= threads
 
 
 def test_dry_run_says_what_would_run(plan):

@@ -134,14 +134,16 @@ def run_on_bus(
         bus = open_bus(plan.bus, node)
         stack.callback(bus.close)
         background = Background()
+        stack.callback(background.close)
         runner = Runner(controller, bus, topics=plan.topics, observers=[background], alone=not plan.shared)
         about = record_of(plan.controller, controller, node, runner.topics, plan.policy)
-        log = None if plan.record is None else RunLog(plan.record, about)
+        say = _instructor(bus, controller, runner.topics, required=bool(plan.instruction))
+        publish_step = StepPublisher(bus, about)
+        log = None if plan.record is None else RunLog(plan.record, about)  # a run that is refused leaves none
         if plan.report is not None:
             watch_levels(bus, trace)
-        background.observe(StepPublisher(bus, about), trace, *([] if log is None else [log]))
+        background.observe(publish_step, trace, *([] if log is None else [log]))
         on_start(about)
-        say = _instructor(bus, controller, runner.topics, required=bool(plan.instruction))
         if say is not None and isinstance(bus, ActionBus):
             background.observe(InstructionAction(bus, node, say))
         time.sleep(plan.settle_s)
