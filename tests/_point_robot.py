@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.buses import QoS, Reception, TopicInfo
+from vlatool.buses._faults import Faults
 from vlatool.controllers import Command, Input, Output, Service
 from vlatool.errors import BusError
 from vlatool.messages import Message
@@ -36,6 +37,7 @@ class MemoryBus:
 
     def __init__(self, exchange: Exchange, node: str) -> None:
         self.exchange, self.node, self.closed = exchange, node, False
+        self.counted = Faults()
 
     def subscribe(self, topic, message, handler, qos):
         with self.exchange.lock:
@@ -75,6 +77,9 @@ class MemoryBus:
         types = {kind for _, kind in sending} | {message.TYPE for _, message, _ in reading}
         return TopicInfo(topic, tuple(sorted(types)), tuple(node for node, _ in sending),
                          tuple(node for node, _, _ in reading))  # fmt: skip
+
+    def faults(self):
+        return self.counted.listing()
 
     def stamp(self):
         return Time.from_seconds(time.time())  # noqa: TID251

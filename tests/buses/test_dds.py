@@ -120,10 +120,11 @@ class TestDds(NetworkBus):
         with opened(open_node, "robot", "controller") as (robot, controller):
             Heard(robot, "/cmd_vel", qos=QoS(reliable=True))
             controller.publisher("/cmd_vel", Twist, QoS(reliable=False))
-            assert wait_until(lambda: bool(robot.faults() and controller.faults()))
-            assert "between this node and robot: the subscriber asks for 'reliable'" in str(
-                controller.faults()[0].error
-            )
+            expected = "between this node and robot: the subscriber asks for 'reliable'"
+            assert wait_until(lambda: expected in "".join(str(fault.error) for fault in controller.faults()))
+            robot.close()
+            assert wait_until(lambda: not controller.topics()[0].subscribers)
+            assert expected in str(controller.faults()[0].error)
 
     def test_one_process_uses_a_domain_on_one_interface(self, open_node: Open) -> None:
         with (

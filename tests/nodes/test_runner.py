@@ -84,10 +84,16 @@ def test_step_that_raises_ends_in_rest(exchange, others, error):
     assert [message.linear.x for message in sent] == [1, 1, 0]
 
 
+@pytest.fixture
+def unhandled_sigterm():
+    handler = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGTERM, handler)
+
+
 @pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
-def test_signals_end_in_rest(exchange, others, number, raised):
+def test_signals_end_in_rest(exchange, others, number, raised, unhandled_sigterm):
     sent = collect(others, "/cmd_vel", Twist)
-    handler = signal.getsignal(signal.SIGTERM)
     waiting = [number]
     others.subscribe("/cmd_vel", Twist, lambda _: waiting and os.kill(os.getpid(), waiting.pop()), QoS())
     with pytest.raises(raised) as left:
@@ -95,7 +101,7 @@ def test_signals_end_in_rest(exchange, others, number, raised):
     assert getattr(left.value, "code", 143) == 143
     assert sent[-1].linear.x == 0
     assert all(message.linear.x == 1 for message in sent[:-1])
-    assert signal.getsignal(signal.SIGTERM) is handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_stop_from_another_thread(exchange, others):

@@ -11,12 +11,14 @@ import pytest
 from tests._point_robot import GoTo, PointWorld
 from vlatool import registry
 from vlatool.buses import QoS, open_bus
+from vlatool.buses._faults import Faults
 from vlatool.errors import BusError, OutputError, UsageError
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.std_msgs import String
 from vlatool.nodes import session
 from vlatool.nodes.launch import PolicyOptions
 from vlatool.nodes.replay import replay
+from vlatool.nodes.report_page import write_page
 from vlatool.nodes.run_log import read_log
 from vlatool.nodes.session import RunPlan, dry_run, run_on_bus
 from vlatool.nodes.world_node import WorldNode
@@ -109,6 +111,29 @@ def test_refused_instruction_leaves_no_log_and_no_thread(plan, tmp_path):
         run_on_bus(plan)
     assert not plan.record.exists()
     assert {thread.name for thread in threading.enumerate()} <= threads
+
+
+def test_faults_of_the_bus_are_passed_on_once_and_counted_at_the_end(plan, monkeypatch, tmp_path):
+    counted, heard = Faults(), []
+
+    def faulty_bus(*arguments):
+        bus = open_bus(*arguments)
+        monkeypatch.setattr(bus, "faults", counted.listing)
+        return bus
+
+    monkeypatch.setattr(session, "open_bus", faulty_bus)
+    for _ in range(2):
+        counted.add("/odom", BusError("No messages pass on /odom.", "give both ends one quality of service"))
+    page = tmp_path / "page.html"
+    watched = replace(plan, seconds=1.2, wait_s=0.0)
+    with pytest.warns(UserWarning, match="nobody publishes"):
+        result = run_on_bus(watched, on_fault=heard.append, on_end=lambda *run: write_page(page, *run))
+    assert [fault.topic for fault in heard] == ["/odom"]
+    assert result.to_dict()["faults"] == [
+        {"topic": "/odom", "count": 2, "error": "No messages pass on /odom.",
+         "fix": "give both ends one quality of service"}
+    ]  # fmt: skip
+    assert "On the bus, 2 times: No messages pass on /odom." in page.read_text()
 
 
 def test_dry_run_says_what_would_run(plan):

@@ -8,6 +8,7 @@ import pytest
 
 from tests._point_robot import Exchange, MemoryBus
 from vlatool.buses import QoS
+from vlatool.errors import BusError
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.nav_msgs import Odometry
@@ -59,6 +60,16 @@ def test_rates_ages_publishers_and_conflicts():
     text = "\n".join(lines(list(found.values())))
     assert "  ! 2 publishers command one robot" in text
     assert "teleop, rogue -> robot" in text
+
+
+def test_faults_of_the_bus_are_problems_of_their_topics():
+    exchange = Exchange()
+    bus = MemoryBus(exchange, "survey")
+    MemoryBus(exchange, "robot").publisher("/odom", Odometry, QoS())
+    for count in range(3):
+        bus.counted.add("/odom", BusError(f"A malformed message came on /odom, number {count}.", "check the robot"))
+    (report,) = survey(bus, "survey", 0)
+    assert report.problems == ("A malformed message came on /odom, number 2. (3 times); check the robot",)
 
 
 def test_empty_bus():

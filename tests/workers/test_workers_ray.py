@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -60,6 +61,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
             for cache, path in zip(caches, paths, strict=True)
         ]  # fmt: skip
         first = {**arguments[0], "include_dashboard": False, "temp_dir": sockets}
+        handler = signal.getsignal(signal.SIGTERM)  # a node takes it for itself, and keeps it when it is gone
         cluster = Cluster(initialize_head=True, head_node_args=first)
         try:
             cluster.add_node(**arguments[1])
@@ -68,6 +70,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
         finally:
             ray.shutdown()
             cluster.shutdown()
+            signal.signal(signal.SIGTERM, handler)
             shutil.rmtree(sockets, ignore_errors=True)
 
 

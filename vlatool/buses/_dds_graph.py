@@ -118,8 +118,8 @@ class DdsGraph(Graph):
         for node in told.node_entities_info_seq:
             name = f"{node.node_namespace}/{node.node_name}".strip("/").replace("//", "/")
             names.update({gid.data.tobytes().hex(): name for gid in (*node.reader_gid_seq, *node.writer_gid_seq)})
-        with self._changed:
-            self._nodes[told.gid.data.tobytes().hex()] = names
+        with self._changed:  # a node that leaves takes its endpoints back first: faults go on naming it
+            self._nodes.setdefault(told.gid.data.tobytes().hex(), {}).update(names)
             self._changed.notify_all()
 
     def _hear_endpoint(self, sample: Any, end: str) -> None:

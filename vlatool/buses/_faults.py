@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 from vlatool.buses._interface import Fault
 from vlatool.errors import BusError
@@ -13,13 +14,18 @@ class Faults:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._by_topic: dict[str, Fault] = {}
+        self._by_topic: dict[str, tuple[int, BusError | Callable[[], BusError]]] = {}
 
-    def add(self, topic: str, error: BusError) -> None:
-        """Count an error on a topic or a service."""
+    def add(self, topic: str, error: BusError | Callable[[], BusError]) -> None:
+        """Count an error on a topic or a service.
+
+        Args:
+            topic: The topic or service.
+            error: The error, or what returns it when it is read: names of nodes may become known after their faults.
+        """
         with self._lock:
-            before = self._by_topic.get(topic)
-            self._by_topic[topic] = Fault(topic, before.count + 1 if before else 1, error)
+            count, _ = self._by_topic.get(topic, (0, error))
+            self._by_topic[topic] = count + 1, error
 
     def add_raised(self, topic: str, error: Exception) -> None:
         """Count what a handler raised."""
@@ -32,4 +38,7 @@ class Faults:
     def listing(self) -> list[Fault]:
         """Return one entry for each topic with a fault, sorted by topic."""
         with self._lock:
-            return [self._by_topic[topic] for topic in sorted(self._by_topic)]
+            entries = sorted((topic, *entry) for topic, entry in self._by_topic.items())
+        return [
+            Fault(topic, count, error if isinstance(error, BusError) else error()) for topic, count, error in entries
+        ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from vlatool.buses._faults import Faults
@@ -122,9 +123,9 @@ class Graph:
                 continue
             own, foreign = (one, entity) if one.session == self._own_session else (entity, one)
             if own.type_name != foreign.type_name:
-                self._faults.add(entity.topic, self._other_type(foreign, own.type_name))
-            elif own.kind != foreign.kind and (error := self._unmatched(own, foreign)):
-                self._faults.add(entity.topic, error)
+                self._faults.add(entity.topic, partial(self._other_type, foreign, own.type_name))
+            elif own.kind != foreign.kind and (wants := _unmatched(own, foreign)):
+                self._faults.add(entity.topic, partial(self._no_messages, foreign, wants))
 
     def _other_type(self, entity: Entity, type_name: str) -> BusError:
         return BusError(
@@ -132,19 +133,22 @@ class Graph:
             "remap one of the topics, or correct the type",
         )
 
-    def _unmatched(self, own: Entity, foreign: Entity) -> BusError | None:
-        publisher, subscriber = (own, foreign) if own.kind == PUBLISHER else (foreign, own)
-        if publisher.qos is None or subscriber.qos is None:
-            return None
-        wants = []
-        if subscriber.qos.reliable and not publisher.qos.reliable:
-            wants.append("'reliable', and the publisher is 'best effort'")
-        if subscriber.qos.latched and not publisher.qos.latched:
-            wants.append("'transient local', and the publisher is 'volatile'")
-        if not wants:
-            return None
+    def _no_messages(self, foreign: Entity, wants: str) -> BusError:
         return BusError(
-            f"No messages pass on {own.topic} between this node and {self.node_of(foreign)}: the subscriber asks for "
-            f"{' and for '.join(wants)}.",
+            f"No messages pass on {foreign.topic} between this node and {self.node_of(foreign)}: the subscriber asks "
+            f"for {wants}.",
             "give both ends one quality of service",
         )
+
+
+def _unmatched(own: Entity, foreign: Entity) -> str:
+    """Return what a subscriber asks for and its publisher does not offer; empty where they match."""
+    publisher, subscriber = (own, foreign) if own.kind == PUBLISHER else (foreign, own)
+    if publisher.qos is None or subscriber.qos is None:
+        return ""
+    wants = []
+    if subscriber.qos.reliable and not publisher.qos.reliable:
+        wants.append("'reliable', and the publisher is 'best effort'")
+    if subscriber.qos.latched and not publisher.qos.latched:
+        wants.append("'transient local', and the publisher is 'volatile'")
+    return " and for ".join(wants)

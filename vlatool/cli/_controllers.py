@@ -182,6 +182,7 @@ def _is_given(context: typer.Context, name: str) -> bool:
 
 def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
     """Run a controller as its command line says."""
+    from vlatool.nodes.fault_watch import fault_text
     from vlatool.nodes.launch import PolicyOptions
     from vlatool.nodes.map_file import split_maps
     from vlatool.nodes.session import RunPlan, dry_run, run_on_bus, waiting
@@ -206,6 +207,7 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
         lambda about: _say(about.node, about.topics),
         lambda *ended: _write_report(plan, *ended),
         lambda topics: typer.echo(f"... {printable(waiting(topics))}", err=True),
+        lambda fault: typer.echo(f"... {printable(fault_text(fault))}", err=True),
     )
     answer(as_json, result.to_dict(), _lines(result))
 
@@ -243,6 +245,8 @@ def _plan_lines(found: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _lines(result: RunResult) -> Iterator[str]:
+    from vlatool.nodes.fault_watch import fault_text
+
     found = result.to_dict()
     late, compute, over = (found[name] for name in ("late_ms", "compute_ms", "overhead_ms"))
     yield printable(
@@ -257,3 +261,5 @@ def _lines(result: RunResult) -> Iterator[str]:
     if found["lost_records"] or found["failure"] or found["log_full"]:
         reason = found["failure"] or ("the log was full" if found["log_full"] else f"{found['lost_records']} were lost")
         yield printable(f"  the records of the steps are not whole: {reason}")
+    for fault in result.faults:
+        yield printable(f"  on the bus: {fault_text(fault)}")

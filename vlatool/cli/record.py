@@ -98,6 +98,7 @@ def _record_bus(bus: str, output: Path, topics: list[str], seconds: float | None
     """Record topics of a bus to a new bag."""
     from vlatool.buses import open_bus
     from vlatool.nodes.bus_recorder import BusRecorder, RecordSummary
+    from vlatool.nodes.fault_watch import fault_text, to_plain_faults
 
     if not str(output).strip() or ":" in str(output):
         raise UsageError(f"The bag '{output}' has a colon in its name, which separates bags.", "name it without one")
@@ -112,10 +113,12 @@ def _record_bus(bus: str, output: Path, topics: list[str], seconds: float | None
                 recorder.run(seconds)
         finally:
             bag.close()
+        faults = opened.faults()
     finally:
         opened.close()
     lines = [f"{output}: {sum(summary.messages.values())} messages of {len(summary.messages)} topics in "
              f"{summary.seconds:.1f} s"]  # fmt: skip
     lines += [f"  {topic}  {count}" for topic, count in sorted(summary.messages.items())]
     lines += [f"  {topic} is not recorded: {why}" for topic, why in sorted(summary.unknown.items())]
-    answer(as_json, {"file": str(output), **vars(summary)}, map(printable, lines))
+    lines += [f"  on the bus: {fault_text(fault)}" for fault in faults]
+    answer(as_json, {"file": str(output), **vars(summary), "faults": to_plain_faults(faults)}, map(printable, lines))

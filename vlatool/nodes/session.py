@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.buses import ActionBus, Bus, QoS, open_bus
+from vlatool.buses import ActionBus, Bus, Fault, QoS, open_bus
 from vlatool.errors import OutputError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.std_msgs import String
+from vlatool.nodes.fault_watch import FaultWatch, to_plain_faults
 from vlatool.nodes.instruction_action import InstructionAction
 from vlatool.nodes.launch import PolicyOptions, open_controller, record_of
 from vlatool.nodes.run_log import Background, RunLog, StepPublisher
@@ -76,6 +77,7 @@ class RunResult:
         lost: Reports of steps that were neither published nor logged, because the disk or the bus was too slow.
         log_full: Whether the log reached its limit before the end.
         failure: Why the records of the steps ended before the run did; empty where they did not.
+        faults: What went wrong on the bus, one entry for each topic.
     """
 
     about: ControllerRecord
@@ -83,6 +85,7 @@ class RunResult:
     lost: int = 0
     log_full: bool = False
     failure: str = ""
+    faults: tuple[Fault, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
@@ -92,7 +95,7 @@ class RunResult:
             "steps": summary.steps, "skipped": summary.skipped, "seconds": summary.seconds, "status": summary.status,
             "late_ms": spread(summary.late_ms), "compute_ms": spread(summary.compute_ms),
             "overhead_ms": spread(summary.overhead_ms), "overwritten": summary.overwritten, "lost_records": self.lost,
-            "log_full": self.log_full, "failure": self.failure,
+            "log_full": self.log_full, "failure": self.failure, "faults": to_plain_faults(self.faults),
         }  # fmt: skip
 
 
@@ -109,6 +112,7 @@ def run_on_bus(
     on_start: Callable[[ControllerRecord], None] = lambda about: None,
     on_end: Callable[[RunResult, Trace], None] = lambda result, trace: None,
     on_missing: Callable[[tuple[str, ...]], None] = lambda topics: warnings.warn(waiting(topics), stacklevel=3),
+    on_fault: Callable[[Fault], None] = lambda fault: None,
 ) -> RunResult:
     """Run a controller on a bus until its time is over, or a signal or a failure ends it.
 
@@ -116,6 +120,7 @@ def run_on_bus(
         on_start: Called with what runs, before its first step.
         on_missing: Called with topics of required inputs that nobody publishes yet; it warns when not given.
         on_end: Called with what it was and with its trace, however it ended, once the robot is at rest.
+        on_fault: Called, from another thread, with the first fault of the bus on each topic.
 
     Raises:
         UsageError: when something is not allowed or missing, a file exists already.
@@ -142,7 +147,7 @@ def run_on_bus(
         log = None if plan.record is None else RunLog(plan.record, about)  # a run that is refused leaves none
         if plan.report is not None:
             watch_levels(bus, trace)
-        background.observe(publish_step, trace, *([] if log is None else [log]))
+        background.observe(publish_step, trace, FaultWatch(bus, on_fault), *([] if log is None else [log]))
         on_start(about)
         if say is not None and isinstance(bus, ActionBus):
             background.observe(InstructionAction(bus, node, say))
@@ -154,7 +159,7 @@ def run_on_bus(
         try:
             runner.run(plan.seconds)
         finally:
-            result = _closed(about, runner.summary, background, log)
+            result = _closed(about, runner, background, log)
             on_end(result, trace)
     return result
 
@@ -219,12 +224,13 @@ def node_of(plan: RunPlan) -> str:
     return plan.node or f"vlatool_{plan.controller.replace('-', '_')}"
 
 
-def _closed(about: ControllerRecord, summary: RunSummary, background: Background, log: RunLog | None) -> RunResult:
+def _closed(about: ControllerRecord, runner: Runner, background: Background, log: RunLog | None) -> RunResult:
     background.close()
     if log is not None:
         log.close(background.lost)
     failure = "" if background.failure is None else f"{type(background.failure).__name__}: {background.failure}"
-    return RunResult(about, summary, background.lost, log is not None and log.full, failure)
+    full = log is not None and log.full
+    return RunResult(about, runner.summary, background.lost, full, failure, tuple(runner.bus.faults()))
 
 
 def refuse_output(path: Path | None) -> None:

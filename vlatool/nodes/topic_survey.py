@@ -11,6 +11,7 @@ from typing import Any
 from vlatool.buses import Bus, QoS, Reception, TopicInfo
 from vlatool.errors import BusError, UsageError
 from vlatool.messages import find_type
+from vlatool.nodes.fault_watch import fault_text
 
 COMMANDS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped", "trajectory_msgs/msg/JointTrajectory")
 """Types that command a robot: two publishers of one topic fight each other."""
@@ -86,8 +87,9 @@ def survey(bus: Bus, node: str, seconds: float) -> list[TopicReport]:
         if left <= 0:
             break
         time.sleep(min(0.2, left))
-    return [_report(info, watches.get(info.topic), refused.get(info.topic, ""), node) for info in bus.topics()
-            if set(info.publishers) - {node} or set(info.subscribers) - {node}]  # fmt: skip
+    faults = {fault.topic: fault_text(fault) for fault in bus.faults()}
+    return [_report(info, watches.get(info.topic), (refused.get(info.topic), faults.get(info.topic)), node)
+            for info in bus.topics() if set(info.publishers) - {node} or set(info.subscribers) - {node}]  # fmt: skip
 
 
 def _watch(bus: Bus, info: TopicInfo, watches: dict[str, _Watch], refused: dict[str, str]) -> None:
@@ -103,10 +105,10 @@ def _watch(bus: Bus, info: TopicInfo, watches: dict[str, _Watch], refused: dict[
         watches[info.topic] = watch
 
 
-def _report(info: TopicInfo, watch: _Watch | None, refused: str, node: str) -> TopicReport:
+def _report(info: TopicInfo, watch: _Watch | None, seen: Sequence[str | None], node: str) -> TopicReport:
     publishers = tuple(name for name in info.publishers if name != node)
     subscribers = tuple(name for name in info.subscribers if name != node)
-    problems = [refused] if refused else []
+    problems = [problem for problem in seen if problem]
     if len(info.types) > 1:
         problems.append(f"{len(info.types)} types on one topic: {', '.join(info.types)}")
     if len(publishers) > 1 and set(info.types) & {*COMMANDS}:
