@@ -17,12 +17,14 @@ from vlatool.buses import (
     ActionBus,
     ActionType,
     Goal,
+    NamingBus,
     Outcome,
     QoS,
     Reception,
     TopicInfo,
     open_bus,
     ros2,
+    split_ros_words,
 )
 from vlatool.buses._rclpy_messages import from_ros, to_ros
 from vlatool.buses.ros2 import Ros2
@@ -170,6 +172,28 @@ def test_topics_types_and_peers(node: Nodes) -> None:
         two.subscribe("/cmd_vel", String, lambda each: None, QoS())
     with pytest.raises(BusError, match="/cmd_vel carries geometry_msgs/msg/Twist, not std_msgs/msg/String"):
         two.publisher("cmd_vel", String, QoS())
+
+
+def test_a_launch_file_names_the_node_and_swaps_two_topics(graph: double.Graph) -> None:
+    _, words = split_ros_words(["--ros-args", "-r", "__node:=left", "-r", "__ns:=/robot1", "-r", "/cmd_vel:=safe",
+                                "-r", "/safe:=/cmd_vel", "-r", "~/state:=/state", "-r", "set:=/set"])  # fmt: skip
+    robot, bus, inbox = Ros2("", "robot"), Ros2("", "vlatool_vln", words), Inbox()
+    assert isinstance(bus, NamingBus)
+    assert (bus.node, bus.full_node) == ("left", "robot1/left")
+    robot.subscribe("/robot1/safe", Twist, inbox.put, QoS())
+    robot.publisher("/cmd_vel", String, QoS())
+    bus.publisher("/cmd_vel", Twist, QoS())(Twist(Vector3(1.0)))
+    assert same(inbox.wait(1)[0], Twist(Vector3(1.0)))
+    with pytest.raises(BusError, match="/cmd_vel carries std_msgs/msg/String, not geometry_msgs/msg/Twist"):
+        bus.subscribe("/safe", Twist, inbox.put, QoS())
+    assert [bus.resolve(name) for name in ("scan", "~state", "~other", "/scan")] == [
+        "/robot1/scan", "/state", "/robot1/left/other", "/scan",
+    ]  # fmt: skip
+    assert bus.wait_for_peers(("/cmd_vel", "/safe"), WAIT_S) == ()
+    bus.serve("set", SetBoolRequest, SetBoolResponse, lambda request: SetBoolResponse(True, "here"))
+    assert robot.call("/set", SetBoolRequest(), SetBoolResponse, WAIT_S).message == "here"
+    for each in (robot, bus):
+        each.close()
 
 
 def test_a_latched_message_reaches_who_comes_later(node: Nodes) -> None:
