@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -28,6 +29,7 @@ from vlatool.buses import (
 )
 from vlatool.buses._rclpy_messages import from_ros, to_ros
 from vlatool.buses.ros2 import Ros2
+from vlatool.cli import main
 from vlatool.errors import BusError, MissingExtra, UsageError
 from vlatool.messages import Message, find_type, same
 from vlatool.messages.builtin_interfaces import Time
@@ -298,3 +300,19 @@ def test_absent_packages_are_named(graph: double.Graph, monkeypatch: pytest.Monk
     monkeypatch.setitem(modules, "rclpy", None)
     with pytest.raises(MissingExtra, match="'rclpy' cannot be imported"):
         open_bus("ros2", "node")
+
+
+def test_a_controller_of_a_launch_file_runs_under_its_names(graph: double.Graph, capsys, tmp_path) -> None:
+    (tmp_path / "parameters.yaml").write_text("/robot1/left: {ros__parameters: {rate: 40, use_sim_time: false}}")
+    words = ["run", "roi-tracker", "--bus", "ros2", "--seconds", "0.2", "--wait", "0", "--json", "--ros-args", "-r",
+             "__node:=left", "-r", "__ns:=/robot1", "--params-file", str(tmp_path / "parameters.yaml"), "-p",
+             "gain:=2.5", "-r", "/cmd_vel:=cmd_vel", "-r", "/odd:=/even"]  # fmt: skip
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert (end.value.code, found["node"], found["topics"]["cmd_vel"]) == (0, "robot1/left", "/robot1/cmd_vel")
+    assert found["steps"] == 8
+    assert "parameters of the node: rate = 40, gain = 2.5" in err
+    assert "the remapping /odd:=/even changes no topic of this node" in err
+    assert "/cmd_vel:=cmd_vel changes no topic" not in err

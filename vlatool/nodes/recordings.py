@@ -104,7 +104,7 @@ def _topics(path: Path) -> list[str]:
 
 
 def _records(path: Path) -> list[ControllerRecord]:
-    """Return what ran, by the topics /NODE/controller of a bag; the last of each node."""
+    """Return what ran, by the topics /NODE/controller of a bag; the first of each node, whose steps come first, too."""
     bag = Bag(str(path), NODE)
     try:
         topics = [info.topic for info in bag.topics()
@@ -112,7 +112,7 @@ def _records(path: Path) -> list[ControllerRecord]:
         texts = [(topic, _text(message)) for topic, _, message in bag.messages(topics)] if topics else []
     finally:
         bag.close()
-    return list({topic: ControllerRecord.from_json(text) for topic, text in texts}.values())
+    return list({topic: ControllerRecord.from_json(text) for topic, text in reversed(texts)}.values())[::-1]
 
 
 def _text(message: object) -> str:

@@ -75,7 +75,8 @@ def environment(folder: Path) -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join(paths), "ROS_LOG_DIR": str(folder / "logs"),
         "ROS_HOME": str(folder / "home"), "PYTHONWARNINGS": "ignore", "ROS_ROOT": str(root / "usr/share/ros"),
         "ROS_PYTHON_LOG_CONFIG_FILE": str(root / "etc/ros/python_logging.conf"),
-        "PATH": os.pathsep.join([str(root / "usr/bin"), str(site / "bin"), kept.get("PATH", "")]), "LD_LIBRARY_PATH": str(libraries(folder)),
+        "PATH": os.pathsep.join([str(root / "usr/bin"), str(site / "bin"), kept.get("PATH", "")]),
+        "LD_LIBRARY_PATH": str(libraries(folder)),
         "ROS_PACKAGE_PATH": str(root / "usr/share"), "CMAKE_PREFIX_PATH": str(root / "usr"),
     }  # fmt: skip
 

@@ -14,6 +14,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from vlatool.buses.bag import Bag
 from vlatool.messages.ros1 import encode
+from vlatool.nodes.run_log import Received, read_log
 
 TARGET = ("--target-m", 1.5, "--target-speed", 0.3, "--pillars", 2)
 
@@ -51,7 +53,9 @@ CASES = {
         ("turtlebot4", *TARGET, "--only", "info,roi,depth,odom"),
         ("/camera/color/camera_info", "/roi", "/camera/depth/image_raw"),
     ),
-    "cloud-follower": Case(("turtlebot4", *TARGET[2:], "--target-m", 1.0, "--only", "cloud,odom"), ("/camera/depth/points",)),
+    "cloud-follower": Case(
+        ("turtlebot4", "--target-m", 0.9, "--pillars", 2, "--only", "cloud,odom"), ("/camera/depth/points",)
+    ),
     "safety-monitor": Case(
         ("turtlebot4", *TARGET, "--only", "info,roi,depth,odom,scan,battery,joints,person", "--command-topic",
          "/safe_cmd_vel"),
@@ -78,7 +82,7 @@ class Live:
         self.programs, self.bags, self.name, self.bundle = programs, bags, name, bundle
         self.case, self.node = CASES[name], f"/vlatool_{name.replace('-', '_')}"
 
-    def recorded(self, recorders: list[str], seconds: float, interrupted: bool) -> dict[str, Any]:
+    def recorded(self, recorders: Sequence[str], seconds: float, interrupted: bool) -> dict[str, Any]:
         """Record a run of some seconds; return its result."""
         bus = ("--bus", f"ros1:{self.programs.master.uri}")
         robot = self.programs.vlatool("sim", *self.case.robot, *bus)
@@ -109,12 +113,12 @@ class Live:
             path = self.bags / ("ours.bag" if kind == "ours" else "ours.mcap")
             return self.programs.vlatool("record", "--bus", f"ros1:{self.programs.master.uri}", "-o", path)
         own = (f"{self.node}/steps", f"{self.node}/controller", self.case.command, *self.case.topics)
-        topics = own if kind == "topics" else ("-a",)
+        topics = ("--lz4", *own) if kind == "topics" else ("-a",)
         return self.programs.ros("rosbag", "record", "-O", self.bags / f"{kind}.bag", *topics)
 
     def replay(self, bag: Path) -> tuple[int, dict[str, Any], str]:
         """Return the exit code, the result and the words of ``vlatool replay``."""
-        program = self.programs.vlatool("replay", bag, self.name, *self.bundle, "--json")
+        program = self.programs.vlatool("replay", bag, self.name, *self.bundle[:2], "--json")
         code, text = program.answer(120)
         return code, read_json(text), program.said()
 
@@ -137,18 +141,26 @@ class Live:
 PATHS = {"topics": "topics.bag", "all": "all.bag", "ours": "ours.bag", "mcap": "ours"}
 """Recorder -> its bag."""
 WHO = {
-    "topics": "rosbag record TOPICS", "all": "rosbag record -a", "ours": "vlatool record -o x.bag",
+    "topics": "rosbag record --lz4 TOPICS", "all": "rosbag record -a", "ours": "vlatool record -o x.bag",
     "mcap": "vlatool record -o x.mcap",
 }  # fmt: skip
 
 
-def live(programs: Programs, name: str, bundle: tuple[object, ...], seconds: float, rows: Rows) -> None:
-    """Record a run four times at once; replay each bag, and compare the commands in them."""
+def live(
+    programs: Programs,
+    name: str,
+    bundle: tuple[object, ...],
+    seconds: float,
+    rows: Rows,
+    recorders: Sequence[str] = tuple(PATHS),
+) -> None:
+    """Record a run by several recorders at once; replay each bag, and compare the commands in them."""
     with tempfile.TemporaryDirectory() as folder:
         run = Live(programs, Path(folder), name, bundle)
-        result = run.recorded(list(PATHS), seconds, interrupted=name == "roi-follower")
+        result = run.recorded(recorders, seconds, interrupted=name == "roi-follower")
         commands = {}
-        for kind, path in PATHS.items():
+        for kind in recorders:
+            path = PATHS[kind]
             code, found, said = run.replay(run.bags / path)
             counts = f"{found.get('steps')} of {result['steps']} steps, {found.get('messages')} messages"
             words = f"{counts}, {found.get('unheard')} unheard {found.get('note', '')}"
@@ -161,10 +173,11 @@ def live(programs: Programs, name: str, bundle: tuple[object, ...], seconds: flo
         moving = len(set(commands["ours"]))
         same = all(each == commands["ours"] for each in commands.values())
         said = f"{len(commands['ours'])} commands, {moving} different ones"
-        rows.append((f"{name}: commands in the four bags are bit-equal", said, same and moving > 3))
+        rows.append((f"{name}: commands in these bags are bit-equal", said, same and moving > 3))
         info(programs, run.bags / "ours.bag", rows)
         if name == "roi-follower":
             interrupted(run, rows)
+            played(run, rows)
 
 
 def info(programs: Programs, bag: Path, rows: Rows) -> None:
@@ -174,6 +187,21 @@ def info(programs: Programs, bag: Path, rows: Rows) -> None:
     rows.append(
         ("rosbag info of vlatool record's bag", f"exit code {code}, {count} messages", not code and count > "0")
     )
+
+
+def played(run: Live, rows: Rows) -> None:
+    """Let ``rosbag play``, a node of roscpp, publish a bag for a controller, and replay its log."""
+    bus, log = ("--bus", f"ros1:{run.programs.master.uri}"), run.bags / "played.log"
+    started = run.programs.vlatool("run", run.name, *run.bundle, *bus, "--seconds", 5, "--record", log)
+    started.wait_for("runs:")
+    player = run.programs.ros("rosbag", "play", run.bags / "all.bag", "--topics", *run.case.topics)
+    code, _ = started.answer()
+    player.end()
+    again, found, said = run.replay(log)
+    heard = sum(isinstance(item, Received) for item in read_log(log))
+    words = f"{heard} messages heard, {found.get('steps')} steps"
+    right = code == again == 0 and heard > found["steps"]
+    rows.append((f"{run.name}: rosbag play, a node of roscpp", words if found else last_line(said), right))
 
 
 def interrupted(run: Live, rows: Rows) -> None:

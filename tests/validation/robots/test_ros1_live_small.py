@@ -10,7 +10,7 @@ from _full import small_or_full
 from _ros1 import ROOT, Rows, environment, is_prepared
 from _ros1_processes import Programs
 from ros1_launch import CODES, launched
-from ros1_live import live
+from ros1_live import PATHS, live
 
 FOLDER = ROOT / "out/ros1"
 pytestmark = [
@@ -31,8 +31,8 @@ def wrong(rows: Rows) -> list[str]:
 def test_a_live_run_is_replayed_from_the_bags_of_rosbag_and_of_vlatool(tmp_path: Path, name: str):
     rows: Rows = []
     with Programs(FOLDER, environment(FOLDER), tmp_path) as programs:
-        live(programs, name, (), small_or_full(2.0, 6.0), rows)
-    assert len(rows) > 5
+        live(programs, name, (), small_or_full(1.5, 6.0), rows, small_or_full(("all", "ours"), tuple(PATHS)))
+    assert len(rows) > 3
     assert not wrong(rows)
 
 
