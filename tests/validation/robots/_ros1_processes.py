@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -42,6 +43,10 @@ class Programs:
     def ros(self, name: str, *words: object) -> Program:
         """Start a program of ROS 1 in Python, such as ``rosbag``."""
         return self._start(f"{name}-{words[0]}", [sys.executable, self.folder / "root/usr/bin" / name, *words])
+
+    def python(self, code: str, *words: object) -> Program:
+        """Start a program of a user: Python code with words behind it."""
+        return self._start("python", [sys.executable, "-c", code, *words])
 
     def _start(self, name: str, command: Sequence[object]) -> Program:
         path = self.logs / f"{len(self._running)}-{Path(name).name}.log"
@@ -97,8 +102,6 @@ class Program:
 
 def signal_group(process: int, number: int) -> None:
     """Send a signal to a process and its children, which share a session."""
-    import os
-
     try:
         os.killpg(process, number)
     except ProcessLookupError:

@@ -2,20 +2,22 @@
 
     python tests/validation/robots/ros1_launch.py -o out/ros1
 
-Unpacks ROS 1 into the folder as ``ros1_bus.py`` does, writes the package and the launch file of the guide, and starts
-them: once for each way of ending them. Prints a table, and exits with 1 when a line of it failed.
+Unpacks ROS 1 into the folder as ``ros1_bus.py`` does, writes the package and the launch file that the guide shows
+(docs/guides/robots.md), and starts them: once for each way of ending them. Prints a table, and exits with 1 when a line
+of it failed.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 import signal
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from _ros1 import Rows, prepare
+from _ros1 import ROOT, Rows, prepare
 from _ros1_processes import Program, Programs, await_true, read_json
 
 from vlatool.buses._ros1_master import ask
@@ -24,25 +26,7 @@ from vlatool.messages.geometry_msgs import Twist, Vector3
 from vlatool.messages.ros1 import encode
 from vlatool.nodes.recordings import open_recording
 
-PACKAGE = """<package format="2">
-  <name>my_robot</name> <version>1.0.0</version> <description>launch files</description>
-  <maintainer email="me@example.com">me</maintainer> <license>none</license>
-</package>
-"""
-SCRIPT = """#!/bin/sh
-exec {python} -m vlatool "$@"
-"""
-LAUNCH = """<launch>
-  <group ns="robot1">
-    <remap from="/cmd_vel" to="cmd_vel"/>
-    <node pkg="my_robot" type="vlatool" name="base" output="screen"
-          args="sim turtlebot4 --bus ros1 --target-m 1.5 --target-speed 0.3 --only info,roi,depth,odom"/>
-    <node pkg="my_robot" type="vlatool" name="follower" args="run roi-follower --bus ros1" launch-prefix="{keep}">
-      <param name="rate" value="15"/>
-    </node>
-  </group>
-</launch>
-"""
+GUIDE = ROOT / "docs/guides/robots.md"
 KEEP = """import signal, subprocess, sys
 for number in (signal.SIGINT, signal.SIGTERM):
     signal.signal(number, lambda *_: None)
@@ -55,17 +39,30 @@ CODES = {"Ctrl-C": "130", "SIGTERM": "130", "rosnode kill": "3"}
 """roslaunch sends SIGINT to its nodes first, however it is ended itself."""
 
 
+OWN = """import json
+from vlatool.nodes.session import RunPlan, run_on_bus
+found = run_on_bus(RunPlan("roi-tracker", bus="ros1", seconds=0.3, settle_s=0.0), on_missing=lambda topics: None)
+print(json.dumps({"node": found.about.node, **found.about.topics}))
+"""
+"""A program of a user, which reads no word of roslaunch itself."""
+
+
 def write_package(folder: Path, codes: Path) -> Path:
-    """Write the package ``my_robot``; return its launch file."""
+    """Write the package of the guide, ``my_robot``; return its launch file, which keeps the follower's exit code."""
+    manifest, script, launch = re.findall(
+        r"```(?:xml|sh)\n(.*?)```", GUIDE.read_text().partition("## From a launch file")[2], re.DOTALL
+    )[:3]
     package = folder / "my_robot"
     (package / "scripts").mkdir(parents=True)
-    (package / "package.xml").write_text(PACKAGE)
-    (package / "scripts/vlatool").write_text(SCRIPT.format(python=sys.executable))
+    (package / "package.xml").write_text(manifest)
+    (package / "scripts/vlatool").write_text(
+        script.replace("/home/me/venv/bin/vlatool", f"{sys.executable} -m vlatool")
+    )
     (package / "scripts/vlatool").chmod(0o755)
     (folder / "keep.py").write_text(KEEP)
-    launch = package / "robot.launch"
-    launch.write_text(LAUNCH.format(keep=f"{sys.executable} {folder / 'keep.py'} {codes}"))
-    return launch
+    keep = f'launch-prefix="{sys.executable} {folder / "keep.py"} {codes}" '
+    (package / "robot.launch").write_text(launch.replace('name="follower" ', f'name="follower" {keep}'))
+    return package / "robot.launch"
 
 
 def launched(programs: Programs, end: str, rows: Rows) -> None:
@@ -110,6 +107,28 @@ def launched(programs: Programs, end: str, rows: Rows) -> None:
         )
 
 
+def own_program(programs: Programs, rows: Rows) -> None:
+    """Run a program with the words of roslaunch, which swap two topics: alone, then beside another publisher."""
+    words = ("__name:=own", "__ns:=/robot1", "/cmd_vel:=roi", "/roi:=/cmd_vel")
+    _, text = programs.python(OWN, *words).answer()
+    found = read_json(text)
+    right = (found.get("node"), found.get("cmd_vel"), found.get("roi")) == ("robot1/own", "/robot1/roi", "/cmd_vel")
+    rows.append(("own program with remappings that swap", text.strip()[:110], right))
+    other = programs.python(OWN.replace("0.3", "30"), "__name:=other", "/cmd_vel:=/robot1/roi")
+    await_true(lambda: "/robot1/roi" in topics(programs), 10, "another publisher")
+    second = programs.python(OWN, *words)
+    code, _ = second.answer()
+    said = next((line for line in second.said().splitlines() if "publisher" in line), second.said()[-200:])
+    rows.append(
+        (
+            "a second publisher of a remapped topic is refused",
+            said[:110],
+            code != 0 and "has the publisher /other" in said,
+        )
+    )
+    other.end()
+
+
 def topics(programs: Programs) -> dict[str, list[str]]:
     """Return the topics that have publishers."""
     publishers, _, _ = ask(programs.master.uri, "getSystemState", "/looker")
@@ -138,6 +157,8 @@ def main() -> None:
     environment, rows = prepare(folder), []
     for end in given.only:
         with Programs(folder, environment, folder / "said" / end.replace(" ", "-")) as programs:
+            if end == "Ctrl-C":
+                own_program(programs, rows)
             launched(programs, end, rows)
     for what, said, right in rows:
         print(f"{'ok  ' if right else 'FAIL'} {what:62} {said}")
