@@ -16,9 +16,9 @@ from vlatool.buses._interface import (
     Reception,
     TopicInfo,
     launch_parameters,
+    name_on,
     open_bus,
     refuse_words_of_another,
-    resolved,
 )
 from vlatool.buses._ros_words import RosWords, split_ros_words
 
@@ -39,8 +39,8 @@ __all__ = [
     "RosWords",
     "TopicInfo",
     "launch_parameters",
+    "name_on",
     "open_bus",
     "refuse_words_of_another",
-    "resolved",
     "split_ros_words",
 ]

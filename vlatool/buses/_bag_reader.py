@@ -12,7 +12,7 @@ from vlatool.messages import Message, cdr, find_type, ros1
 from vlatool.messages.type_hash import rihs01
 
 SUFFIXES = (".bag", ".mcap", ".db3")
-UNFINISHED = ".active"
+UNFINISHED_SUFFIX = ".active"
 """Behind the name of a bag that ``rosbag record`` has not finished."""
 REPAIR = "record it again, or repair it: ros2 bag reindex (ROS 1: rosbag reindex)"
 
@@ -50,7 +50,7 @@ class BagReader:
             raise BusError(
                 f"There is no bag {path}.", "name a .bag, .mcap or .db3 file, or the directory of a ROS 2 bag"
             )
-        if path.suffix == UNFINISHED:
+        if path.suffix == UNFINISHED_SUFFIX:
             raise _unfinished(path)
         if not path.is_dir() and path.suffix not in SUFFIXES:
             raise BusError(f"{path} is not a bag: its name ends in none of {', '.join(SUFFIXES)}.", "name a bag")

@@ -214,7 +214,7 @@ class NamingBus(Protocol):
         """Return the full name that a topic or service has on the bus, after remappings."""
 
 
-def resolved(bus: Bus, name: str) -> str:
+def name_on(bus: Bus, name: str) -> str:
     """Return the name that a topic or service has on a bus: that which is written, unless the bus gives it another."""
     return bus.resolve(name) if isinstance(bus, NamingBus) else name
 

@@ -19,13 +19,13 @@ SPECIAL = ("name", "ns", "log", "master", "ip", "hostname")
 """What ROS 1 takes with two underscores before it."""
 MARK = "--ros-args"
 WITH_VALUE = ("--remap", "--param", "--params-file", "--log-level", "--log-config-file", "--enclave")
-SHORT = {"-r": "--remap", "-p": "--param", "-e": "--enclave"}
+SHORT_FLAGS = {"-r": "--remap", "-p": "--param", "-e": "--enclave"}
 SWITCH = re.compile(r"--(?:en|dis)able-(?:rosout|stdout|external-lib)-logs")
 OF_ROS = ("use_sim_time", "start_type_description_service")
 """Parameters that every node of ROS 2 has."""
 WORD = re.compile(r"((?:__?|~/?|/)?[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_]+)*):=(.*)", re.ASCII | re.DOTALL)
 """A word of ROS 1, and behind ``-r`` or ``-p`` one of ROS 2."""
-QUALIFIED = re.compile(r"(/?[A-Za-z]\w*(?:/\w+)*):(?!=)(.*)", re.ASCII | re.DOTALL)
+QUALIFIED_RULE = re.compile(r"(/?[A-Za-z]\w*(?:/\w+)*):(?!=)(.*)", re.ASCII | re.DOTALL)
 """A rule of ROS 2 for the node before the colon alone."""
 NAMESPACE = re.compile(r"/?(?:[A-Za-z]\w*(?:/[A-Za-z]\w*)*)?/?", re.ASCII)
 MAX_BYTES = 1_000_000
@@ -70,8 +70,8 @@ class RosWords:
 
     def special(self, name: str, node: str = "") -> str:
         """Return what ``__NAME`` is for a node; empty where it is not set."""
-        found = [rule.right for rule in self.remappings if rule.left == f"__{name}" and rule.holds_for(node)]
-        return found[-1] if found else ""
+        values = [rule.right for rule in self.remappings if rule.left == f"__{name}" and rule.holds_for(node)]
+        return values[-1] if values else ""
 
     def name_for(self, node: str) -> str:
         """Return the name of a node that is called so without them."""
@@ -111,14 +111,14 @@ class RosWords:
             DataError: when a file or a value is not YAML.
             MissingExtra: when PyYAML is absent.
         """
-        found: dict[str, Any] = {}
+        parameters: dict[str, Any] = {}
         full = self.full_name_for(node)
         for path in self.files:
-            found |= _parameters_in(path, full)
+            parameters |= _parameters_in(path, full)
         for rule in self.settings:
             if rule.holds_for(node) or rule.holds_for(self.name_for(node)):
-                found[rule.left.lstrip("_")] = _value(rule)
-        return {name: value for name, value in found.items() if name not in OF_ROS and "." not in name}
+                parameters[rule.left.lstrip("_")] = _value(rule)
+        return {name: value for name, value in parameters.items() if name not in OF_ROS and "." not in name}
 
 
 def split_ros_words(words: Sequence[str]) -> tuple[list[str], RosWords | None]:
@@ -152,9 +152,10 @@ def _split_ros2(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return outside, inside
 
 
-def _ros1(found: Sequence[tuple[str, re.Match[str]]]) -> RosWords:
-    remappings, settings = [], []
-    for word, match in found:
+def _ros1(matches: Sequence[tuple[str, re.Match[str]]]) -> RosWords:
+    remappings: list[Rule] = []
+    settings: list[Rule] = []
+    for word, match in matches:
         left, right = match.groups()
         special = left.startswith("__")
         if special and left[2:] not in SPECIAL:
@@ -164,11 +165,13 @@ def _ros1(found: Sequence[tuple[str, re.Match[str]]]) -> RosWords:
             raise UsageError(f"'{word}' says nothing behind ':='.", f"write it such as {left}:=VALUE, or leave it out")
         _check_namespace(left, right)
         (settings if private else remappings).append(Rule(left, right))
-    return RosWords("ros1", tuple(word for word, _ in found), tuple(remappings), tuple(settings))
+    return RosWords("ros1", tuple(word for word, _ in matches), tuple(remappings), tuple(settings))
 
 
 def _ros2(behind: Sequence[str]) -> RosWords:
-    remappings, settings, files = [], [], []
+    remappings: list[Rule] = []
+    settings: list[Rule] = []
+    files: list[str] = []
     for flag, value in _flags(behind):
         if flag in ("--remap", "--param"):
             (remappings if flag == "--remap" else settings).append(_rule(flag, value))
@@ -182,11 +185,11 @@ def _flags(behind: Sequence[str]) -> Iterator[tuple[str, str]]:
     words = iter(behind)
     for word in words:
         flag, sign, value = word.partition("=") if word.startswith("--") else (word, "", "")
-        flag = SHORT.get(flag, flag)
+        flag = SHORT_FLAGS.get(flag, flag)
         if word in (MARK, "--") or SWITCH.fullmatch(word):
             continue
         if flag not in WITH_VALUE:
-            raise UsageError.unknown(f"ROS 2 has no argument '{word}' behind {MARK}", flag, [*WITH_VALUE, *SHORT])
+            raise UsageError.unknown(f"ROS 2 has no argument '{word}' behind {MARK}", flag, [*WITH_VALUE, *SHORT_FLAGS])
         value = value if sign else next(words, "")
         if not value or value in (MARK, "--"):
             raise UsageError(f"'{flag}' behind {MARK} has no value.", f"write it such as {flag} VALUE")
@@ -196,7 +199,7 @@ def _flags(behind: Sequence[str]) -> Iterator[tuple[str, str]]:
 def _rule(flag: str, text: str) -> Rule:
     """Return a rule of ROS 2: ``FROM:=TO``, ``NODE:FROM:=TO``, or with a dot in the name of a parameter."""
     plain = text.replace("rostopic://", "").replace("rosservice://", "")
-    qualified = QUALIFIED.fullmatch(plain)
+    qualified = QUALIFIED_RULE.fullmatch(plain)
     node, rest = qualified.groups() if qualified else ("", plain)
     left, sign, right = rest.partition(":=")
     shape = re.compile(r"[A-Za-z_][\w.]*", re.ASCII) if flag == "--param" else re.compile(r"[~/\w]+", re.ASCII)
@@ -232,11 +235,11 @@ def _parameters_in(path: str, full: str) -> dict[str, Any]:
         raise DataError(f"The parameters {path} cannot be read: {error.strerror}.", "check the path") from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(f"The parameters {path} are not YAML: {' '.join(str(error).split())[:160]}.", fix) from None
-    found: dict[str, Any] = {}
+    values_of_node: dict[str, Any] = {}
     for node, parameters in _nodes_in(values, path, fix):
         if _is_for(node, full):
-            found |= parameters
-    return found
+            values_of_node |= parameters
+    return values_of_node
 
 
 def _nodes_in(values: Any, path: str, fix: str, above: str = "") -> Iterator[tuple[str, dict[str, Any]]]:

@@ -99,8 +99,8 @@ class Ros1:
             BusError: when no master answers.
         """
         full = words.full_name_for(node)
-        found = Master(_master_of(address, words), full).ask("getParam", full)
-        return found if isinstance(found, dict) else {}
+        values = Master(_master_of(address, words), full).ask("getParam", full)
+        return values if isinstance(values, dict) else {}
 
     def resolve(self, name: str) -> str:
         """See ``NamingBus.resolve``."""

@@ -63,7 +63,7 @@ class Ros2:
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
         """See ``Bus.subscribe``; other nodes are known half a second after this one has been opened."""
         name = self._agreed(topic, message)
-        written = self._written(topic)
+        name_as_written = self._as_written(topic)
 
         def receive(theirs: Any) -> None:
             received_s = time.monotonic()
@@ -72,14 +72,14 @@ class Ros2:
             except Exception as error:  # it would end the executor, and with it every other subscription
                 self._faults.add_raised(name, error)
 
-        self._node.create_subscription(generated_class(message.TYPE), written, receive, self._profile(qos))
+        self._node.create_subscription(generated_class(message.TYPE), name_as_written, receive, self._profile(qos))
         self._subscriptions[name] = self._subscriptions.get(name, 0) + 1
 
     def publisher(self, topic: str, message: type[M], qos: QoS) -> Callable[[M], None]:
         """See ``Bus.publisher``."""
         name = self._agreed(topic, message)
-        written = self._written(topic)
-        publisher = self._node.create_publisher(generated_class(message.TYPE), written, self._profile(qos))
+        name_as_written = self._as_written(topic)
+        publisher = self._node.create_publisher(generated_class(message.TYPE), name_as_written, self._profile(qos))
         self._publishers[name] = publisher
 
         def send(content: M) -> None:
@@ -108,7 +108,7 @@ class Ros2:
             threading.Thread(target=work, name=f"ros2 {name}", daemon=True).start()
             return await future
 
-        self._node.create_service(kind, self._written(service), answer)
+        self._node.create_service(kind, self._as_written(service), answer)
 
     def call(self, service: str, request: Message, response: type[M], timeout_s: float) -> M:
         """See ``Bus.call``; a server that fails answers an empty response, as rclpy has no other way."""
@@ -117,7 +117,7 @@ class Ros2:
         with self._lock:
             key = (name, request.TYPE)
             if key not in self._clients:
-                self._clients[key] = self._node.create_client(_service(type(request)), self._written(service))
+                self._clients[key] = self._node.create_client(_service(type(request)), self._as_written(service))
             client = self._clients[key]
         if not client.wait_for_service(timeout_sec=timeout_s):
             raise BusError(f"Nobody has served {name} within {timeout_s:g} s.", "start the node; ros2 service list")
@@ -134,23 +134,23 @@ class Ros2:
     def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
         """See ``ActionBus.serve_action``; the action's generated class must be installed."""
         self._refuse_closed()
-        self._ends.append(serve_action(self._node, self._written(action), kind, handler, self._future))
+        self._ends.append(serve_action(self._node, self._as_written(action), kind, handler, self._future))
 
     def send_goal(
         self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
     ) -> ClientGoal:
         """See ``ActionBus.send_goal``."""
         self._refuse_closed()
-        sent = ClientGoal(self._node, self._written(action), kind)
+        sent = ClientGoal(self._node, self._as_written(action), kind)
         sent.send(goal, feedback)
         return sent
 
     def resolve(self, name: str) -> str:
         """See ``NamingBus.resolve``."""
-        full: str = self._node.resolve_topic_name(self._written(name))
+        full: str = self._node.resolve_topic_name(self._as_written(name))
         return full
 
-    def _written(self, name: str) -> str:
+    def _as_written(self, name: str) -> str:
         """Return a name as rclpy takes it, which writes ``~/`` for ``~``; raises UsageError for one that none takes."""
         resolve(name, self.node)
         return f"~/{name.lstrip('~/')}" if name.startswith("~") else name
@@ -199,8 +199,14 @@ class Ros2:
     def _agreed(self, topic: str, message: type[Message]) -> str:
         """Return the full name of a topic; raises BusError when a node uses it with another type."""
         self._refuse_closed()
-        name, written = self.resolve(topic), self._written(topic)  # rclpy applies remappings to the latter itself
-        ends = (*self._node.get_publishers_info_by_topic(written), *self._node.get_subscriptions_info_by_topic(written))
+        name, name_as_written = (
+            self.resolve(topic),
+            self._as_written(topic),
+        )  # rclpy applies remappings to the latter itself
+        ends = (
+            *self._node.get_publishers_info_by_topic(name_as_written),
+            *self._node.get_subscriptions_info_by_topic(name_as_written),
+        )
         for end in ends:
             if end.topic_type != message.TYPE:
                 raise BusError(

@@ -10,7 +10,7 @@ from typer.core import TyperGroup
 
 from vlatool import registry
 from vlatool.cli._flag_conflicts import refuse_conflicting_flags
-from vlatool.cli._launched import take_ros_words
+from vlatool.cli._launch_words import take_ros_words
 from vlatool.cli._stages import DEFAULTS, StageGroup, build_command, failing_command
 from vlatool.errors import PluginError, UsageError, suggest
 from vlatool.stage.build import stage_kinds

@@ -16,7 +16,7 @@ from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._default import DefaultGroup
 from vlatool.cli._document import answer
-from vlatool.cli._launched import parameters, ros_words, unused
+from vlatool.cli._launch_words import parameters, ros_words, unused_remappings
 from vlatool.cli._stages import build_command, failing_command
 from vlatool.errors import PluginError, UsageError, fix_for, suggest
 from vlatool.files.printable import one_line, printable
@@ -193,9 +193,9 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any], words: R
     options = PolicyOptions(**{name: flags[name] for name in names if name in flags})
     topics, mapping = split_maps(flags["map"] or [], takes_file=name == "policy")
     node = flags["node"] or default_node(name)
-    found = parameters(words, "" if flags["dry_run"] else flags["bus"], node)
+    launch_values = parameters(words, "" if flags["dry_run"] else flags["bus"], node)
     settings = {
-        **({} if flags["settings"] is None else read_settings(flags["settings"])), **mapping, **found, **typed,
+        **({} if flags["settings"] is None else read_settings(flags["settings"])), **mapping, **launch_values, **typed,
     }  # fmt: skip
     if flags.get("print_map"):
         typer.echo(_proposed_map(options), nl=False)
@@ -210,7 +210,7 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any], words: R
         return
     result = run_on_bus(
         plan,
-        lambda about: _say(about.node, about.topics, unused(words, about.node, {*about.topics.values()})),
+        lambda about: _say(about.node, about.topics, unused_remappings(words, about.node, {*about.topics.values()})),
         lambda *ended: _write_report(plan, *ended),
         lambda topics: typer.echo(f"... {printable(waiting(topics))}", err=True),
     )

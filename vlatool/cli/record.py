@@ -10,7 +10,7 @@ import typer
 
 from vlatool.cli import _complete
 from vlatool.cli._document import answer
-from vlatool.cli._launched import ros_words
+from vlatool.cli._launch_words import ros_words
 from vlatool.cli._options import (
     AsJson,
     BundleEngine,

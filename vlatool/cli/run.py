@@ -9,7 +9,7 @@ import typer
 
 from vlatool.cli._controllers import BUNDLE, ControllerGroup
 from vlatool.cli._document import answer
-from vlatool.cli._launched import ros_words
+from vlatool.cli._launch_words import ros_words
 from vlatool.cli._options import (
     AsJson,
     BundleEngine,

@@ -14,7 +14,7 @@ from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._controllers import flags_of, summary_of, values_of
 from vlatool.cli._document import answer
-from vlatool.cli._launched import parameters, ros_words
+from vlatool.cli._launch_words import parameters, ros_words
 from vlatool.cli._signals import stopped_by_signals
 from vlatool.cli._stages import build_command, failing_command
 from vlatool.errors import PluginError, UsageError
@@ -93,7 +93,7 @@ def _simulate(
     seed: int, settings: Path | None, node: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Simulate a robot on a bus."""
-    from vlatool.buses import open_bus, resolved
+    from vlatool.buses import name_on, open_bus
     from vlatool.nodes.settings import build, read_settings
     from vlatool.nodes.world_node import WorldNode
 
@@ -105,7 +105,7 @@ def _simulate(
     opened = open_bus(bus, node, words)
     try:
         simulated = WorldNode(robot, opened, seed)
-        sensors, commands = (", ".join(resolved(opened, channel.topic) for channel in each)
+        sensors, commands = (", ".join(name_on(opened, channel.topic) for channel in each)
                              for each in (robot.sensors, robot.commands))  # fmt: skip
         typer.echo(printable(f"{name} reports {sensors} and obeys {commands}"), err=True)
         try:

@@ -14,7 +14,7 @@ from vlatool.nodes.run_log import Item, Received, is_log, read_log
 from vlatool.nodes.step_record import CONTROLLER, STEPS, ControllerRecord, StepRecord, topic_of
 
 SUFFIXES = (".bag", ".mcap", ".db3")
-UNFINISHED = ".active"
+UNFINISHED_SUFFIX = ".active"
 """Behind the name of a bag that ``rosbag record`` has not finished: the bus ``bag`` says what to do."""
 NODE = "vlatool_replay"
 
@@ -69,7 +69,7 @@ def open_recording(path: Path, controller: str, node: str = "") -> Recording:
     if not path.exists():
         raise DataError(f"There is no recording at {path}.", "check the path")
     if not is_log(path):  # by its first bytes: a log may be called as a bag is
-        if path.is_dir() or path.suffix in (*SUFFIXES, UNFINISHED):
+        if path.is_dir() or path.suffix in (*SUFFIXES, UNFINISHED_SUFFIX):
             return _of_bag(path, controller, node)
         raise DataError(f"{path} is not a recorded run.", "name a file of vlatool run --record, or a bag")
     about = next((item for item in read_log(path) if isinstance(item, ControllerRecord)), None)

@@ -139,7 +139,7 @@ def run_on_bus(
         stack.callback(background.close)
         runner = Runner(controller, bus, topics=plan.topics, observers=[background], alone=not plan.shared)
         about = record_of(plan.controller, controller, node, runner.topics, plan.policy)
-        say = _instructor(bus, controller, runner.written, required=bool(plan.instruction))
+        say = _instructor(bus, controller, runner.written_topics, required=bool(plan.instruction))
         publish_step = StepPublisher(bus, about)
         log = None if plan.record is None else RunLog(plan.record, about)  # a run that is refused leaves none
         if plan.report is not None:

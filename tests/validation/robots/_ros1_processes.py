@@ -71,13 +71,15 @@ class Program:
             command, env=environment, stdout=subprocess.PIPE, stderr=self._file, text=True, start_new_session=True
         )
 
-    def said(self) -> str:
+    def errors(self) -> str:
         """Return what it has written to standard error so far."""
         return self.path.read_text(errors="replace")
 
     def wait_for(self, word: str, timeout_s: float = END_S) -> None:
         """Wait until it has written a word to standard error."""
-        await_true(lambda: word in self.said() or self.process.poll() is not None, timeout_s, f"{word} in {self.path}")
+        await_true(
+            lambda: word in self.errors() or self.process.poll() is not None, timeout_s, f"{word} in {self.path}"
+        )
 
     def end(self, number: int = signal.SIGINT, timeout_s: float = END_S) -> int:
         """Send a signal, to rosbag's program below, too; return the exit code."""
@@ -119,5 +121,5 @@ def await_true(condition: Callable[[], bool], timeout_s: float, what: str) -> No
 
 def read_json(text: str) -> dict[str, Any]:
     """Return the document that vlatool printed, empty when it printed none."""
-    found: dict[str, Any] = json.loads(text) if text.strip().startswith("{") else {}
-    return found
+    document: dict[str, Any] = json.loads(text) if text.strip().startswith("{") else {}
+    return document

@@ -41,8 +41,8 @@ CODES = {"Ctrl-C": "130", "SIGTERM": "130", "rosnode kill": "3"}
 
 OWN = """import json
 from vlatool.nodes.session import RunPlan, run_on_bus
-found = run_on_bus(RunPlan("roi-tracker", bus="ros1", seconds=0.3, settle_s=0.0), on_missing=lambda topics: None)
-print(json.dumps({"node": found.about.node, **found.about.topics}))
+document = run_on_bus(RunPlan("roi-tracker", bus="ros1", seconds=0.3, settle_s=0.0), on_missing=lambda topics: None)
+print(json.dumps({"node": document.about.node, **document.about.topics}))
 """
 """A program of a user, which reads no word of roslaunch itself."""
 
@@ -65,7 +65,7 @@ def write_package(folder: Path, codes: Path) -> Path:
     return package / "robot.launch"
 
 
-def launched(programs: Programs, end: str, rows: Rows) -> None:
+def try_launch(programs: Programs, end: str, rows: Rows) -> None:
     """Launch robot and follower, record them, end them, and look at what was recorded."""
     with tempfile.TemporaryDirectory() as folder:
         code = Path(folder) / "code"
@@ -100,10 +100,10 @@ def launched(programs: Programs, end: str, rows: Rows) -> None:
             (f"{end}: the last command is a rest", f"{len(commands)} commands, {moving} moving", rest and moving)
         )
         replayed, text = programs.vlatool("replay", Path(folder) / "run.bag", "roi-follower", "--json").answer()
-        found = read_json(text)
-        said = f"{found.get('steps')} steps, {found.get('messages')} messages {found.get('note')}"
+        document = read_json(text)
+        said = f"{document.get('steps')} steps, {document.get('messages')} messages {document.get('note')}"
         rows.append(
-            (f"{end}: the bag of rosbag record -a, replayed bit-equal", said, not replayed and not found["note"])
+            (f"{end}: the bag of rosbag record -a, replayed bit-equal", said, not replayed and not document["note"])
         )
 
 
@@ -111,14 +111,18 @@ def own_program(programs: Programs, rows: Rows) -> None:
     """Run a program with the words of roslaunch, which swap two topics: alone, then beside another publisher."""
     words = ("__name:=own", "__ns:=/robot1", "/cmd_vel:=roi", "/roi:=/cmd_vel")
     _, text = programs.python(OWN, *words).answer()
-    found = read_json(text)
-    right = (found.get("node"), found.get("cmd_vel"), found.get("roi")) == ("robot1/own", "/robot1/roi", "/cmd_vel")
+    document = read_json(text)
+    right = (document.get("node"), document.get("cmd_vel"), document.get("roi")) == (
+        "robot1/own",
+        "/robot1/roi",
+        "/cmd_vel",
+    )
     rows.append(("own program with remappings that swap", text.strip()[:110], right))
     other = programs.python(OWN.replace("0.3", "30"), "__name:=other", "/cmd_vel:=/robot1/roi")
     await_true(lambda: "/robot1/roi" in topics(programs), 10, "another publisher")
     second = programs.python(OWN, *words)
     code, _ = second.answer()
-    said = next((line for line in second.said().splitlines() if "publisher" in line), second.said()[-200:])
+    said = next((line for line in second.errors().splitlines() if "publisher" in line), second.errors()[-200:])
     rows.append(
         (
             "a second publisher of a remapped topic is refused",
@@ -156,10 +160,10 @@ def main() -> None:
     folder = given.output.resolve()
     environment, rows = prepare(folder), []
     for end in given.only:
-        with Programs(folder, environment, folder / "said" / end.replace(" ", "-")) as programs:
+        with Programs(folder, environment, folder / "printed" / end.replace(" ", "-")) as programs:
             if end == "Ctrl-C":
                 own_program(programs, rows)
-            launched(programs, end, rows)
+            try_launch(programs, end, rows)
     for what, said, right in rows:
         print(f"{'ok  ' if right else 'FAIL'} {what:62} {said}")
     sys.exit(int(not all(right for _, _, right in rows)))

@@ -82,7 +82,7 @@ class Live:
         self.programs, self.bags, self.name, self.bundle = programs, bags, name, bundle
         self.case, self.node = CASES[name], f"/vlatool_{name.replace('-', '_')}"
 
-    def recorded(self, recorders: Sequence[str], seconds: float, interrupted: bool) -> dict[str, Any]:
+    def record(self, recorders: Sequence[str], seconds: float, interrupted: bool) -> dict[str, Any]:
         """Record a run of some seconds; return its result."""
         bus = ("--bus", f"ros1:{self.programs.master.uri}")
         robot = self.programs.vlatool("sim", *self.case.robot, *bus)
@@ -102,7 +102,7 @@ class Live:
             killed[0].end(signal.SIGKILL)
         code, text = run.answer(seconds + 60)
         if code:
-            raise SystemExit(f"vlatool run {self.name} ended with {code}:\n{run.said()}")
+            raise SystemExit(f"vlatool run {self.name} ended with {code}:\n{run.errors()}")
         time.sleep(0.5)
         for each in (*running, *driver, robot):
             each.end()
@@ -120,14 +120,14 @@ class Live:
         """Return the exit code, the result and the words of ``vlatool replay``."""
         program = self.programs.vlatool("replay", bag, self.name, *self.bundle[:2], "--json")
         code, text = program.answer(120)
-        return code, read_json(text), program.said()
+        return code, read_json(text), program.errors()
 
     def commands(self, bag: Path) -> list[str]:
         """Return the commands in a bag, as bytes of ROS 1 that are written again."""
         opened = Bag(str(bag), "reader")
-        found = [encode(one.message).hex() for one in opened.messages([self.case.command])]
+        document = [encode(one.message).hex() for one in opened.messages([self.case.command])]
         opened.close()
-        return found
+        return document
 
     def commands_of_rosbags(self, bag: Path) -> list[str]:
         """Return the same by rosbags and its own definitions."""
@@ -146,7 +146,7 @@ WHO = {
 }  # fmt: skip
 
 
-def live(
+def try_live(
     programs: Programs,
     name: str,
     bundle: tuple[object, ...],
@@ -157,15 +157,15 @@ def live(
     """Record a run by several recorders at once; replay each bag, and compare the commands in them."""
     with tempfile.TemporaryDirectory() as folder:
         run = Live(programs, Path(folder), name, bundle)
-        result = run.recorded(recorders, seconds, interrupted=name == "roi-follower")
+        result = run.record(recorders, seconds, interrupted=name == "roi-follower")
         commands = {}
         for kind in recorders:
             path = PATHS[kind]
-            code, found, said = run.replay(run.bags / path)
-            counts = f"{found.get('steps')} of {result['steps']} steps, {found.get('messages')} messages"
-            words = f"{counts}, {found.get('unheard')} unheard {found.get('note', '')}"
-            right = not code and found["equal"] and found["steps"] == result["steps"] and not found["unheard"]
-            rows.append((f"{name}: {WHO[kind]}, replayed bit-equal", words if found else last_line(said), right))
+            code, document, said = run.replay(run.bags / path)
+            counts = f"{document.get('steps')} of {result['steps']} steps, {document.get('messages')} messages"
+            words = f"{counts}, {document.get('unheard')} unheard {document.get('note', '')}"
+            right = not code and document["equal"] and document["steps"] == result["steps"] and not document["unheard"]
+            rows.append((f"{name}: {WHO[kind]}, replayed bit-equal", words if document else last_line(said), right))
             commands[kind] = run.commands(run.bags / path)
             by_rosbags = run.commands_of_rosbags(run.bags / path) if kind in ("ours", "mcap") else commands[kind]
             if by_rosbags != commands[kind]:
@@ -176,8 +176,8 @@ def live(
         rows.append((f"{name}: commands in these bags are bit-equal", said, same and moving > 3))
         info(programs, run.bags / "ours.bag", rows)
         if name == "roi-follower":
-            interrupted(run, rows)
-            played(run, rows)
+            try_interruptions(run, rows)
+            try_playing(run, rows)
 
 
 def info(programs: Programs, bag: Path, rows: Rows) -> None:
@@ -189,7 +189,7 @@ def info(programs: Programs, bag: Path, rows: Rows) -> None:
     )
 
 
-def played(run: Live, rows: Rows) -> None:
+def try_playing(run: Live, rows: Rows) -> None:
     """Let ``rosbag play``, a node of roscpp, publish a bag for a controller, and replay its log."""
     bus, log = ("--bus", f"ros1:{run.programs.master.uri}"), run.bags / "played.log"
     started = run.programs.vlatool("run", run.name, *run.bundle, *bus, "--seconds", 5, "--record", log)
@@ -197,14 +197,14 @@ def played(run: Live, rows: Rows) -> None:
     player = run.programs.ros("rosbag", "play", run.bags / "all.bag", "--topics", *run.case.topics)
     code, _ = started.answer()
     player.end()
-    again, found, said = run.replay(log)
+    again, document, said = run.replay(log)
     heard = sum(isinstance(item, Received) for item in read_log(log))
-    words = f"{heard} messages heard, {found.get('steps')} steps"
-    right = code == again == 0 and heard > found["steps"]
-    rows.append((f"{run.name}: rosbag play, a node of roscpp", words if found else last_line(said), right))
+    words = f"{heard} messages heard, {document.get('steps')} steps"
+    right = code == again == 0 and heard > document["steps"]
+    rows.append((f"{run.name}: rosbag play, a node of roscpp", words if document else last_line(said), right))
 
 
-def interrupted(run: Live, rows: Rows) -> None:
+def try_interruptions(run: Live, rows: Rows) -> None:
     """Replay a bag that begins late, and one whose recorder was killed, before and after ``rosbag reindex``."""
     left = run.bags / "killed.bag.active"
     for what, path, words in (
@@ -216,8 +216,8 @@ def interrupted(run: Live, rows: Rows) -> None:
     code, _ = run.programs.ros("rosbag", "reindex", left).answer()
     if left.exists():
         left.rename(run.bags / "killed.bag")
-    again, found, said = run.replay(run.bags / "killed.bag")
-    words = f"{found.get('steps')} steps; {found.get('note')}" if found else last_line(said)
+    again, document, said = run.replay(run.bags / "killed.bag")
+    words = f"{document.get('steps')} steps; {document.get('note')}" if document else last_line(said)
     rows.append(("the same after rosbag reindex and mv: replayed bit-equal", words, code == again == 0))
 
 
@@ -241,8 +241,8 @@ def main() -> None:
         if name == "vln" and given.bundle is None:
             continue
         bundle = ("--bundle", given.bundle.resolve(), "--threads", 1) if name == "vln" else ()
-        with Programs(folder, environment, folder / "said" / name) as programs:
-            live(programs, name, bundle, given.seconds, rows)
+        with Programs(folder, environment, folder / "printed" / name) as programs:
+            try_live(programs, name, bundle, given.seconds, rows)
     for what, said, right in rows:
         print(f"{'ok  ' if right else 'FAIL'} {what:72} {said}")
     sys.exit(int(not all(right for _, _, right in rows)))

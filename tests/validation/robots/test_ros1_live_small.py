@@ -9,8 +9,8 @@ import pytest
 from _full import small_or_full
 from _ros1 import ROOT, Rows, environment, is_prepared
 from _ros1_processes import Programs
-from ros1_launch import CODES, launched
-from ros1_live import PATHS, live
+from ros1_launch import CODES, try_launch
+from ros1_live import PATHS, try_live
 
 FOLDER = ROOT / "out/ros1"
 pytestmark = [
@@ -31,7 +31,7 @@ def wrong(rows: Rows) -> list[str]:
 def test_a_live_run_is_replayed_from_the_bags_of_rosbag_and_of_vlatool(tmp_path: Path, name: str):
     rows: Rows = []
     with Programs(FOLDER, environment(FOLDER), tmp_path) as programs:
-        live(programs, name, (), small_or_full(1.5, 6.0), rows, small_or_full(("all", "ours"), tuple(PATHS)))
+        try_live(programs, name, (), small_or_full(1.5, 6.0), rows, small_or_full(("all", "ours"), tuple(PATHS)))
     assert len(rows) > 3
     assert not wrong(rows)
 
@@ -40,6 +40,6 @@ def test_a_live_run_is_replayed_from_the_bags_of_rosbag_and_of_vlatool(tmp_path:
 def test_roslaunch_names_remaps_and_ends_a_controller_which_brings_the_robot_to_rest(tmp_path: Path, end: str):
     rows: Rows = []
     with Programs(FOLDER, environment(FOLDER), tmp_path) as programs:
-        launched(programs, end, rows)
+        try_launch(programs, end, rows)
     assert len(rows) > 2
     assert not wrong(rows)

@@ -69,14 +69,14 @@ def parameters(words: RosWords | None, bus: str, node: str) -> dict[str, Any]:
         return {}
     from vlatool.buses import launch_parameters
 
-    found = launch_parameters(bus, node, words)
-    if found:
-        text = ", ".join(f"{name} = {value}" for name, value in found.items())
+    values = launch_parameters(bus, node, words)
+    if values:
+        text = ", ".join(f"{name} = {value}" for name, value in values.items())
         typer.echo(printable(f"parameters of the node: {text}"), err=True)
-    return found
+    return values
 
 
-def unused(words: RosWords | None, node: str, topics: set[str]) -> Iterator[str]:
+def unused_remappings(words: RosWords | None, node: str, topics: set[str]) -> Iterator[str]:
     """Yield a sentence on each remapping of a topic that a node does not have.
 
     Args:
