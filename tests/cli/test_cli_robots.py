@@ -156,6 +156,7 @@ def files(tmp_path, bundle, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bundle").symlink_to(bundle)
     (tmp_path / "there").write_text("x")
+    (tmp_path / "run.bag.active").write_bytes(b"#ROSBAG V2.0\n")
     (tmp_path / "list.json").write_text("[1]")
     (tmp_path / "broken.json").write_text("{")
     (tmp_path / "twice.json").write_text('{"rate": 1, "rate": 2}')
@@ -236,6 +237,7 @@ WRONG = [
     (("sim", "turtlebot5", "--bus", "sim"), 2, "Unknown simulated robot 'turtlebot5'; did you mean 'turtlebot4'"),
     (("sim", "turtlebot4"), 2, "--bus"),
     (("replay", "absent", "roi-tracker"), 3, "There is no recording at absent"),
+    (("replay", "run.bag.active", "roi-tracker"), 3, "run.bag.active has no index yet: rosbag record still writes it"),
     (("replay", "there", "roi-tracker"), 3, "there is not a recorded run"),
     (("replay", "there", "bundle", "--settings", "list.json"), 2, "are for a robot controller"),
 ]  # fmt: skip
