@@ -9,6 +9,7 @@ from __future__ import annotations
 import array
 import enum
 import inspect
+import itertools
 import queue
 import time
 import types
@@ -52,6 +53,7 @@ def _rclpy(graph: Graph) -> dict[str, dict[str, Any]]:
         assert context is not None
         context.domain = domain_id or 0
         context.valid = True
+        context.rules = _rules(args or [])
         graph.signals.append(signal_handler_options)
 
     def create_node(node_name: str, *, context: Any = None, namespace: str | None = None) -> Node:
@@ -69,6 +71,11 @@ def _rclpy(graph: Graph) -> dict[str, dict[str, Any]]:
         "rclpy.task": {"Future": Future},
         "rclpy.action": {"ActionServer": ActionServer, "ActionClient": ActionClient, "CancelResponse": CancelResponse},
     }  # fmt: skip
+
+
+def _rules(arguments: list[str]) -> dict[str, str]:
+    """Return the rules ``FROM:=TO`` behind ``--ros-args``, as rcl keeps them for a context."""
+    return dict(word.split(":=") for flag, word in itertools.pairwise(arguments) if flag in ("-r", "--remap"))
 
 
 def _packages() -> dict[str, dict[str, Any]]:
@@ -177,6 +184,7 @@ class Context:
 
     def __init__(self) -> None:
         self.valid, self.domain = False, 0
+        self.rules: dict[str, str] = {}
 
     def ok(self) -> bool:
         return self.valid
@@ -267,7 +275,7 @@ class Endpoint:
 
     def __init__(self, node: Node, topic: str, kind: Any, profile: QoSProfile, callback: Any = None) -> None:
         self.node, self.topic, self.kind, self.profile, self.callback = node, topic, kind, profile, callback
-        self.node_name, self.node_namespace, self.topic_type = node.name, "/", kind.NAME
+        self.node_name, self.node_namespace, self.topic_type = node.name, node.namespace, kind.NAME
         self.last: Any = None
 
     def publish(self, message: Any) -> None:
@@ -305,7 +313,9 @@ class Node:
     """As in rclpy.node."""
 
     def __init__(self, graph: Graph, name: str, context: Context) -> None:
-        self.graph, self.name, self.context = graph, name, context
+        self.graph, self.context = graph, context
+        self.name = context.rules.get("__node", name)
+        self.namespace = context.rules.get("__ns", "/")
         self.executor: SingleThreadedExecutor = None  # type: ignore[assignment]
         graph.nodes.append(self)
         self.publishers: list[Endpoint] = []
@@ -314,13 +324,27 @@ class Node:
     def get_name(self) -> str:
         return self.name
 
+    def get_fully_qualified_name(self) -> str:
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+    def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
+        rules = {self._expanded(left): right for left, right in self.context.rules.items() if left[:2] != "__"}
+        full = self._expanded(topic)
+        return self._expanded(rules[full]) if full in rules else full
+
+    def _expanded(self, name: str) -> str:
+        if name.startswith("~/"):
+            return f"{self.get_fully_qualified_name()}/{name[2:]}"
+        return name if name.startswith("/") else f"{self.namespace.rstrip('/')}/{name}"
+
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: QoSProfile) -> Endpoint:
-        self.publishers.append(Endpoint(self, topic, msg_type, qos_profile))
+        self.publishers.append(Endpoint(self, self.resolve_topic_name(topic), msg_type, qos_profile))
         return self.publishers[-1]
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[[Any], None], qos_profile: QoSProfile, *, raw: bool = False
     ) -> Endpoint:
+        topic = self.resolve_topic_name(topic)
         self.subscriptions.append(Endpoint(self, topic, msg_type, qos_profile, callback))
         if qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL:
             for end in self.graph.ends("publishers", self, topic):
@@ -330,22 +354,22 @@ class Node:
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any) -> None:
         assert srv_type.Request
-        self.graph.services[srv_name] = (self, callback)
+        self.graph.services[self.resolve_topic_name(srv_name)] = (self, callback)
 
     def create_client(self, srv_type: Any, srv_name: str) -> Client:
-        return Client(self, srv_type, srv_name)
+        return Client(self, srv_type, self.resolve_topic_name(srv_name))
 
     def get_publishers_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Endpoint]:
-        return self.graph.ends("publishers", self, topic_name)
+        return self.graph.ends("publishers", self, self.resolve_topic_name(topic_name))
 
     def get_subscriptions_info_by_topic(self, topic_name: str, no_mangle: bool = False) -> list[Endpoint]:
-        return self.graph.ends("subscriptions", self, topic_name)
+        return self.graph.ends("subscriptions", self, self.resolve_topic_name(topic_name))
 
     def count_publishers(self, topic_name: str) -> int:
-        return len(self.get_publishers_info_by_topic(topic_name))
+        return len(self.graph.ends("publishers", self, topic_name))  # "the queried topic name is not remapped"
 
     def count_subscribers(self, topic_name: str) -> int:
-        return len(self.get_subscriptions_info_by_topic(topic_name))
+        return len(self.graph.ends("subscriptions", self, topic_name))
 
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
         found: dict[str, set[str]] = {}

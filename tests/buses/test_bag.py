@@ -264,3 +264,11 @@ def test_messages_that_the_disk_does_not_take_are_counted(tmp_path: Path, monkey
     again = Bag(str(tmp_path / "new"), "node")
     assert len(list(again.messages())) == 2
     again.close()
+
+
+def test_bag_that_rosbag_record_has_not_finished_is_named(tmp_path):
+    (tmp_path / "run.bag.active").write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(
+        BusError, match=r"run\.bag\.active has no index yet(?s:.*)rosbag reindex .*, then mv .*run\.bag$"
+    ):
+        open_bus(f"bag:{tmp_path / 'run.bag.active'}", "node")

@@ -12,7 +12,7 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 import pytest
 
-from vlatool.buses import TopicInfo, open_bus
+from vlatool.buses import TopicInfo, launch_parameters, open_bus, split_ros_words
 from vlatool.buses._ros1_master import DEFAULT, Master, ask, master_uri, own_address
 from vlatool.errors import BusError, MissingExtra, UsageError
 from vlatool.messages.geometry_msgs import Twist
@@ -49,6 +49,9 @@ def master() -> Iterator[Master]:
         server.register_function(
             lambda caller, name: [1, "", uri.replace("http", "rosrpc")] if name == "/set" else [-1, "", 0],
             "lookupService",
+        )
+        server.register_function(
+            lambda caller, name: [1, "", {"rate": 5}] if name == "/ns/left" else [-1, "not set", 0], "getParam"
         )
         server.register_function(lambda caller: "no answer of a master", "odd")
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
@@ -112,6 +115,18 @@ def test_a_living_node_of_the_same_name_and_a_second_server_are_refused(master: 
     with pytest.raises(BusError, match="/set is served already"):
         master.refuse_second_server("/set")
     master.refuse_second_server("/other")
+
+
+def test_parameters_of_a_launch_file_are_those_below_the_name_of_the_node(master: Master) -> None:
+    named, other = (split_ros_words([f"__name:={name}", "__ns:=/ns", "_turn:=2"])[1] for name in ("left", "right"))
+    assert named is not None
+    assert other is not None
+    assert launch_parameters(f"ros1:{master.uri}", "n", named) == {"rate": 5, "turn": 2}
+    assert launch_parameters(f"ros1:{master.uri}", "n", other) == {"turn": 2}
+    with pytest.raises(BusError, match="No ROS 1 master answers"):
+        launch_parameters("ros1:127.0.0.1:1", "n", named)
+    with pytest.raises(UsageError, match="Two masters are named"):
+        launch_parameters("ros1:127.0.0.1:1", "n", split_ros_words(["__master:=127.0.0.1:2"])[1])  # type: ignore[arg-type]
 
 
 def test_what_is_no_master_is_told_at_once(master: Master) -> None:

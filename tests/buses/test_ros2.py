@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -17,15 +18,18 @@ from vlatool.buses import (
     ActionBus,
     ActionType,
     Goal,
+    NamingBus,
     Outcome,
     QoS,
     Reception,
     TopicInfo,
     open_bus,
     ros2,
+    split_ros_words,
 )
 from vlatool.buses._rclpy_messages import from_ros, to_ros
 from vlatool.buses.ros2 import Ros2
+from vlatool.cli import main
 from vlatool.errors import BusError, MissingExtra, UsageError
 from vlatool.messages import Message, find_type, same
 from vlatool.messages.builtin_interfaces import Time
@@ -172,6 +176,28 @@ def test_topics_types_and_peers(node: Nodes) -> None:
         two.publisher("cmd_vel", String, QoS())
 
 
+def test_a_launch_file_names_the_node_and_swaps_two_topics(graph: double.Graph) -> None:
+    _, words = split_ros_words(["--ros-args", "-r", "__node:=left", "-r", "__ns:=/robot1", "-r", "/cmd_vel:=safe",
+                                "-r", "/safe:=/cmd_vel", "-r", "~/state:=/state", "-r", "set:=/set"])  # fmt: skip
+    robot, bus, inbox = Ros2("", "robot"), Ros2("", "vlatool_vln", words), Inbox()
+    assert isinstance(bus, NamingBus)
+    assert (bus.node, bus.full_node) == ("left", "robot1/left")
+    robot.subscribe("/robot1/safe", Twist, inbox.put, QoS())
+    robot.publisher("/cmd_vel", String, QoS())
+    bus.publisher("/cmd_vel", Twist, QoS())(Twist(Vector3(1.0)))
+    assert same(inbox.wait(1)[0], Twist(Vector3(1.0)))
+    with pytest.raises(BusError, match="/cmd_vel carries std_msgs/msg/String, not geometry_msgs/msg/Twist"):
+        bus.subscribe("/safe", Twist, inbox.put, QoS())
+    assert [bus.resolve(name) for name in ("scan", "~state", "~other", "/scan")] == [
+        "/robot1/scan", "/state", "/robot1/left/other", "/scan",
+    ]  # fmt: skip
+    assert bus.wait_for_peers(("/cmd_vel", "/safe"), WAIT_S) == ()
+    bus.serve("set", SetBoolRequest, SetBoolResponse, lambda request: SetBoolResponse(True, "here"))
+    assert robot.call("/set", SetBoolRequest(), SetBoolResponse, WAIT_S).message == "here"
+    for each in (robot, bus):
+        each.close()
+
+
 def test_a_latched_message_reaches_who_comes_later(node: Nodes) -> None:
     robot, late, inbox = node("robot"), node("late"), Inbox()
     robot.publisher("/map", String, QoS(reliable=True, latched=True))(String("walls"))
@@ -274,3 +300,19 @@ def test_absent_packages_are_named(graph: double.Graph, monkeypatch: pytest.Monk
     monkeypatch.setitem(modules, "rclpy", None)
     with pytest.raises(MissingExtra, match="'rclpy' cannot be imported"):
         open_bus("ros2", "node")
+
+
+def test_a_controller_of_a_launch_file_runs_under_its_names(graph: double.Graph, capsys, tmp_path) -> None:
+    (tmp_path / "parameters.yaml").write_text("/robot1/left: {ros__parameters: {rate: 40, use_sim_time: false}}")
+    words = ["run", "roi-tracker", "--bus", "ros2", "--seconds", "0.2", "--wait", "0", "--json", "--ros-args", "-r",
+             "__node:=left", "-r", "__ns:=/robot1", "--params-file", str(tmp_path / "parameters.yaml"), "-p",
+             "gain:=2.5", "-r", "/cmd_vel:=cmd_vel", "-r", "/odd:=/even"]  # fmt: skip
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert (end.value.code, found["node"], found["topics"]["cmd_vel"]) == (0, "robot1/left", "/robot1/cmd_vel")
+    assert found["steps"] == 8
+    assert "parameters of the node: rate = 40, gain = 2.5" in err
+    assert "the remapping /odd:=/even changes no topic of this node" in err
+    assert "/cmd_vel:=cmd_vel changes no topic" not in err

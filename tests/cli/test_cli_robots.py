@@ -116,6 +116,19 @@ def test_dry_run_of_a_controller(vlatool):
     assert re.search(r"input +roi +/face +sensor_msgs/msg/RegionOfInterest", out)
 
 
+def test_what_roslaunch_adds_names_the_node_and_sets_what_no_flag_sets(vlatool, tmp_path):
+    (tmp_path / "settings.json").write_text('{"rate": 15, "x_threshold": 0.2, "gain": 3}')
+    code, out, err = vlatool(
+        "run", "roi-tracker", "--settings", tmp_path / "settings.json", "--rate", 25, "--dry-run", "--json",
+        "_x_threshold:=0.25", "_rate:=20", "/roi:=/face", "__name:=left", "__log:=/tmp/left-1.log",
+    )  # fmt: skip
+    found = json.loads(out)
+    assert code == 0, err
+    assert (found["node"], found["rate_hz"]) == ("left", 25)
+    assert (found["settings"]["x_threshold"], found["settings"]["gain"]) == (0.25, 3)
+    assert "parameters of the node: x_threshold = 0.25, rate = 20" in err
+
+
 def test_flags_count_before_the_file(vlatool, tmp_path):
     (tmp_path / "settings.json").write_text('{"rate": 15, "x_threshold": 0.2}')
     code, out, _ = vlatool(
@@ -143,6 +156,7 @@ def files(tmp_path, bundle, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bundle").symlink_to(bundle)
     (tmp_path / "there").write_text("x")
+    (tmp_path / "run.bag.active").write_bytes(b"#ROSBAG V2.0\n")
     (tmp_path / "list.json").write_text("[1]")
     (tmp_path / "broken.json").write_text("{")
     (tmp_path / "twice.json").write_text('{"rate": 1, "rate": 2}')
@@ -204,11 +218,26 @@ WRONG = [
     ((*POLICY, "--deadline-ms", "5000", "--map", "empty.yaml"), 2, "longer than the control period"),
     (("run", "policy", "--print-map"), 2, "none is named"),
     (("run", "policy", "--bus", "sim", "--engine", "abacus", "--bundle", "bundle"), 2, "abacus"),
+    ((*TRACKER, "__name:=left", "__log:=/tmp/a"), 2, "'__name:=left __log:=/tmp/a' is for a node of ROS 1"),
+    ((*TRACKER, "--ros-args", "-r", "__node:=a"), 2, "is for a node of ROS 2, and the bus is 'sim'"),
+    (("run", "roi-tracker", "--bus", "ros2", "__name:=a"), 2, "is for a node of ROS 1, and the bus is 'ros2'"),
+    (("run", "roi-tracker", "__name:=a"), 2, "No bus is named"),
+    (("run", "roi-tracker", "--dry-run", "_rat:=5"), 2, "has no setting 'rat'; did you mean 'rate'"),
+    (("run", "roi-tracker", "--dry-run", "_rate:=fast"), 2, "the setting 'rate' is 'fast'; allowed: a number"),
+    (("run", "roi-tracker", "--bus", "ros1", "__nmae:=a"), 2, "ROS 1 has no argument '__nmae'; did you mean '__name'"),
+    (("run", "roi-tracker", "--bus", "ros1:http://127.0.0.1:1", "__name:=a"), 3, "No ROS 1 master answers at http://127.0.0.1:1"),
+    (("run", "roi-tracker", "--bus", "ros1:127.0.0.1:1", "__master:=127.0.0.1:2"), 2, "Two masters are named"),
+    (("run", "bundle", "bundle", "--dry-run", "__name:=a"), 2, "'__name:=a' is for a node of ROS, and a bundle alone"),
+    (("sim", "babyai", "--bus", "zenoh", "__name:=a"), 2, "is for a node of ROS 1, and the bus is 'zenoh'"),
+    (("record", "--bus", "sim", "-o", "new", "__name:=a"), 2, "is for a node of ROS 1, and the bus is 'sim'"),
+    (("record", "bundle", "-o", "new", "__name:=a"), 2, "A bundle is not a node"),
+    (("topics", "--bus", "sim", "__name:=a"), 2, "__name:=a"),
     (("topics",), 2, "--bus"),
     (("topics", "--bus", "carrier-pigeon"), 2, "Unknown bus 'carrier-pigeon'"),
     (("sim", "turtlebot5", "--bus", "sim"), 2, "Unknown simulated robot 'turtlebot5'; did you mean 'turtlebot4'"),
     (("sim", "turtlebot4"), 2, "--bus"),
     (("replay", "absent", "roi-tracker"), 3, "There is no recording at absent"),
+    (("replay", "run.bag.active", "roi-tracker"), 3, "run.bag.active has no index yet: rosbag record still writes it"),
     (("replay", "there", "roi-tracker"), 3, "there is not a recorded run"),
     (("replay", "there", "bundle", "--settings", "list.json"), 2, "are for a robot controller"),
 ]  # fmt: skip

@@ -101,3 +101,15 @@ def test_run_of_one_of_two_nodes(tmp_path):
                 ("/a/steps", StepRecord(0, 1.0, (0, 0)).to_json())]  # fmt: skip
     recording = open_recording(bag_of(tmp_path / "bag", contents), "go-to", "a")
     assert list(recording.items()) == [StepRecord(0, 1.0, (0, 0))]
+
+
+def test_first_of_two_runs_of_one_node_is_replayed(tmp_path):
+    first = ControllerRecord("go-to", {**SETTINGS, "goal_x": 0.25}, {"odom": "/odom", "cmd": "/cmd_vel"}, node="a")
+    steps = [("/a/steps", StepRecord(number, 1.0 + number, (0, 0)).to_json()) for number in (0, 1)]
+    second = ("/a/controller", replace(first, settings=SETTINGS).to_json())
+    recording = open_recording(
+        bag_of(tmp_path / "bag", [("/a/controller", first.to_json()), *steps, second, *steps]), "go-to"
+    )
+    assert recording.about == first
+    found = replay(GoTo(**recording.about.settings), recording.items(), recording.topics)
+    assert (found.steps, found.note) == (2, "another run of the node begins, after step 1 of this one")

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from dataclasses import replace
+from typing import ClassVar
 
 import pytest
 
 from tests._point_robot import GoTo, PointWorld
 from vlatool import registry
-from vlatool.buses import QoS, open_bus
+from vlatool.buses import QoS, open_bus, split_ros_words
 from vlatool.buses._faults import Faults
+from vlatool.buses.sim import Sim
 from vlatool.errors import BusError, OutputError, UsageError
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.std_msgs import String
 from vlatool.nodes import session
+from vlatool.nodes.bus_recorder import BusRecorder
 from vlatool.nodes.launch import PolicyOptions
+from vlatool.nodes.recordings import open_recording
 from vlatool.nodes.replay import replay
 from vlatool.nodes.report_page import write_page
 from vlatool.nodes.run_log import read_log
@@ -142,3 +147,65 @@ def test_dry_run_says_what_would_run(plan):
     assert found["inputs"][0] == {"name": "odom", "topic": "/a", "type": "nav_msgs/msg/Odometry"}
     assert found["services"] == [{"name": "halt", "topic": "/halt", "type": "std_msgs/msg/Bool"}]
     assert found["settings"]["goal_x"] == 0.05
+
+
+class LaunchedBus(Sim):
+    """A node of a bus whose library remaps topics, as rospy and rclpy do: two of them are swapped."""
+
+    SWAPPED: ClassVar = {"/odom": "/base/odom", "/base/odom": "/odom", "/cmd_vel": "/base/cmd_vel"}
+
+    def __init__(self, address, node, words=None):
+        super().__init__(address, "left" if words else node)
+        self.full_node = "robot1/left" if words else node
+        self.swapped = self.SWAPPED if words else {}
+
+    def resolve(self, name):
+        return self.swapped.get(name, name)
+
+    def subscribe(self, topic, message, handler, qos):
+        super().subscribe(self.resolve(topic), message, handler, qos)
+
+    def publisher(self, topic, message, qos):
+        return super().publisher(self.resolve(topic), message, qos)
+
+    def wait_for_peers(self, topics, timeout_s):
+        alone = super().wait_for_peers(tuple(map(self.resolve, topics)), timeout_s)
+        return tuple(topic for topic in topics if self.resolve(topic) in alone)
+
+
+def test_first_step_waits_for_the_recorders_of_the_bus(plan, monkeypatch):
+    load = registry.load
+    monkeypatch.setattr("vlatool.buses._interface.load",
+                        lambda kind, name: LaunchedBus if kind == "buses" else load(kind, name))  # fmt: skip
+    monkeypatch.setattr(LaunchedBus, "settle_s", 0.4, raising=False)
+    times = []
+    plan = replace(plan, settle_s=None, wait_s=0.0, seconds=0.0)
+    run_on_bus(plan, lambda about: times.append(time.monotonic()), lambda *_: times.append(time.monotonic()), print)
+    assert 0.4 <= times[1] - times[0] < 2.0
+
+
+def test_node_of_a_launch_file_is_recorded_under_the_names_that_the_bus_has(plan, monkeypatch, tmp_path):
+    load = registry.load
+    monkeypatch.setattr(registry, "load", lambda kind, name: LaunchedBus if name == "ros1" else load(kind, name))
+    monkeypatch.setattr("vlatool.buses._interface.load", registry.load)
+    _, words = split_ros_words(["__name:=left", "/odom:=/base/odom"])
+    plan = replace(plan, bus=plan.bus.replace("sim:", "ros1:"), words=words, seconds=0.2, wait_s=0.0)
+    other = open_bus(plan.bus, "teleop")
+    other.publisher("/cmd_vel", Twist, QoS())
+    bag = open_bus(f"bag::{tmp_path / 'run'}", "recorder")
+    recorder = BusRecorder(other, bag, "recorder")
+    thread = threading.Thread(target=recorder.run)
+    thread.start()
+    said = []
+    result = run_on_bus(replace(plan, settle_s=0.3), on_missing=said.append)
+    recorder.stop()
+    thread.join()
+    bag.close()
+    assert (result.about.node, said) == ("robot1/left", [("/base/odom",)])
+    assert (result.about.topics["odom"], result.about.topics["cmd"]) == ("/base/odom", "/base/cmd_vel")
+    found = open_recording(tmp_path / "run", "go-to", "/robot1/left")
+    assert replay(GoTo(**plan.settings), found.items(), found.topics).unheard == 0
+    other.publisher("/base/cmd_vel", Twist, QoS())
+    with pytest.raises(BusError, match="/base/cmd_vel has the publisher teleop already"):
+        run_on_bus(plan)
+    other.close()

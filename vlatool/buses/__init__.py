@@ -10,12 +10,17 @@ from vlatool.buses._interface import (
     ClientGoal,
     Fault,
     Goal,
+    NamingBus,
     Outcome,
     QoS,
     Reception,
     TopicInfo,
+    launch_parameters,
+    name_on,
     open_bus,
+    refuse_words_of_another,
 )
+from vlatool.buses._ros_words import RosWords, split_ros_words
 
 __all__ = [
     "GOAL_ABORTED",
@@ -27,9 +32,15 @@ __all__ = [
     "ClientGoal",
     "Fault",
     "Goal",
+    "NamingBus",
     "Outcome",
     "QoS",
     "Reception",
+    "RosWords",
     "TopicInfo",
+    "launch_parameters",
+    "name_on",
     "open_bus",
+    "refuse_words_of_another",
+    "split_ros_words",
 ]

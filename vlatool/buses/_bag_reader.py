@@ -12,6 +12,8 @@ from vlatool.messages import Message, cdr, find_type, ros1
 from vlatool.messages.type_hash import rihs01
 
 SUFFIXES = (".bag", ".mcap", ".db3")
+UNFINISHED_SUFFIX = ".active"
+"""Behind the name of a bag that ``rosbag record`` has not finished."""
 REPAIR = "record it again, or repair it: ros2 bag reindex (ROS 1: rosbag reindex)"
 
 
@@ -48,6 +50,8 @@ class BagReader:
             raise BusError(
                 f"There is no bag {path}.", "name a .bag, .mcap or .db3 file, or the directory of a ROS 2 bag"
             )
+        if path.suffix == UNFINISHED_SUFFIX:
+            raise _unfinished(path)
         if not path.is_dir() and path.suffix not in SUFFIXES:
             raise BusError(f"{path} is not a bag: its name ends in none of {', '.join(SUFFIXES)}.", "name a bag")
         with _readable(path):
@@ -121,6 +125,15 @@ class BagReader:
         if self._reader is not None:
             self._reader.close()
             self._reader = None
+
+
+def _unfinished(path: Path) -> BusError:
+    """Say what to do with a bag that ``rosbag record`` still writes, or left when it was killed."""
+    finished = path.with_suffix("")
+    return BusError(
+        f"{path} has no index yet: rosbag record still writes it, or was killed.",
+        f"end rosbag record with Ctrl-C; if it was killed: rosbag reindex {path}, then mv {path} {finished}",
+    )
 
 
 @contextmanager

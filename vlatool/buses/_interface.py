@@ -8,11 +8,12 @@ return soon; the run of a controller (``vlatool.nodes``) puts what they get into
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
-from vlatool.errors import BusError
+from vlatool.buses._ros_words import RosWords
+from vlatool.errors import BusError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.registry import load
@@ -202,18 +203,72 @@ class ActionBus(Bus, Protocol):
         """
 
 
-def open_bus(name: str, node: str) -> Bus:
+@runtime_checkable
+class NamingBus(Protocol):
+    """A bus whose library may call the node and its topics otherwise than they are written: that of ROS."""
+
+    full_node: str
+    """Name of the node with its namespace, without a slash before it: ``robot1/vlatool_vln``."""
+
+    def resolve(self, name: str) -> str:
+        """Return the full name that a topic or service has on the bus, after remappings."""
+
+
+def name_on(bus: Bus, name: str) -> str:
+    """Return the name that a topic or service has on a bus: that which is written, unless the bus gives it another."""
+    return bus.resolve(name) if isinstance(bus, NamingBus) else name
+
+
+def open_bus(name: str, node: str, words: RosWords | None = None) -> Bus:
     """Open a bus by what a user types: ``zenoh``, or with an address behind a colon: ``zenoh:tcp/127.0.0.1:7447``.
 
     Args:
         name: Bus, with an address where it needs one: master (ros1), router (zenoh), domain (dds, ros2), file (bag).
         node: Name of this node, such as ``vlatool_vln``.
+        words: What a launcher of ROS says of the node; with None, rospy and rclpy read the command line of the process.
 
     Raises:
-        UsageError: for an unknown bus or an impossible address.
+        UsageError: for an unknown bus or an impossible address, and for words that are not for this bus.
         MissingExtra: when its library is absent.
         BusError: when it cannot be reached.
     """
     kind, _, address = name.partition(":")
-    bus: Bus = load("buses", kind)(address, node)
-    return bus
+    entry = load("buses", kind)
+    if words is None:
+        opened: Bus = entry(address, node)
+    else:
+        refuse_words_of_another(kind, words)
+        opened = entry(address, node, words)
+    return opened
+
+
+def refuse_words_of_another(kind: str, words: RosWords) -> None:
+    """Raise UsageError where the words of a launcher are not those of the ROS that a bus belongs to."""
+    if words.dialect != kind:
+        release = "ROS 1" if words.dialect == "ros1" else "ROS 2"
+        raise UsageError(
+            f"'{' '.join(words.typed):.80}' is for a node of {release}, and the bus is '{kind}'.",
+            f"pass --bus {words.dialect}, or leave it out; --node NAME and --map NAME=/TOPIC work on every bus",
+        )
+
+
+def launch_parameters(name: str, node: str, words: RosWords) -> dict[str, Any]:
+    """Return the parameters that a launcher gives a node: what ROS 1's master has for it, then those in its words.
+
+    Args:
+        name: Bus, as ``open_bus`` takes it; where it is empty, the words alone count.
+        node: Name of the node without a launcher.
+        words: What the launcher says of it.
+
+    Raises:
+        UsageError: as ``open_bus`` does.
+        BusError: when the master does not answer.
+        DataError: when a file or a value among the words is not YAML.
+    """
+    stored: Mapping[str, Any] = {}
+    if name:
+        kind, _, address = name.partition(":")
+        refuse_words_of_another(kind, words)
+        read = getattr(load("buses", kind), "stored_parameters", None)
+        stored = {} if read is None else read(address, node, words)
+    return {**stored, **words.parameters_for(node)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -14,15 +15,18 @@ from vlatool.buses._faults import Faults
 from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, Reception, TopicInfo
 from vlatool.buses._names import check_node, resolve
 from vlatool.buses._ros1_master import Master, ask, master_uri, own_address
+from vlatool.buses._ros_words import RosWords
 from vlatool.buses._rospy_types import carrier, service_class
 from vlatool.buses._topic_actions import TopicActionClient, TopicActionServer, TopicGoal
-from vlatool.errors import BusError, MissingExtra
+from vlatool.errors import BusError, MissingExtra, UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 
 BUFFER_BYTES = 1 << 18
 """What is read from a connection at a time: a small camera image."""
 FLUSH_S = 0.5
+LEAVE_S = 1.0
+"""Time in which whoever runs the node ends it, when it is asked to end: the robot is brought to rest meanwhile."""
 LINGER_S = 0.02
 """Time that is left to the threads of rospy to write what they took from their queues, in seconds."""
 WATCH_S = 0.25
@@ -39,11 +43,17 @@ class Ros1:
     Args:
         address: The master, such as ``http://127.0.0.1:11311``; that of ``ROS_MASTER_URI`` when empty.
         node: Name of this node; roslaunch may give it another one (``__name:=``).
+        words: What roslaunch says of the node; with None, rospy reads the command line of the process.
     """
 
-    def __init__(self, address: str, node: str) -> None:
-        check_node(node)
-        uri = master_uri(address)
+    settle_s = 2.0
+    """Time after which recorders hear a new topic, in seconds: ``rosbag record -a`` asks the master once a second."""
+
+    def __init__(self, address: str, node: str, words: RosWords | None = None) -> None:
+        check_node(words.name_for(node) if words else node)
+        uri = _master_of(address, words)
+        if words is not None and (namespace := words.namespace_for(node)):
+            os.environ["ROS_NAMESPACE"] = namespace  # rospy reads it when it is imported
         rospy = _rospy()
         self._master = Master(uri, f"/{node}")
         self._master.ask("getPid")
@@ -53,29 +63,48 @@ class Ros1:
         self._faults = Faults()
         self._actions: list[TopicActionServer] = []
         self._action_clients: dict[str, TopicActionClient] = {}
-        self._closed = threading.Event()
+        self._asked, self._closed = threading.Event(), threading.Event()
         self._kinds: dict[str, type[Message]] = {}
         self._publishers: dict[str, Any] = {}
         self._subscribers: dict[str, Any] = {}
-        self._start(uri, node)
+        self._start(uri, node, words)
+        self._rospy.on_shutdown(self._leave)
         self._watcher = threading.Thread(target=self._watch, name="ros1 master", daemon=True)
         self._watcher.start()
 
-    def _start(self, uri: str, node: str) -> None:
+    def _start(self, uri: str, node: str, words: RosWords | None) -> None:
         os.environ["ROS_MASTER_URI"] = uri
         if not {"ROS_IP", "ROS_HOSTNAME"} & {*os.environ} and (address := own_address(uri)):
             os.environ["ROS_IP"] = address
-        renamed = self._rospy.names.get_mappings().get("__name", node)
+        renamed = words.name_for(node) if words else self._rospy.names.get_mappings().get("__name", node)
+        arguments = None if words is None else [sys.argv[0], *words.for_library()]
         self._master.caller = f"{self._rospy.get_namespace()}{renamed.lstrip('/')}"
         try:
             self._master.refuse_namesake()
-            self._rospy.init_node(node, disable_signals=True)
+            self._rospy.init_node(node, arguments, disable_signals=True)
         except (self._rospy.ROSException, ValueError) as error:
             raise BusError(f"The node {node} cannot join the master at {uri}: {error}.", RESTART) from error
         except BusError:
             _used.release()  # rospy has not been started
             raise
-        self.node = self._rospy.get_name().rpartition("/")[2]
+        self.full_node = self._rospy.get_name().strip("/")
+        self.node = self.full_node.rpartition("/")[2]
+
+    @staticmethod
+    def stored_parameters(address: str, node: str, words: RosWords) -> dict[str, Any]:
+        """Return the parameters below the full name of a node at the master, as ``<param>`` in a launch file sets them.
+
+        Raises:
+            UsageError: for an impossible address.
+            BusError: when no master answers.
+        """
+        full = words.full_name_for(node)
+        values = Master(_master_of(address, words), full).ask("getParam", full)
+        return values if isinstance(values, dict) else {}
+
+    def resolve(self, name: str) -> str:
+        """See ``NamingBus.resolve``."""
+        return self._resolved(name)
 
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
         """See ``Bus.subscribe``; a latched message comes whatever ``qos`` says, as always in ROS 1."""
@@ -178,8 +207,9 @@ class Ros1:
         """See ``Bus.topics``; of each topic the master knows one type, that of its last publisher.
 
         Raises:
-            BusError: when the master does not answer.
+            BusError: when the master does not answer, or the node was asked to end.
         """
+        self._refuse_asked()
         return self._master.topics()
 
     def faults(self) -> list[Fault]:
@@ -187,7 +217,13 @@ class Ros1:
         return self._faults.listing()
 
     def stamp(self) -> Time:
-        """Return ROS time: that of the system's clock, or that of ``/clock`` where ``/use_sim_time`` is set."""
+        """Return ROS time: that of the system's clock, or that of ``/clock`` where ``/use_sim_time`` is set.
+
+        Raises:
+            BusError: when the node was asked to end, by ``rosnode kill`` or by another node of its name; it sends for
+                another second, so that a controller's rest reaches the robot.
+        """
+        self._refuse_asked()
         now = self._rospy.Time.now()
         return Time(now.secs, now.nsecs)
 
@@ -243,8 +279,19 @@ class Ros1:
         if self._closed.is_set() or self._rospy.is_shutdown():
             raise BusError(f"The node {self.node} has left the bus: {self._why_over()}.", RESTART)
 
+    def _refuse_asked(self) -> None:
+        if self._asked.is_set() and not self._closed.is_set():
+            raise BusError(f"The node {self.node} has left the bus: {self._why_over()}.", RESTART)
+
     def _why_over(self) -> str:
-        return "it was closed" if self._closed.is_set() else "another node of the same name took its place"
+        if self._closed.is_set():
+            return "it was closed"
+        return "rosnode kill ended it, or another node of the same name took its place"
+
+    def _leave(self) -> None:
+        """Let whoever runs the node bring the robot to rest before rospy ends it."""
+        self._asked.set()
+        self._closed.wait(LEAVE_S)
 
     def _watch(self) -> None:
         """End the node when the main thread has, and register again at a master that was started anew."""
@@ -269,6 +316,14 @@ class Ros1:
             ask(own, "publisherUpdate", "/master", name, present or [])
         for name, uri in registration.get_service_manager().get_services():
             self._master.ask("registerService", name, uri, own)
+
+
+def _master_of(address: str, words: RosWords | None) -> str:
+    """Return the address of the master; raises UsageError where two are named."""
+    named = words.special("master") if words else ""
+    if address and named and master_uri(address) != master_uri(named):
+        raise UsageError(f"Two masters are named: {address}, and {named} by '__master:='.", "name one of them")
+    return master_uri(address or named)
 
 
 def _malformed(name: str, message: type[Message]) -> BusError:

@@ -17,6 +17,7 @@ from vlatool.buses._interface import ActionType, Fault, Goal, M, Outcome, QoS, R
 from vlatool.buses._names import check_node, domain_id, resolve
 from vlatool.buses._rclpy_actions import ClientGoal, serve_action
 from vlatool.buses._rclpy_messages import from_ros, generated_class, to_ros
+from vlatool.buses._ros_words import RosWords
 from vlatool.errors import BusError, MissingExtra
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
@@ -31,9 +32,10 @@ class Ros2:
     Args:
         address: Number of the domain, 0 to 232; that of ``ROS_DOMAIN_ID`` when empty.
         node: Name of this node; a launch file may give it another one (``--ros-args -r __node:=``).
+        words: What a launch file says of the node; with None, rclpy reads the command line of the process.
     """
 
-    def __init__(self, address: str, node: str) -> None:
+    def __init__(self, address: str, node: str, words: RosWords | None = None) -> None:
         check_node(node)
         domain = domain_id(address)
         rclpy = _rclpy("rclpy")
@@ -41,9 +43,11 @@ class Ros2:
         self._faults = Faults()
         self._context = _rclpy("rclpy.context").Context()
         signals = _rclpy("rclpy.signals").SignalHandlerOptions.NO
-        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=signals)
+        arguments = None if words is None else words.for_library()
+        rclpy.init(args=arguments, context=self._context, domain_id=domain, signal_handler_options=signals)
         self._node = rclpy.create_node(node, context=self._context)
         self.node: str = self._node.get_name()
+        self.full_node: str = self._node.get_fully_qualified_name().strip("/")
         self._executor = _rclpy("rclpy.executors").SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._publishers: dict[str, Any] = {}
@@ -59,6 +63,7 @@ class Ros2:
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
         """See ``Bus.subscribe``; other nodes are known half a second after this one has been opened."""
         name = self._agreed(topic, message)
+        name_as_written = self._as_written(topic)
 
         def receive(theirs: Any) -> None:
             received_s = time.monotonic()
@@ -67,13 +72,14 @@ class Ros2:
             except Exception as error:  # it would end the executor, and with it every other subscription
                 self._faults.add_raised(name, error)
 
-        self._node.create_subscription(generated_class(message.TYPE), name, receive, self._profile(qos))
+        self._node.create_subscription(generated_class(message.TYPE), name_as_written, receive, self._profile(qos))
         self._subscriptions[name] = self._subscriptions.get(name, 0) + 1
 
     def publisher(self, topic: str, message: type[M], qos: QoS) -> Callable[[M], None]:
         """See ``Bus.publisher``."""
         name = self._agreed(topic, message)
-        publisher = self._node.create_publisher(generated_class(message.TYPE), name, self._profile(qos))
+        name_as_written = self._as_written(topic)
+        publisher = self._node.create_publisher(generated_class(message.TYPE), name_as_written, self._profile(qos))
         self._publishers[name] = publisher
 
         def send(content: M) -> None:
@@ -87,7 +93,7 @@ class Ros2:
     def serve(self, service: str, request: type[Message], response: type[M], handler: Callable[[Message], M]) -> None:
         """See ``Bus.serve``; each call has a thread of its own, so that topics are heard meanwhile."""
         self._refuse_closed()
-        name, kind = resolve(service, self.node), _service(request)
+        name, kind = self.resolve(service), _service(request)
 
         async def answer(theirs: Any, empty: Any) -> Any:
             future = self._future()
@@ -102,16 +108,16 @@ class Ros2:
             threading.Thread(target=work, name=f"ros2 {name}", daemon=True).start()
             return await future
 
-        self._node.create_service(kind, name, answer)
+        self._node.create_service(kind, self._as_written(service), answer)
 
     def call(self, service: str, request: Message, response: type[M], timeout_s: float) -> M:
         """See ``Bus.call``; a server that fails answers an empty response, as rclpy has no other way."""
         self._refuse_closed()
-        name, until = resolve(service, self.node), time.monotonic() + timeout_s
+        name, until = self.resolve(service), time.monotonic() + timeout_s
         with self._lock:
             key = (name, request.TYPE)
             if key not in self._clients:
-                self._clients[key] = self._node.create_client(_service(type(request)), name)
+                self._clients[key] = self._node.create_client(_service(type(request)), self._as_written(service))
             client = self._clients[key]
         if not client.wait_for_service(timeout_sec=timeout_s):
             raise BusError(f"Nobody has served {name} within {timeout_s:g} s.", "start the node; ros2 service list")
@@ -128,16 +134,26 @@ class Ros2:
     def serve_action(self, action: str, kind: ActionType, handler: Callable[[Goal], Outcome]) -> None:
         """See ``ActionBus.serve_action``; the action's generated class must be installed."""
         self._refuse_closed()
-        self._ends.append(serve_action(self._node, resolve(action, self.node), kind, handler, self._future))
+        self._ends.append(serve_action(self._node, self._as_written(action), kind, handler, self._future))
 
     def send_goal(
         self, action: str, kind: ActionType, goal: Message, feedback: Callable[[Message], None] | None = None
     ) -> ClientGoal:
         """See ``ActionBus.send_goal``."""
         self._refuse_closed()
-        sent = ClientGoal(self._node, resolve(action, self.node), kind)
+        sent = ClientGoal(self._node, self._as_written(action), kind)
         sent.send(goal, feedback)
         return sent
+
+    def resolve(self, name: str) -> str:
+        """See ``NamingBus.resolve``."""
+        full: str = self._node.resolve_topic_name(self._as_written(name))
+        return full
+
+    def _as_written(self, name: str) -> str:
+        """Return a name as rclpy takes it, which writes ``~/`` for ``~``; raises UsageError for one that none takes."""
+        resolve(name, self.node)
+        return f"~/{name.lstrip('~/')}" if name.startswith("~") else name
 
     def topics(self) -> list[TopicInfo]:
         """See ``Bus.topics``."""
@@ -183,8 +199,14 @@ class Ros2:
     def _agreed(self, topic: str, message: type[Message]) -> str:
         """Return the full name of a topic; raises BusError when a node uses it with another type."""
         self._refuse_closed()
-        name = resolve(topic, self.node)
-        ends = (*self._node.get_publishers_info_by_topic(name), *self._node.get_subscriptions_info_by_topic(name))
+        name, name_as_written = (
+            self.resolve(topic),
+            self._as_written(topic),
+        )  # rclpy applies remappings to the latter itself
+        ends = (
+            *self._node.get_publishers_info_by_topic(name_as_written),
+            *self._node.get_subscriptions_info_by_topic(name_as_written),
+        )
         for end in ends:
             if end.topic_type != message.TYPE:
                 raise BusError(
@@ -194,7 +216,7 @@ class Ros2:
         return name
 
     def _has_peer(self, topic: str) -> bool:
-        name = resolve(topic, self.node)
+        name = self.resolve(topic)
         readers, writers = self._node.count_subscribers(name), self._node.count_publishers(name)
         if name in self._subscriptions or name in self._publishers:
             own_readers, own_writers = self._subscriptions.get(name, 0), int(name in self._publishers)

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vlatool.cli._commands import Commands
+from vlatool.cli._commands import ROOT_OPTIONS, Commands
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._document import Output, forget_kept, output, take_print_failure
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPT_CODE, Failure, failure
@@ -23,7 +23,6 @@ from vlatool.machine.host import LEROBOT_PYTHON, UNNORM_KEY
 from vlatool.machine.version import VERSION
 from vlatool.user_code import children, trust
 
-ROOT_OPTIONS = ("--trust", "--python", "--unnorm-key")
 app = typer.Typer(
     name="vlatool",
     cls=Commands,

@@ -10,18 +10,25 @@ from typer.core import TyperGroup
 
 from vlatool import registry
 from vlatool.cli._flag_conflicts import refuse_conflicting_flags
+from vlatool.cli._launch_words import take_ros_words
 from vlatool.cli._stages import DEFAULTS, StageGroup, build_command, failing_command
 from vlatool.errors import PluginError, UsageError, suggest
 from vlatool.stage.build import stage_kinds
 
 FIRST_COMMAND = "optimize"
 """What most people want comes first in the help."""
+ROOT_OPTIONS = ("--trust", "--python", "--unnorm-key")
+"""Options of every command, which stand before it."""
 HIDDEN_KINDS = ("sources",)
 """Kinds of stages that are not commands: a source is an argument of every command."""
 
 
 class Commands(TyperGroup):
     """The group of all commands."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take out what a launcher of ROS added to the command line of a node."""
+        return super().parse_args(ctx, take_ros_words(ctx, args, ROOT_OPTIONS))
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the commands: the one for everything, then the others by name."""

@@ -16,11 +16,13 @@ from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._default import DefaultGroup
 from vlatool.cli._document import answer
+from vlatool.cli._launch_words import parameters, ros_words, unused_remappings
 from vlatool.cli._stages import build_command, failing_command
 from vlatool.errors import PluginError, UsageError, fix_for, suggest
 from vlatool.files.printable import one_line, printable
 
 if TYPE_CHECKING:
+    from vlatool.buses import RosWords
     from vlatool.nodes.session import RunPlan, RunResult
     from vlatool.nodes.settings import Setting
     from vlatool.nodes.trace import Trace
@@ -116,7 +118,7 @@ def controller_function(name: str, controller: type) -> Callable[..., None]:
     def command(**arguments: Any) -> None:
         context: typer.Context = arguments.pop("context")
         typed = values_of(controller, context, {key: arguments.pop(key) for key in flags})
-        _run(name, typed, arguments)
+        _run(name, typed, arguments, ros_words(context))
 
     typed = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
     shared = [inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
@@ -180,23 +182,28 @@ def _is_given(context: typer.Context, name: str) -> bool:
     return source is not None and "DEFAULT" not in source.name
 
 
-def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
+def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any], words: RosWords | None) -> None:
     """Run a controller as its command line says."""
     from vlatool.nodes.fault_watch import fault_text
     from vlatool.nodes.launch import PolicyOptions
     from vlatool.nodes.map_file import split_maps
-    from vlatool.nodes.session import RunPlan, dry_run, run_on_bus, waiting
+    from vlatool.nodes.session import RunPlan, default_node, dry_run, run_on_bus, waiting
     from vlatool.nodes.settings import read_settings
 
     names = ("bundle", "robot", "deadline_ms", "neutral", "engine", "threads", "seed")
     options = PolicyOptions(**{name: flags[name] for name in names if name in flags})
     topics, mapping = split_maps(flags["map"] or [], takes_file=name == "policy")
-    settings = {**({} if flags["settings"] is None else read_settings(flags["settings"])), **mapping, **typed}
+    node = flags["node"] or default_node(name)
+    launch_values = parameters(words, "" if flags["dry_run"] else flags["bus"], node)
+    settings = {
+        **({} if flags["settings"] is None else read_settings(flags["settings"])), **mapping, **launch_values, **typed,
+    }  # fmt: skip
     if flags.get("print_map"):
         typer.echo(_proposed_map(options), nl=False)
         return
-    plan = RunPlan(name, settings, options, flags["bus"], flags["node"], topics, flags["seconds"], flags["wait"],
-                   flags["record"], flags["report"], flags["shared"], flags.get("instruction", ""))  # fmt: skip
+    plan = RunPlan(name, settings, options, flags["bus"], node, topics, flags["seconds"], flags["wait"],
+                   flags["record"], flags["report"], flags["shared"], flags.get("instruction", ""),
+                   words=words)  # fmt: skip
     as_json = flags["as_json"]
     if flags["dry_run"]:
         found = dry_run(plan)
@@ -204,7 +211,7 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
         return
     result = run_on_bus(
         plan,
-        lambda about: _say(about.node, about.topics),
+        lambda about: _say(about.node, about.topics, unused_remappings(words, about.node, {*about.topics.values()})),
         lambda *ended: _write_report(plan, *ended),
         lambda topics: typer.echo(f"... {printable(waiting(topics))}", err=True),
         lambda fault: typer.echo(f"... {printable(fault_text(fault))}", err=True),
@@ -212,9 +219,10 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
     answer(as_json, result.to_dict(), _lines(result))
 
 
-def _say(node: str, topics: Mapping[str, str]) -> None:
+def _say(node: str, topics: Mapping[str, str], notes: Iterator[str]) -> None:
     text = ", ".join(f"{name} {topic}" for name, topic in topics.items())
-    typer.echo(printable(f"{node} runs: {text}"), err=True)
+    for line in (f"{node} runs: {text}", *notes):
+        typer.echo(printable(line), err=True)
 
 
 def _write_report(plan: RunPlan, result: RunResult, trace: Trace) -> None:

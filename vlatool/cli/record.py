@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vlatool.cli import _complete
 from vlatool.cli._document import answer
+from vlatool.cli._launch_words import ros_words
 from vlatool.cli._options import (
     AsJson,
     BundleEngine,
@@ -22,10 +24,15 @@ from vlatool.cli._signals import stopped_by_signals
 from vlatool.errors import UsageError
 from vlatool.files.printable import printable
 
-NODE = "vlatool_record"
+if TYPE_CHECKING:
+    from vlatool.buses import RosWords
+
+NODE = f"vlatool_record_{os.getpid()}"
+"""In ROS 1 a second node of the same name ends the first one."""
 
 
 def record(
+    context: typer.Context,
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="new file; NAME.mcap, NAME.db3 or NAME.bag of a bus", show_default=False),
@@ -71,8 +78,12 @@ def record(
     """
     words = what or []
     if bus:
-        _record_bus(bus, output, words, seconds, as_json)
+        _record_bus(bus, output, words, seconds, as_json, ros_words(context))
         return
+    if ros_words(context) is not None:
+        raise UsageError(
+            "A bundle is not a node, and there are words of a launcher of ROS.", "pass --bus ros1 to record a bus"
+        )
     if len(words) != 1:
         raise UsageError(f"{len(words)} bundles are named to record; allowed: one, or topics with --bus.",
                          "name a bundle, or pass --bus BUS")  # fmt: skip
@@ -94,15 +105,17 @@ def record(
     answer(as_json, found.to_dict(), [f"{found.file}: {found.steps} control steps, {found.bytes / 1e6:.3g} MB"])
 
 
-def _record_bus(bus: str, output: Path, topics: list[str], seconds: float | None, as_json: bool) -> None:
-    """Record topics of a bus to a new bag."""
+def _record_bus(
+    bus: str, output: Path, topics: list[str], seconds: float | None, as_json: bool, words: RosWords | None
+) -> None:
+    """Record topics of a bus to a new bag, under the names that they have there: remappings are left out."""
     from vlatool.buses import open_bus
     from vlatool.nodes.bus_recorder import BusRecorder, RecordSummary
     from vlatool.nodes.fault_watch import fault_text, to_plain_faults
 
     if not str(output).strip() or ":" in str(output):
         raise UsageError(f"The bag '{output}' has a colon in its name, which separates bags.", "name it without one")
-    opened = open_bus(bus, NODE)
+    opened = open_bus(bus, NODE, None if words is None else words.without_topics())
     summary = RecordSummary()
     try:
         bag = open_bus(f"bag::{output}", NODE)

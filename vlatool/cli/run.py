@@ -9,6 +9,7 @@ import typer
 
 from vlatool.cli._controllers import BUNDLE, ControllerGroup
 from vlatool.cli._document import answer
+from vlatool.cli._launch_words import ros_words
 from vlatool.cli._options import (
     AsJson,
     BundleEngine,
@@ -35,6 +36,7 @@ def _group() -> None:
 
 @app.command(BUNDLE)
 def run(
+    context: typer.Context,
     bundle: BundlePath,
     robot: RobotName = "",
     deadline_ms: StepDeadline = None,
@@ -61,6 +63,9 @@ def run(
             "A bundle alone does not say which topics its inputs and actions are.",
             "run it by a controller: vlatool run policy --bundle BUNDLE --bus BUS; or add --dry-run to see the layers",
         )
+    if (words := ros_words(context)) is not None:
+        raise UsageError(f"'{' '.join(words.typed):.80}' is for a node of ROS, and a bundle alone is none.",
+                         "leave it out, or run it by a controller: vlatool run policy --bundle BUNDLE")  # fmt: skip
     from vlatool.measurement.dry_run import dry_run as measure
 
     found = measure(

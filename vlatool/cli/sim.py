@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 from typer.core import TyperGroup
@@ -14,10 +14,14 @@ from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._controllers import flags_of, summary_of, values_of
 from vlatool.cli._document import answer
+from vlatool.cli._launch_words import parameters, ros_words
 from vlatool.cli._signals import stopped_by_signals
 from vlatool.cli._stages import build_command, failing_command
 from vlatool.errors import PluginError, UsageError
 from vlatool.files.printable import printable
+
+if TYPE_CHECKING:
+    from vlatool.buses import RosWords
 
 
 class WorldGroup(TyperGroup):
@@ -73,7 +77,7 @@ def world_function(name: str, world: type) -> Callable[..., None]:
     def command(**arguments: Any) -> None:
         context: typer.Context = arguments.pop("context")
         knobs = values_of(world, context, {key: arguments.pop(key) for key in flags})
-        _simulate(name, world, knobs, **arguments)
+        _simulate(name, world, knobs, ros_words(context), **arguments)
 
     typed = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
     shared = [inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
@@ -85,21 +89,25 @@ def world_function(name: str, world: type) -> Callable[..., None]:
 
 
 def _simulate(
-    name: str, world: type, knobs: dict[str, Any], *, bus: str, seconds: float | None, seed: int,
-    settings: Path | None, node: str, as_json: bool,
+    name: str, world: type, knobs: dict[str, Any], words: RosWords | None, *, bus: str, seconds: float | None,
+    seed: int, settings: Path | None, node: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Simulate a robot on a bus."""
-    from vlatool.buses import open_bus
+    from vlatool.buses import name_on, open_bus
     from vlatool.nodes.fault_watch import fault_text, to_plain_faults
     from vlatool.nodes.settings import build, read_settings
     from vlatool.nodes.world_node import WorldNode
 
-    chosen = {**({} if settings is None else read_settings(settings)), **knobs}
+    node = node or f"vlatool_{name.replace('-', '_')}"
+    chosen = {
+        **({} if settings is None else read_settings(settings)), **parameters(words, bus, node), **knobs,
+    }  # fmt: skip
     robot = build(world, chosen, f"vlatool sim {name}")
-    opened = open_bus(bus, node or f"vlatool_{name.replace('-', '_')}")
+    opened = open_bus(bus, node, words)
     try:
         simulated = WorldNode(robot, opened, seed)
-        sensors, commands = (", ".join(channel.topic for channel in each) for each in (robot.sensors, robot.commands))
+        sensors, commands = (", ".join(name_on(opened, channel.topic) for channel in each)
+                             for each in (robot.sensors, robot.commands))  # fmt: skip
         typer.echo(printable(f"{name} reports {sensors} and obeys {commands}"), err=True)
         try:
             with stopped_by_signals(simulated.stop):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Annotated
 
 import typer
@@ -11,7 +12,8 @@ from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson
 from vlatool.files.printable import printable
 
-NODE = "vlatool_topics"
+NODE = f"vlatool_topics_{os.getpid()}"
+"""In ROS 1 a second node of the same name ends the first one."""
 
 
 def topics(

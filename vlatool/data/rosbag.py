@@ -38,7 +38,7 @@ ACTIONS = ("action", "actions", "command", "cmd", "joint_command", "commands")
 MIN_MESSAGES = 2
 MAX_AGE_S = 0.2
 """Seconds that a message may be from the time of a row; the row is left out where it is further."""
-RECORD_AGAIN = "record it again, or repair it: ros2 bag reindex"
+RECORD_AGAIN = "record it again, or repair it: ros2 bag reindex (ROS 1: rosbag reindex)"
 
 
 class Rosbag(StepReader):

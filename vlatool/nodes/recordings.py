@@ -14,6 +14,8 @@ from vlatool.nodes.run_log import Item, Received, is_log, read_log
 from vlatool.nodes.step_record import CONTROLLER, STEPS, ControllerRecord, StepRecord, topic_of
 
 SUFFIXES = (".bag", ".mcap", ".db3")
+UNFINISHED_SUFFIX = ".active"
+"""Behind the name of a bag that ``rosbag record`` has not finished: the bus ``bag`` says what to do."""
 NODE = "vlatool_replay"
 
 
@@ -67,7 +69,7 @@ def open_recording(path: Path, controller: str, node: str = "") -> Recording:
     if not path.exists():
         raise DataError(f"There is no recording at {path}.", "check the path")
     if not is_log(path):  # by its first bytes: a log may be called as a bag is
-        if path.is_dir() or path.suffix in SUFFIXES:
+        if path.is_dir() or path.suffix in (*SUFFIXES, UNFINISHED_SUFFIX):
             return _of_bag(path, controller, node)
         raise DataError(f"{path} is not a recorded run.", "name a file of vlatool run --record, or a bag")
     about = next((item for item in read_log(path) if isinstance(item, ControllerRecord)), None)
@@ -78,7 +80,7 @@ def open_recording(path: Path, controller: str, node: str = "") -> Recording:
 
 def _of_bag(path: Path, controller: str, node: str) -> Recording:
     found = _records(path)
-    fitting = [about for about in found if _is(about, controller) and node in ("", about.node)]
+    fitting = [about for about in found if _is(about, controller) and node.strip("/") in ("", about.node)]
     if not fitting:
         raise _other(path, found, controller)
     if len(fitting) > 1:
@@ -102,7 +104,7 @@ def _topics(path: Path) -> list[str]:
 
 
 def _records(path: Path) -> list[ControllerRecord]:
-    """Return what ran, by the topics /NODE/controller of a bag; the last of each node."""
+    """Return what ran, by the topics /NODE/controller of a bag; the first of each node, whose steps come first, too."""
     bag = Bag(str(path), NODE)
     try:
         topics = [info.topic for info in bag.topics()
@@ -110,7 +112,7 @@ def _records(path: Path) -> list[ControllerRecord]:
         texts = [(topic, _text(message)) for topic, _, message in bag.messages(topics)] if topics else []
     finally:
         bag.close()
-    return list({topic: ControllerRecord.from_json(text) for topic, text in texts}.values())
+    return list({topic: ControllerRecord.from_json(text) for topic, text in reversed(texts)}.values())[::-1]
 
 
 def _text(message: object) -> str:

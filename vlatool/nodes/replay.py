@@ -141,8 +141,9 @@ def replay(controller: RobotController[Any], items: Iterable[Item], topics: Mapp
     names = [entry.name for entry in controller.inputs]
     channels: dict[str, tuple[str, ...]] = {}
     for name in names:
-        channel = name if topics is None else topics[name]
-        channels[channel] = (*channels.get(channel, ()), name)
+        channel = name if topics is None else topics.get(name)
+        if channel is not None:  # a recording of another version may lack an input
+            channels[channel] = (*channels.get(channel, ()), name)
     outputs = (
         {} if topics is None else {each.name: topics[each.name] for each in controller.outputs if each.name in topics}
     )
@@ -193,6 +194,8 @@ class _Replay:
         """Compute the steps whose messages are all there; return why it cannot go on, if so."""
         while self._waiting and not self._messages.has(self._waiting[0]):
             record = self._waiting.pop(0)
+            if record.step < self._steps:
+                return f"another run of the node begins, after step {self._steps - 1} of this one"
             if record.step != self._steps:
                 return f"the records of the steps {self._steps} to {record.step - 1} are not in the recording"
             self._step(record)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from vlatool.buses import Bus, QoS, Reception
+from vlatool.buses import Bus, QoS, Reception, name_on
 from vlatool.controllers import Command, RobotController, Service
 from vlatool.errors import BusError
 from vlatool.messages import Message
@@ -90,7 +90,10 @@ class Runner:
         alone: bool = True,
     ) -> None:
         self.controller, self.bus = controller, bus
-        self.topics = topics_of(controller, topics or {})
+        self.written_topics = topics_of(controller, topics or {})
+        """Input, output or service -> topic, as it is asked for."""
+        self.topics = {name: name_on(bus, topic) for name, topic in self.written_topics.items()}
+        """Input, output or service -> topic, as the bus calls it: a launch file of ROS may remap it."""
         self.summary = RunSummary()
         self._observers, self._stop = tuple(observers), threading.Event()
         self._stepper = Stepper(controller)
@@ -98,12 +101,14 @@ class Runner:
         self._senders: dict[str, Callable[[Any], None]] = {}
         for output in controller.outputs:
             qos = QoS(output.reliable, 10 if output.reliable else 1, output.latched)
-            self._senders[output.name] = bus.publisher(self.topics[output.name], output.message, qos)
+            self._senders[output.name] = bus.publisher(self.written_topics[output.name], output.message, qos)
         for entry in controller.inputs:
             qos = QoS(entry.reliable, max(1, entry.depth), entry.latched)
-            bus.subscribe(self.topics[entry.name], entry.message, _filling(self._stepper.inboxes[entry.name]), qos)
+            bus.subscribe(
+                self.written_topics[entry.name], entry.message, _filling(self._stepper.inboxes[entry.name]), qos
+            )
         for service in controller.services:
-            bus.serve(self.topics[service.name], service.request, service.response, self._answering(service))
+            bus.serve(self.written_topics[service.name], service.request, service.response, self._answering(service))
 
     def _refuse_conflicts(self, alone: bool) -> None:
         """Raise BusError where a topic carries another type, or an output has a publisher already."""
@@ -128,8 +133,10 @@ class Runner:
 
     def missing(self, timeout_s: float) -> tuple[str, ...]:
         """Wait until each required input has a publisher; return the topics without one after this many seconds."""
-        wanted = tuple(self.topics[entry.name] for entry in self.controller.inputs if entry.required)
-        return self.bus.wait_for_peers(wanted, timeout_s) if wanted else ()
+        wanted = {self.written_topics[entry.name]: self.topics[entry.name] for entry in self.controller.inputs
+                  if entry.required}  # fmt: skip
+        alone = self.bus.wait_for_peers(tuple(wanted), timeout_s) if wanted else ()
+        return tuple(wanted[topic] for topic in alone)
 
     def stop(self) -> None:
         """Let the run end after its current step; may be called from any thread."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.buses import ActionBus, Bus, Fault, QoS, open_bus
+from vlatool.buses import ActionBus, Bus, Fault, NamingBus, QoS, RosWords, open_bus
 from vlatool.errors import OutputError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.std_msgs import String
@@ -28,7 +28,7 @@ from vlatool.nodes.trace import Trace, watch_levels
 
 SETTLE_S = 0.5
 """Recorders look for new topics ten times a second (``ros2 bag record``, ``vlatool record``); the first step of a
-controller waits for them, so that a recording begins with it."""
+controller waits for them, so that a recording begins with it. A bus whose recorders are slower says ``settle_s``."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,8 @@ class RunPlan:
         shared: Whether others may publish the controller's outputs, too.
         instruction: Text that is published to the controller's input of the name ``instruction``, or to the only one of
             texts, before its first step.
-        settle_s: Time from the announcement of the node's topics to its first step, in seconds.
+        settle_s: Time from the announcement of the node's topics to its first step, in seconds; the bus's when None.
+        words: What a launcher of ROS says of the node; None without one.
     """
 
     controller: str
@@ -64,7 +65,8 @@ class RunPlan:
     report: Path | None = None
     shared: bool = False
     instruction: str = ""
-    settle_s: float = SETTLE_S
+    settle_s: float | None = None
+    words: RosWords | None = None
 
 
 @dataclass(frozen=True)
@@ -132,17 +134,17 @@ def run_on_bus(
     if not plan.bus:
         raise UsageError("No bus is named.", "pass --bus BUS, such as --bus zenoh, or --dry-run")
     controller = open_controller(plan.controller, plan.settings, plan.policy)
-    node = node_of(plan)
     trace = Trace()
     with contextlib.ExitStack() as stack:
         stack.callback(_close_policy, controller)
-        bus = open_bus(plan.bus, node)
+        bus = open_bus(plan.bus, node_of(plan), plan.words)
         stack.callback(bus.close)
+        node = bus.full_node if isinstance(bus, NamingBus) else node_of(plan)
         background = Background()
         stack.callback(background.close)
         runner = Runner(controller, bus, topics=plan.topics, observers=[background], alone=not plan.shared)
         about = record_of(plan.controller, controller, node, runner.topics, plan.policy)
-        say = _instructor(bus, controller, runner.topics, required=bool(plan.instruction))
+        say = _instructor(bus, controller, runner.written_topics, required=bool(plan.instruction))
         publish_step = StepPublisher(bus, about)
         log = None if plan.record is None else RunLog(plan.record, about)  # a run that is refused leaves none
         if plan.report is not None:
@@ -151,7 +153,7 @@ def run_on_bus(
         on_start(about)
         if say is not None and isinstance(bus, ActionBus):
             background.observe(InstructionAction(bus, node, say))
-        time.sleep(plan.settle_s)
+        time.sleep(getattr(bus, "settle_s", SETTLE_S) if plan.settle_s is None else plan.settle_s)
         if say is not None and plan.instruction:
             say(String(plan.instruction))
         if missing := runner.missing(plan.wait_s):
@@ -204,7 +206,7 @@ def dry_run(plan: RunPlan) -> dict[str, Any]:
 
     return {
         "controller": plan.controller,
-        "node": node_of(plan),
+        "node": node_of(plan) if plan.words is None else plan.words.name_for(node_of(plan)),
         "rate_hz": controller.rate_hz,
         "inputs": [entry(each, each.message) for each in controller.inputs],
         "outputs": [entry(each, each.message) for each in controller.outputs],
@@ -221,7 +223,12 @@ def _close_policy(controller: Any) -> None:
 
 def node_of(plan: RunPlan) -> str:
     """Return the name of the node."""
-    return plan.node or f"vlatool_{plan.controller.replace('-', '_')}"
+    return plan.node or default_node(plan.controller)
+
+
+def default_node(controller: str) -> str:
+    """Return the name of the node of a controller."""
+    return f"vlatool_{controller.replace('-', '_')}"
 
 
 def _closed(about: ControllerRecord, runner: Runner, background: Background, log: RunLog | None) -> RunResult:

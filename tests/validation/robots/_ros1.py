@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import sysconfig
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,14 @@ catkin rospy rosmaster rosbag roslaunch rosgraph rosgraph-msgs roslib roslz4 ros
 std-msgs std-srvs geometry-msgs sensor-msgs nav-msgs actionlib actionlib-msgs rosservice rostopic rosnode rosmsg
 diagnostic-msgs trajectory-msgs visualization-msgs tf2-msgs
 """.split()  # noqa: SIM905
+LIBRARIES = """
+libament-index-cpp0d libapr1 libaprutil1 libb64-0d libboost-chrono1.74.0 libboost-filesystem1.74.0
+libboost-program-options1.74.0 libboost-regex1.74.0 libboost-system1.74.0 libboost-thread1.74.0 libclass-loader3d
+libconsole-bridge1.0 libcpp-common0d libgpgme11 liblog4cxx15 librcpputils1d librcutils1d librosbag-storage4d librosbag4d
+librosconsole3d libroscpp-serialization0d libroscpp4d libroslib0d libroslz4-1d librospack0d librostime1d libtinyxml2-9
+libtopic-tools2d libxmlrpcpp3d rosout
+""".split()  # noqa: SIM905
+"""What ``rosbag record``, ``rosbag play`` and ``rosout`` need, which are nodes of roscpp."""
 PIP = ("pyyaml", "rospkg", "catkin_pkg", "netifaces", "defusedxml", "pycryptodomex", "python-gnupg")
 MODULES = "usr/lib/python3/dist-packages"
 HERE = Path(__file__).resolve().parent
@@ -30,22 +39,45 @@ Rows = list[tuple[str, str, bool]]
 def prepare(folder: Path) -> dict[str, str]:
     """Unpack ROS 1 into a folder unless it is there, and return the environment in which Python imports it."""
     root, site, debs = folder / "root", folder / "site", folder / "debs"
-    if not (root / MODULES / "rospy").is_dir():
-        debs.mkdir(parents=True, exist_ok=True)
-        subprocess.run(["apt-get", "download", "-q", *(f"python3-{name}" for name in DEBS)], cwd=debs, check=True,
-                       stdout=subprocess.DEVNULL)  # fmt: skip
-        for package in sorted(debs.glob("*.deb")):
-            subprocess.run(["dpkg", "-x", package, root], check=True)
+    for names, sign in (([f"python3-{name}" for name in DEBS], root / MODULES / "rospy"),
+                        (LIBRARIES, root / "usr/lib/rosout/rosout")):  # fmt: skip
+        if not sign.exists():
+            debs.mkdir(parents=True, exist_ok=True)
+            subprocess.run(["apt-get", "download", "-q", *names], cwd=debs, check=True, stdout=subprocess.DEVNULL)
+            for package in sorted(debs.glob("*.deb")):
+                subprocess.run(["dpkg", "-x", package, root], check=True)
+    plugins = "librosbag_default_encryption_plugins.so"
+    if not (root / "usr/lib" / plugins).exists():  # Debian's own place is searched in /usr alone
+        (root / "usr/lib" / plugins).symlink_to(libraries(folder) / "ros" / plugins)
+    (root / "usr/.catkin").touch()  # as Debian's package catkin has it: programs below usr/lib are found
     if not (site / "rospkg").is_dir():
         pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--target", site, *PIP]
         subprocess.run(pip, check=True)
+    return environment(folder)
+
+
+def is_prepared(folder: Path) -> bool:
+    """Return whether ROS 1 is in a folder."""
+    return (folder / "root/usr/lib/rosout/rosout").exists() and (folder / "site/rospkg").is_dir()
+
+
+def libraries(folder: Path) -> Path:
+    """Return where the libraries of C++ are."""
+    return folder / "root/usr/lib" / (sysconfig.get_config_var("MULTIARCH") or "")
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Return the environment in which Python imports what is unpacked in a folder, and its programs run."""
+    root, site = folder / "root", folder / "site"
     paths = [str(path) for path in (ROOT, root / MODULES, site)]
     kept = {name: value for name, value in os.environ.items() if not name.startswith("ROS_")}
     return kept | {
         "PYTHONPATH": os.pathsep.join(paths), "ROS_LOG_DIR": str(folder / "logs"),
         "ROS_HOME": str(folder / "home"), "PYTHONWARNINGS": "ignore", "ROS_ROOT": str(root / "usr/share/ros"),
         "ROS_PYTHON_LOG_CONFIG_FILE": str(root / "etc/ros/python_logging.conf"),
-        "PATH": f"{root / 'usr/bin'}{os.pathsep}{kept.get('PATH', '')}",
+        "PATH": os.pathsep.join([str(root / "usr/bin"), str(site / "bin"), kept.get("PATH", "")]),
+        "LD_LIBRARY_PATH": str(libraries(folder)),
+        "ROS_PACKAGE_PATH": str(root / "usr/share"), "CMAKE_PREFIX_PATH": str(root / "usr"),
     }  # fmt: skip
 
 
