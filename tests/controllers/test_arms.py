@@ -269,6 +269,20 @@ def test_the_arms_of_aloha_never_come_near_each_other() -> None:
     assert distance(arm.path()[-1:])[0] > 0.2
 
 
+def test_no_joint_of_aloha_changes_the_distance_faster_than_its_reach_says() -> None:
+    """What lets the envelope leave out distances: for any two poses, near ones and far ones."""
+    keep, random = built("aloha")._apart(), np.random.default_rng(6)
+    joints = load("controllers", "aloha").ROBOT.limits().joints
+    low, high = (np.array([joint.bounds[side] for joint in joints]) for side in (0, 1))
+    poses = random.uniform(low, high, (4000, 14))
+    poses[:2000] = np.array(load("controllers", "aloha").ROBOT.start) + random.uniform(-0.8, 0.8, (2000, 14))
+    others = poses + random.standard_normal((4000, 14)) * 10.0 ** random.uniform(-3, 0, (4000, 1))
+    changes = np.abs(keep.distance(poses) - keep.distance(others))
+    bounds = np.abs(poses - others) @ np.array(keep.reach_m)
+    assert (changes <= bounds + 1e-12).all()
+    assert (changes / bounds).max() > 0.3  # and it says no more than it must
+
+
 def test_a_way_that_is_not_free_ends_where_it_is_and_the_call_is_told() -> None:
     """The start pose of the right arm is behind the left one, which reaches across."""
     pose = np.array(load("controllers", "aloha").ROBOT.start)

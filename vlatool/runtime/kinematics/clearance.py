@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,26 +54,58 @@ class Clearance:
             (...) float64.
         """
         values = np.asarray(positions, np.float64)
-        ends, radii = [], []
-        for chain, joints, capsules in zip(self.chains, self.joints, self.capsules, strict=True):
-            frames = chain.frames(values[..., list(joints)])
-            base = np.broadcast_to(chain.base.matrix(), (*frames.shape[:-3], 1, 4, 4))
-            ends.append(_segments(np.concatenate([frames, base], axis=-3), capsules))
-            radii.append(np.array([capsule.radius for capsule in capsules]))
+        ends = [_segments(chain, values[..., body.joints], body)
+                for chain, body in zip(self.chains, self._bodies, strict=True)]  # fmt: skip
         (one_begin, one_end), (two_begin, two_end) = ends
         distances = segment_distances(
             one_begin[..., :, None, :], one_end[..., :, None, :], two_begin[..., None, :, :], two_end[..., None, :, :]
         )
-        nearest: Array = (distances - radii[0][:, None] - radii[1][None, :]).min(axis=(-2, -1))
+        one, two = self._bodies
+        nearest: Array = (distances - one.radii[:, None] - two.radii[None, :]).min(axis=(-2, -1))
         return nearest
 
+    @cached_property
+    def _bodies(self) -> tuple[_Body, _Body]:
+        """Both arms as arrays."""
+        parts = zip(self.chains, self.joints, self.capsules, strict=True)
+        one, two = (_Body.of(chain, joints, capsules) for chain, joints, capsules in parts)
+        return one, two
 
-def _segments(frames: Array, capsules: Sequence[Capsule]) -> tuple[Array, Array]:
-    """Return begin and end of each capsule's segment in the world, (..., C, 3) each; the base is the last frame."""
-    own = frames[..., [capsule.link for capsule in capsules], :, :]
-    begin, end = (np.array([getattr(capsule, side) for capsule in capsules]) for side in ("begin", "end"))
+
+class _Body(NamedTuple):
+    """Capsules of an arm as arrays, so that a distance makes no array of them.
+
+    Args:
+        joints: Places of its joints in the vector.
+        links: (C,) index of the frame of each capsule; the last frame is the base.
+        begin, end: (C, 3, 1) in those frames.
+        radii: (C,).
+        base: (1, 4, 4) in the world.
+    """
+
+    joints: list[int]
+    links: list[int]
+    begin: Array
+    end: Array
+    radii: Array
+    base: Array
+
+    @classmethod
+    def of(cls, chain: Chain, joints: Sequence[int], capsules: Sequence[Capsule]) -> _Body:
+        """Return those of an arm."""
+        links = [capsule.link for capsule in capsules]
+        begin, end = (np.array([getattr(capsule, side) for capsule in capsules])[..., None] for side in ("begin", "end"))
+        radii = np.array([capsule.radius for capsule in capsules])
+        return cls(list(joints), links, begin, end, radii, chain.base.matrix()[None])
+
+
+def _segments(chain: Chain, positions: Array, body: _Body) -> tuple[Array, Array]:
+    """Return begin and end of each capsule's segment in the world, (..., C, 3) each."""
+    frames = chain.frames(positions)
+    base = np.broadcast_to(body.base, (*frames.shape[:-3], 1, 4, 4))
+    own = np.concatenate([frames, base], axis=-3)[..., body.links, :, :]
     origins, rotations = own[..., :3, 3], own[..., :3, :3]
-    return origins + (rotations @ begin[..., None])[..., 0], origins + (rotations @ end[..., None])[..., 0]
+    return origins + (rotations @ body.begin)[..., 0], origins + (rotations @ body.end)[..., 0]
 
 
 def segment_distances(one_begin: Array, one_end: Array, two_begin: Array, two_end: Array) -> Array:
