@@ -164,6 +164,60 @@ def test_an_old_joint_state_stops_the_arm(repeated: bool) -> None:
     assert (hardest <= [joint.acceleration + 1e-6 for joint in arm.controller.ROBOT.limits().joints]).all()
 
 
+@pytest.mark.parametrize("away", [0.3, 2.0])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_an_arm_that_is_elsewhere_after_a_silence_is_commanded_from_where_it_is(name: str, away: float) -> None:
+    """Its driver, or the robot, started again: the last command is no place to leap to."""
+    arm = Arm(built(name, lambda seen: seen["state"], speed=0.4))
+    arm.until("acting")
+    arm.steps(5)
+    command = arm.steps(80, silent=True)
+    assert arm.state.envelope.at_rest()
+    assert "joint state" in command.status
+    assert not command.messages  # what starts again finds no command of before
+    limits = arm.controller.ROBOT.limits(0.4, arm.controller.margin_rad).joints
+    shifts = [0.0 if joint.command == "range" else away for joint in limits]
+    arm.positions = np.array([
+        value + shift if value + shift < joint.bounds[1] else max(value - shift, joint.bounds[0])
+        for value, shift, joint in zip(arm.positions, shifts, limits, strict=True)
+    ])  # fmt: skip
+    places = [arm.positions]
+    for _ in range(60):
+        arm.step()
+        places.append(arm.positions)
+    fastest, _ = differences(np.array(places), arm.controller.rate)
+    assert all(speed <= joint.velocity[1] + 1e-9 for speed, joint in zip(fastest, limits, strict=True)
+               if joint.command != "range")  # fmt: skip
+    assert arm.commands[-1].status.startswith("acting")
+    assert arm.state.envelope.position == pytest.approx(places[0], abs=1e-6)
+
+
+def test_an_arm_that_is_beyond_its_limits_after_a_silence_is_not_commanded_to_leap_back() -> None:
+    arm = Arm(built("franka", lambda seen: seen["state"], start_pose=(0, 0, 0, -0.2, 0, 1.5, 0), margin_rad=0.02))
+    arm.until("acting")
+    arm.steps(80, silent=True)
+    before = arm.state.envelope.position
+    beyond = np.array(before)
+    beyond[3] = 0.05
+    for _ in range(10):
+        command = arm.step(state=joint_state(arm.names, beyond, arm.time_s + 0.02))
+        assert "joint4 is at 0.05; its limits are" in command.status
+        assert not command.messages
+    arm.steps(3, state=None)
+    assert command.status.startswith("acting")
+
+
+def test_what_an_arm_lags_behind_its_command_is_no_reason_to_command_another_place() -> None:
+    arm = Arm(built("franka", lambda seen: seen["state"] * 0 + arm.positions.astype(np.float32)))
+    arm.until("acting")
+    arm.steps(5)
+    before = arm.state.envelope.position
+    arm.steps(80, silent=True)
+    sagging = joint_state(arm.names, arm.positions - 0.01, arm.time_s + 0.02)
+    arm.step(state=sagging)
+    assert arm.state.envelope.position == pytest.approx(before, abs=1e-6)
+
+
 def test_nothing_is_sent_before_the_first_good_joint_state() -> None:
     arm = Arm(built("franka"))
     command = arm.step(silent=True, calls=1)
@@ -191,6 +245,19 @@ def test_the_service_brings_the_arm_back_and_answers_when_it_is_there() -> None:
     fastest, hardest = differences(arm.path(), 50.0)
     assert (fastest <= 0.5 * math.pi + 1e-9).all()
     assert (hardest <= 3.0 + 1e-6).all()
+
+
+@pytest.mark.parametrize("speed", [0.1, 1.0])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_call_of_the_service_waits_for_the_longest_way(name: str, speed: float) -> None:
+    """From one end of all joints to the other."""
+    joints = built(name).ROBOT.limits(speed, built(name).margin_rad).joints
+    low, high = (tuple(joint.bounds[side] for joint in joints) for side in (0, 1))
+    arm = Arm(built(name, speed=speed, start_pose=high), low)
+    arm.step()
+    while arm.state.phase == "returning":
+        arm.steps(10)
+    assert arm.controller.services[0].answer_s > arm.time_s
 
 
 @pytest.mark.parametrize("act", [lambda seen: np.full(7, np.nan, np.float32), lambda seen: np.zeros(3, np.float32),
@@ -311,6 +378,7 @@ def test_a_policy_sees_targets_cameras_and_an_instruction() -> None:
         "/wrist/image_raw",
         "/instruction",
     ]
+    assert [entry.name for entry in arm.controller.inputs if entry.required] == ["joints", "target", "wrist"]
     assert "no target" in arm.step().status
     assert "no target" not in (status := arm.step(target=PoseStamped(pose=Pose(Point(0.1, 0.2, 0.3)))).status)
     assert "camera wrist: no image" in status

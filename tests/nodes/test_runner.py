@@ -11,7 +11,7 @@ import pytest
 
 from tests._point_robot import Exchange, Failing, GoTo, MemoryBus, collect
 from vlatool.buses import QoS
-from vlatool.controllers import Command
+from vlatool.controllers import Command, Service
 from vlatool.errors import BusError, DataError, UsageError
 from vlatool.messages.geometry_msgs import Twist, Vector3
 from vlatool.messages.nav_msgs import Odometry
@@ -140,6 +140,15 @@ def test_call_that_no_step_answers(exchange):
     with pytest.raises(BusError, match=r"no step answered within 0\.01 s"):
         runner._stepper.calls.ask("halt", Bool(True), 0.01)
     assert runner._stepper.calls.take() == ()
+
+
+def test_a_call_waits_as_long_as_its_service_says(exchange, others):
+    class Impatient(GoTo):
+        services = (Service("halt", "/halt", Bool, Bool, answer_s=0.01),)
+
+    runner_of(exchange, Impatient())
+    with pytest.raises(BusError, match=r"no step answered within 0\.01 s"):
+        others.call("/halt", Bool(True), Bool, 1)
 
 
 def test_too_many_calls_are_refused(exchange):

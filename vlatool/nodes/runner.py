@@ -124,7 +124,7 @@ class Runner:
                 )  # fmt: skip
 
     def _answering(self, service: Service) -> Callable[[Message], Any]:
-        return lambda request: self._stepper.calls.ask(service.name, request)
+        return lambda request: self._stepper.calls.ask(service.name, request, service.answer_s)
 
     def missing(self, timeout_s: float) -> tuple[str, ...]:
         """Wait until each required input has a publisher; return the topics without one after this many seconds."""

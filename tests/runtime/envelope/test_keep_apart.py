@@ -82,9 +82,12 @@ def test_a_distance_that_is_known_saves_time_and_changes_no_command() -> None:
         envelope = Envelope(LIMITS, PERIOD, apart=kind(counted, 0.15, (0.5, 0.5)))
         envelope.start([1.0, 1.0])
         calls.clear()
-        paths.append(drive(envelope, 600, lambda step, at, goals=goals: [
-            value + float(np.clip(goal - value, -0.038, 0.038)) for value, goal in zip(at, goals[step // 50], strict=True)
-        ]))  # fmt: skip
+
+        def ask(step: int, at: tuple[float, ...], goals: np.ndarray = goals) -> list[float]:
+            steps = np.clip(goals[step // 50] - np.array(at), -0.038, 0.038)
+            return (np.array(at) + steps).tolist()
+
+        paths.append(drive(envelope, 600, ask))
         counts.append(len(calls))
     assert paths[0] == paths[1]
     assert counts[0] < 0.7 * counts[1]

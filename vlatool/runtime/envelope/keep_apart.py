@@ -87,9 +87,7 @@ class KeepApart:
         )
 
 
-def _path(
-    now: Place, axes: Sequence[PositionAxis], samples: Sequence[Sample], interval: float, step_s: float
-) -> Array:
+def _path(now: Place, axes: Sequence[PositionAxis], samples: Sequence[Sample], interval: float, step_s: float) -> Array:
     """Return positions (K, A): where the axes are, the command, and the stop behind it at ``step_s`` or wider."""
     stops = [_stop_of(axis, sample, interval) for axis, sample in zip(axes, samples, strict=True)]
     longest = max(left for _, _, left in stops)

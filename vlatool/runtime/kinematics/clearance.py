@@ -94,7 +94,7 @@ class _Body(NamedTuple):
     def of(cls, chain: Chain, joints: Sequence[int], capsules: Sequence[Capsule]) -> _Body:
         """Return those of an arm."""
         links = [capsule.link for capsule in capsules]
-        begin, end = (np.array([getattr(capsule, side) for capsule in capsules])[..., None] for side in ("begin", "end"))
+        begin, end = (np.array([getattr(each, side) for each in capsules])[..., None] for side in ("begin", "end"))
         radii = np.array([capsule.radius for capsule in capsules])
         return cls(list(joints), links, begin, end, radii, chain.base.matrix()[None])
 
