@@ -7,12 +7,12 @@ minutes of processor time; ``vlatool export onnx`` and ``vlatool quantize static
 plays it in the simulated robot. ``--episodes``: the tip must be within 2 cm of its target 4 s after the arm is at its
 start pose; every tenth episode is played again with the joints of all messages in another order, and every command must
 be the same.
-``--ticks``: a policy that goes to the limits as fast as it can, jumps, answers NaN or late; no position or velocity of
-the *simulated* joints may leave the limits of the robot (grippers, whose limits are stops of the hardware, are told
-apart), and ALOHA's arms never come nearer than 5 cm. Contacts are off in hostile ticks: an arm that is driven into
-itself or into a table is pushed by it, whatever its commands are. In both, the time of the controller's step without
-its policy must be within 1 ms at the 99th percentile. Models come from PyPI's wheels into OUT/models; what was found
-is printed as a table, and written to OUT/measured.json.
+``--ticks``: a policy that goes to the limits as fast as it can, jumps, answers NaN or late, or has two arms meet; no
+position or velocity of the *simulated* joints may leave the limits of the robot (grippers, whose limits are stops of
+the hardware, are told apart), and ALOHA's arms never come nearer than 5 cm. Contacts are off in hostile ticks: an arm
+that is driven into itself or into a table is pushed by it, whatever its commands are. In both, the time of the
+controller's step without its policy must be within 1 ms at the 99th percentile. Models come from PyPI's wheels into
+OUT/models; what was found is printed as a table, and written to OUT/measured.json.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ from vlatool.worlds import open_world  # noqa: E402
 
 WORLDS = {"franka": "franka_panda", "ur5e": "ur5e", "so101": "so101", "aloha": "aloha"}
 KINDS = ("bang-bang", "random", "nan", "jumps", "late")
+MEET = "meet"
+"""The kind of hostile policy that brings two arms to poses in which they would overlap."""
 REACH_S, NEAR_M, APART_M, TICK_MS, TRAINING_S = 4.0, 0.02, 0.05, 1.0, 300.0
 SLACK = {"position": 1e-6, "velocity": 1e-6}
 
@@ -243,12 +245,19 @@ class Hostile:
         state = TensorSpec("state", (1, len(labels)), labels=labels)
         action = TensorSpec("action", (1, 1, len(labels)), labels=labels, mode="absolute")
         self.spec = PolicySpec((state,), (action,), control_hz=built.rate)
-        self.random, self.kind, self.count = np.random.default_rng(seed), KINDS[seed % len(KINDS)], 0
+        kinds = KINDS if built._apart() is None else (*KINDS, MEET)
+        self.random, self.kind, self.count = np.random.default_rng(seed), kinds[seed % len(kinds)], 0
         joints = robot.limits(built.speed).joints
         self.low, self.high = (np.array([joint.bounds[side] for joint in joints]) for side in (0, 1))
         self.beyond = np.where([joint.command == "range" for joint in joints], 0.0, 0.1)  # farther is a discontinuity
         self.step = np.array([joint.velocity[1] or 1.0 for joint in joints]) / built.rate
         self.goal, self.asked, self.late = self.high, self.low, [self.low]
+        self.meetings = self._overlaps(built) if self.kind == MEET else np.empty((0, len(labels)))
+
+    def _overlaps(self, built: Any) -> np.ndarray:
+        """Return poses of two arms that overlap."""
+        poses = self.random.uniform(self.low, self.high, (4000, len(self.low)))
+        return poses[built._apart().distance(poses) < 0.0]
 
     def reset(self, seed: int | None = None) -> None:
         """Nothing is kept from an episode."""
@@ -261,6 +270,7 @@ class Hostile:
         if self.count % int(random.integers(5, 90)) == 0:
             ends = np.where(random.random(len(state)) < 0.5, self.low - self.beyond, self.high + self.beyond)
             self.goal = ends if self.kind != "random" else random.uniform(self.low, self.high)
+            self.goal = random.choice(self.meetings) if self.kind == MEET else self.goal
         self.count += 1
         step = self.step * (random.uniform(0.1, 2.5) if self.kind != "bang-bang" else 2.5)
         self.asked = self.asked + np.clip(self.goal - self.asked, -step, step)
