@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from _arm_feed import Arm, Scripted, joint_state, spec_of
 
+from tests._arm_bundle import arm_bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.controllers import RobotController
 from vlatool.errors import DeadlineMissed, UsageError
@@ -17,6 +19,7 @@ from vlatool.messages.geometry_msgs import Point, Pose, PoseStamped
 from vlatool.messages.sensor_msgs import Image, JointState
 from vlatool.messages.std_msgs import Header, String
 from vlatool.messages.trajectory_msgs import JointTrajectory
+from vlatool.nodes.launch import PolicyOptions, open_controller
 from vlatool.registry import load, names
 from vlatool.runtime.kinematics import ARMS
 
@@ -436,3 +439,29 @@ def test_without_a_policy_it_does_not_start() -> None:
     with pytest.raises(UsageError, match="--bundle"):
         controller.start()
     assert not controller.rest().messages
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a policy of a Panda that asks for where the arm is."""
+    folder = tmp_path_factory.mktemp("arm") / "bundle"
+    arm_bundle(folder)
+    return folder
+
+
+@pytest.mark.parametrize("robot", ["", "franka-panda"])
+def test_a_policy_acts_after_each_return_to_the_start_pose(bundle: Path, robot: str) -> None:
+    """Limits are kept once: what it said before the arm went back holds it nowhere."""
+    controller = open_controller("franka", {"return_at_start": False}, PolicyOptions(bundle, robot, deadline_ms=0))
+    arm = Arm(controller, np.array(controller.ROBOT.start) + 0.4)
+    for _ in range(2):
+        arm.until("acting")
+        commands = [arm.step() for _ in range(30)]
+        assert {command.status for command in commands[1:]} == {"acting"}
+        arm.step(calls=1)
+    assert arm.positions == pytest.approx(controller.ROBOT.start, abs=0.01)
+
+
+def test_another_robot_than_that_of_the_controller_is_refused(bundle: Path) -> None:
+    with pytest.raises(UsageError, match=r"keeps the limits of franka-panda, and --robot is ur5e"):
+        open_controller("franka", {}, PolicyOptions(bundle, "ur5e"))

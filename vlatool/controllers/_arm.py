@@ -118,6 +118,11 @@ class ArmController:
         return policy_of(self.policy.spec, self.ROBOT)
 
     @property
+    def limits_of(self) -> str:
+        """The robot whose limits all commands keep; no further envelope is around the policy."""
+        return self.ROBOT.name
+
+    @property
     def rate_hz(self) -> float:
         """Steps in a second."""
         return self.rate
