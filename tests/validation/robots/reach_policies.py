@@ -10,8 +10,8 @@ be the same.
 ``--ticks``: a policy that goes to the limits as fast as it can, jumps, answers NaN or late, or has two arms meet; no
 position or velocity of the *simulated* joints may leave the limits of the robot (grippers, whose limits are stops of
 the hardware, are told apart), and ALOHA's arms never come nearer than 5 cm. Contacts are off in hostile ticks: an arm
-that is driven into itself or into a table is pushed by it, whatever its commands are. In both, the time of the
-controller's step without its policy must be within 1 ms at the 99th percentile. Models come from PyPI's wheels into
+that is driven into itself or into a table is pushed by it, whatever its commands are. In both, the processor time of
+the controller's step without its policy must be within 1 ms at the 99th percentile. Models come from PyPI's wheels into
 OUT/models; what was found is printed as a table, and written to OUT/measured.json.
 """
 
@@ -23,7 +23,6 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,10 +35,10 @@ from _reach_training import Task, train  # noqa: E402
 
 import vlatool  # noqa: E402
 from vlatool.bundle.spec import PolicySpec, TensorSpec  # noqa: E402
+from vlatool.controllers import Snapshot  # noqa: E402
 from vlatool.messages.geometry_msgs import Point, Pose, PoseStamped  # noqa: E402
 from vlatool.messages.sensor_msgs import JointState  # noqa: E402
 from vlatool.nodes.in_world import Event, Simulation  # noqa: E402
-from vlatool.nodes.stepper import StepReport  # noqa: E402
 from vlatool.registry import load  # noqa: E402
 from vlatool.stats.intervals import wilson  # noqa: E402
 from vlatool.worlds import open_world  # noqa: E402
@@ -64,7 +63,7 @@ class Outcome:
         in_episodes, in_attacks: Excess of the simulated joints over their limits, by what it is of.
         ticks: Hostile ticks.
         apart_m: Least distance of two arms, infinity for one.
-        tick_ms: Times of the controller's steps without its policy, in episodes and in hostile ticks.
+        tick_ms: Processor times of the controller's steps without its policy, in episodes and in hostile ticks.
     """
 
     name: str
@@ -104,7 +103,7 @@ class Outcome:
             "grippers beyond their stops": f"{worst['gripper']:.2g}",
             "least distance of the arms": f"{self.apart_m:.3f} m" if np.isfinite(self.apart_m) else "",
             **{
-                f"time of a step without the policy, {where}, p50, p99": ", ".join(
+                f"processor time of a step without the policy, {where}, p50, p99": ", ".join(
                     f"{value:.2f}" for value in np.percentile(times or [np.nan], (50, 99))
                 ) + " ms"
                 for where, times in zip(("episodes", "hostile ticks"), self.tick_ms, strict=True)
@@ -170,10 +169,10 @@ class Shuffled:
 
 
 class Timed:
-    """A policy whose time is known, so that of its controller can be told apart."""
+    """A policy whose processor time is known, so that of its controller can be told apart."""
 
     def __init__(self, policy: Any) -> None:
-        self._policy, self.spec, self._spent_s = policy, policy.spec, 0.0
+        self._policy, self.spec, self.spent_s = policy, policy.spec, 0.0
 
     def reset(self, seed: int | None = None) -> None:
         """Begin an episode."""
@@ -181,16 +180,34 @@ class Timed:
 
     def act(self, observation: Any) -> Any:
         """Return the action."""
-        began = time.perf_counter()
+        began = time.thread_time()
         try:
             return self._policy.act(observation)
         finally:
-            self._spent_s += time.perf_counter() - began
+            self.spent_s += time.thread_time() - began
 
-    def rest_ms(self, report: StepReport) -> float:
-        """Return the time of a step without the policy, and forget the policy's."""
-        spent, self._spent_s = self._spent_s, 0.0
-        return (report.compute_s - spent) * 1e3
+
+class Clocked:
+    """A controller whose steps are timed without their policy, in processor time: others use the core meanwhile.
+
+    Args:
+        controller: The controller, with a policy that is ``Timed``.
+        tick_ms: Gets the time of each step.
+    """
+
+    def __init__(self, controller: Any, tick_ms: list[float]) -> None:
+        self._controller, self._tick_ms = controller, tick_ms
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._controller, name)
+
+    def step(self, snapshot: Snapshot, state: Any) -> Any:
+        """Return the command and the next state."""
+        policy = self._controller.policy
+        began, policy.spent_s = time.thread_time(), 0.0
+        found = self._controller.step(snapshot, state)
+        self._tick_ms.append((time.thread_time() - began - policy.spent_s) * 1e3)
+        return found
 
 
 def target_events(task: Task, target: np.ndarray) -> list[Event]:
@@ -202,19 +219,12 @@ def target_events(task: Task, target: np.ndarray) -> list[Event]:
     return events
 
 
-def timing(controller: Any, tick_ms: list[float]) -> Callable[[int, StepReport], None]:
-    """Return an observer that collects the times of steps without the policy."""
-    return lambda _, report: tick_ms.append(controller.policy.rest_ms(report))
-
-
 def play(
     task: Task, controller: Any, world: Any, row: int, seed: int, tick_ms: list[float]
 ) -> tuple[float, Simulation]:
     """Return how far the farthest tip is from its target at the end of an episode in metres, and the simulation."""
-    simulation = Simulation(
-        world, [controller], seed=seed, events=target_events(task, task.targets[row]),
-        observers=[timing(controller, tick_ms)],
-    )  # fmt: skip
+    events = target_events(task, task.targets[row])
+    simulation = Simulation(world, [Clocked(controller, tick_ms)], seed=seed, events=events)
     simulation.play(20.0, until=lambda _: simulation.steppers[0].state.phase == "acting")
     simulation.play(simulation.time_s + REACH_S)
     tips = world.truth()["tips"]
@@ -289,7 +299,7 @@ def attack(outcome: Outcome, ticks: int, models: str) -> None:
     for seed in range(-(-ticks // 1000)):
         world = open_world(WORLDS[outcome.name], contacts=False, models=models)
         built = controller(policy=Timed(Hostile(controller, seed)))
-        simulation = Simulation(world, [built], seed=seed, observers=[timing(built, outcome.tick_ms[1])])
+        simulation = Simulation(world, [Clocked(built, outcome.tick_ms[1])], seed=seed)
         simulation.play(min(ticks, 1000) / built.rate)
         outcome.note(excess(built, world), attacked=True)
         outcome.apart_m = min(outcome.apart_m, world.truth().get("least_distance_m", outcome.apart_m))

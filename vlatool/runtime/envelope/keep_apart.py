@@ -40,8 +40,11 @@ class KeepApart:
     minimum_m: float
     reach_m: tuple[float, ...] | None = None
     step_s: float = 0.02
-    _measured: list[tuple[Place, float]] = field(default_factory=list, init=False, repr=False, compare=False)
-    """The place whose distance was computed last, and that distance: it changes how fast answers are, never which."""
+    _measured: list[tuple[Place, float, bool]] = field(default_factory=list, init=False, repr=False, compare=False)
+    """The place whose distance was computed last, that distance, and whether the way had to be looked at.
+
+    It changes how fast answers are, never which.
+    """
 
     def __post_init__(self) -> None:
         check_positive("minimum_m", self.minimum_m, "a number of metres")
@@ -61,12 +64,16 @@ class KeepApart:
         way = self._longest_way(axes, samples)
         if self._at_least(now) - way >= self.minimum_m + ROUNDING:
             return True
+        near = self._measured[-1][2] if self._measured else self.reach_m is None
+        if not near:
+            here = float(self.distance(np.array([now]))[0])
+            self._measured[:] = [(now, here, here - way < self.minimum_m)]
+            if here - way >= self.minimum_m:
+                return True
         distances = self.distance(_path(now, axes, samples, interval, self.step_s))
         here = float(distances[0])
-        self._measured[:] = [(now, here)]
-        if here - way >= self.minimum_m:
-            return True
-        return bool(np.min(distances) >= min(self.minimum_m, here) - ROUNDING)
+        self._measured[:] = [(now, here, here - way < self.minimum_m)]
+        return here - way >= self.minimum_m or bool(np.min(distances) >= min(self.minimum_m, here) - ROUNDING)
 
     def _longest_way(self, axes: Sequence[PositionAxis], samples: Sequence[Sample]) -> float:
         """Return by how much the distance can change at most until the stop ends, in metres; infinity if unknown."""
@@ -81,7 +88,7 @@ class KeepApart:
         """Return a distance that is not above that of a place, by the one that was computed last."""
         if self.reach_m is None or not self._measured:
             return -float("inf")
-        ((before, distance),) = self._measured
+        ((before, distance, _),) = self._measured
         return distance - sum(
             reach * abs(one - other) for reach, one, other in zip(self.reach_m, place, before, strict=True)
         )
