@@ -33,6 +33,7 @@ ROBOTS = {"franka": "franka-panda", "ur5e": "ur5e", "so101": "so101", "aloha": "
 """Controller -> robot whose limits its policy keeps."""
 REACH_S, ACTING_S, RESTART_S, LEASE_S = 10.0, 40.0, 3.0, 15.0
 """Time to a target, to the start pose, until joint states are told to be old, and until a dead node is forgotten."""
+TARGETLESS = ("acting: no target", "acting: no left_target")
 START_RAD = 0.1
 """Distance from the start pose at which an arm is there: servos sag."""
 
@@ -125,10 +126,9 @@ def reach(trial: Trial, operator: Operator, target: np.ndarray, what: str, *, pu
 
 def begins(trial: Trial, operator: Operator) -> None:
     """A controller goes to the start pose, and says that it has no target."""
-    took = operator.wait(lambda: operator.status.startswith("acting"), ACTING_S)
-    operator.wait(lambda: operator.stands(0.3), 2.0)
+    took = operator.wait(lambda: operator.status in TARGETLESS and operator.stands(0.3), ACTING_S)
     away = float(np.abs(operator.positions() - trial.robot.start).max())
-    right = np.isfinite(took) and away < START_RAD and "no " in operator.status and "target" in operator.status
+    right = np.isfinite(took) and away < START_RAD
     trial.add("at the start pose, without a target", f"after {took:.1f} s, {away:.3f} rad; {operator.status}", right)
 
 
