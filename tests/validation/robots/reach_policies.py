@@ -364,10 +364,12 @@ def main() -> int:
     options = parser.parse_args()
     options.models = options.models or options.output / "models"
     install_models(options.models)
-    outcomes = [judge(name, options) for name in options.only]
+    outcomes = []
+    for name in options.only:
+        outcomes.append(judge(name, options))
+        plain = [dataclasses.asdict(outcome) | {"tick_ms": None, "lines": outcome.lines()} for outcome in outcomes]
+        (options.output / "measured.json").write_text(json.dumps(plain, indent=1))
     show(outcomes)
-    plain = [dataclasses.asdict(outcome) | {"tick_ms": None, "lines": outcome.lines()} for outcome in outcomes]
-    (options.output / "measured.json").write_text(json.dumps(plain, indent=1))
     return int(any(outcome.wrong() for outcome in outcomes))
 
 
