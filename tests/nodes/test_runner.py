@@ -167,6 +167,19 @@ def test_another_publisher_is_refused(exchange, others):
     runner_of(exchange, GoTo(), alone=False)
 
 
+def test_another_publisher_that_is_seen_late_is_refused_before_the_first_step(exchange, others):
+    """Networks list other nodes after a while: a controller that starts beside another one must not miss it."""
+    sent = collect(others, "/cmd_vel", Twist)
+    runner = runner_of(exchange, GoTo(rate_hz=100))
+    others.publisher("/cmd_vel", Twist, QoS())
+    with pytest.raises(BusError, match=r"/cmd_vel has the publishers others, vlatool_test: two would command one"):
+        runner.run(0.1)
+    assert not sent
+    assert runner.summary.steps == 0
+    runner_of(exchange, GoTo(rate_hz=100), alone=False).run(0.02)
+    assert sent
+
+
 def test_another_type_is_refused(exchange, others):
     others.publisher("/odom", Twist, QoS())
     with pytest.raises(BusError, match=r"/odom carries geometry_msgs/msg/Twist; the controller's 'odom' is nav_msgs"):

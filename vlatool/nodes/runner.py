@@ -93,8 +93,8 @@ class Runner:
         self.topics = topics_of(controller, topics or {})
         self.summary = RunSummary()
         self._observers, self._stop = tuple(observers), threading.Event()
-        self._stepper = Stepper(controller)
-        self._refuse_conflicts(alone)
+        self._stepper, self._alone = Stepper(controller), alone
+        self._refuse_conflicts()
         self._senders: dict[str, Callable[[Any], None]] = {}
         for output in controller.outputs:
             qos = QoS(output.reliable, 10 if output.reliable else 1, output.latched)
@@ -105,7 +105,7 @@ class Runner:
         for service in controller.services:
             bus.serve(self.topics[service.name], service.request, service.response, self._answering(service))
 
-    def _refuse_conflicts(self, alone: bool) -> None:
+    def _refuse_conflicts(self) -> None:
         """Raise BusError where a topic carries another type, or an output has a publisher already."""
         present = {info.topic: info for info in self.bus.topics()}
         for name, topic, message in ends_of(self.controller, self.topics):
@@ -115,12 +115,23 @@ class Runner:
                     f"The topic {topic} carries {', '.join(info.types)}; the controller's '{name}' is "
                     f"{message.TYPE}.", f"map '{name}' to a topic of that type: --map {name}=/TOPIC",
                 )  # fmt: skip
-        for output in self.controller.outputs if alone else ():
+        for output in self.controller.outputs if self._alone else ():
             info = present.get(self.topics[output.name])
             if info is not None and info.publishers:
                 raise BusError(
                     f"The topic {info.topic} has the publisher {', '.join(info.publishers)} already: two would command "
                     "one robot.", f"stop that node, or map the output: --map {output.name}=/TOPIC",
+                )  # fmt: skip
+
+    def _refuse_others(self) -> None:
+        """Raise BusError where an output has a publisher beside this node's: one that was not seen when it began."""
+        present = {info.topic: info for info in self.bus.topics()} if self._alone else {}
+        for output in self.controller.outputs:
+            info = present.get(self.topics[output.name])
+            if info is not None and len(info.publishers) > 1:
+                raise BusError(
+                    f"The topic {info.topic} has the publishers {', '.join(sorted(info.publishers))}: two would command one "
+                    "robot.", f"stop the other node, or map the output: --map {output.name}=/TOPIC",
                 )  # fmt: skip
 
     def _answering(self, service: Service) -> Callable[[Message], Any]:
@@ -139,9 +150,11 @@ class Runner:
         """Step at the controller's rate until the time is over or ``stop`` is called; then send its rest.
 
         Raises:
+            BusError: when an output has another publisher by now; nothing was sent then.
             Exception: what a step, the bus or an observer raised, after the rest was sent.
             SystemExit: with 143 at SIGTERM, where nobody else handles it; KeyboardInterrupt at Ctrl-C.
         """
+        self._refuse_others()
         began = time.monotonic()
         try:
             with _ended_by_sigterm():

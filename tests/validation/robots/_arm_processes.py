@@ -72,8 +72,11 @@ class Process:
         return self.exit_code(timeout_s)
 
     def exit_code(self, timeout_s: float) -> int:
-        """Wait for its end, and return the exit code."""
-        code = self._process.wait(timeout_s)
+        """Wait for its end, and return the exit code; -1 where it does not end."""
+        try:
+            code = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return -1
         return 128 - code if code < 0 else code
 
     def __enter__(self) -> Process:
