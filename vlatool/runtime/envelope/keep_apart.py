@@ -106,8 +106,12 @@ def _path(now: Place, axes: Sequence[PositionAxis], samples: Sequence[Sample], i
     moving = [index for index, (_, phases, left) in enumerate(stops) if phases is not None and left > 0.0]
     if moving and count:
         offsets = [0.0 if samples[index].start is not None else axes[index].elapsed + interval for index in moving]
-        starts, phases = (np.array([stops[index][part] for index in moving]).T for part in (0, 1))
-        positions[2:, moving] = stop_positions(*starts, phases, np.array(offsets) + times[:, None])
+        (position, velocity, acceleration), phases = (
+            np.array([stops[index][part] for index in moving]).T for part in (0, 1)
+        )
+        positions[2:, moving] = stop_positions(
+            position, velocity, acceleration, phases, np.array(offsets) + times[:, None]
+        )
     return positions
 
 
