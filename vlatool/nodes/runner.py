@@ -129,10 +129,11 @@ class Runner:
         for output in self.controller.outputs:
             info = present.get(self.topics[output.name])
             if info is not None and len(info.publishers) > 1:
+                names = ", ".join(sorted(info.publishers))
                 raise BusError(
-                    f"The topic {info.topic} has the publishers {', '.join(sorted(info.publishers))}: two would command one "
-                    "robot.", f"stop the other node, or map the output: --map {output.name}=/TOPIC",
-                )  # fmt: skip
+                    f"The topic {info.topic} has the publishers {names}: two would command one robot.",
+                    f"stop the other node, or map the output: --map {output.name}=/TOPIC",
+                )
 
     def _answering(self, service: Service) -> Callable[[Message], Any]:
         return lambda request: self._stepper.calls.ask(service.name, request, service.answer_s)
