@@ -212,7 +212,9 @@ def read_report(path: Path) -> Report:
 
 
 def without_nan(value: Any) -> Any:
-    """Return a value that JSON can say: NaN and the infinities are null, tuples are lists."""
+    """Return a value that JSON can say: NaN and the infinities are null, tuples, arrays and their numbers are plain."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, dict):

@@ -75,6 +75,15 @@ class TestZenoh(NetworkBus):
             name = f"MP/%/%/robot/%cmd_vel/geometry_msgs::msg::dds_::Twist_/{rihs01(Twist)}/1:2:1,10:,:,:,,"
             assert any(token.endswith(name) for token in tokens)
 
+    def test_a_new_node_knows_the_others_at_once(self, open_node: Open) -> None:
+        """It meets them beside the router, after it is there: nobody may take a topic for free meanwhile."""
+        with opened(open_node, "router", "robot") as (_, robot):
+            robot.publisher("/cmd_vel", Twist, QUALITY)
+            for number in range(6):
+                with opened(open_node, f"later{number}") as (later,):
+                    known = {info.topic: info.publishers for info in later.topics()}
+                    assert known.get("/cmd_vel") == ("robot",)
+
     def test_foreign_type_that_appears_later_is_a_fault(self, open_node: Open) -> None:
         with opened(open_node, "robot", "other") as (robot, other):
             Heard(robot, "/cmd_vel")

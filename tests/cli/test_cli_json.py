@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 import typer
 from _acts import POLICY_YAML, policy
@@ -25,7 +26,7 @@ from _slots import bundle_of, install
 from safetensors.torch import load_file, save_file
 
 from vlatool.cli import app, main
-from vlatool.cli._document import document, output, report_document
+from vlatool.cli._document import document, json_text, output, report_document
 from vlatool.deployment.signature import new_key, sign
 from vlatool.deployment.store import Store
 from vlatool.errors import OutputError
@@ -457,3 +458,18 @@ def test_a_report_that_cannot_be_written_is_printed_with_the_error(vlatool, plac
 
 def test_rows_without_raw_samples_are_told_as_they_are() -> None:
     assert "raw_samples" not in report_document(Report("evaluate", "t", rows=(Row("a"),)), raw=False, file=None)
+
+
+@pytest.mark.parametrize(
+    ("value", "plain"),
+    [
+        (np.array([0.5, np.nan]), [0.5, None]),
+        (np.arange(4, dtype=np.int16).reshape(2, 2), [[0, 1], [2, 3]]),
+        (np.array([True, False]), [True, False]),
+        ((np.float32(0.25), np.float64("inf"), np.int64(3), np.bool_(True)), [0.25, None, 3, True]),
+        (np.zeros((0, 3)), []),
+    ],
+)
+def test_arrays_and_their_numbers_are_numbers_of_json(value: Any, plain: Any) -> None:
+    """Such as what a simulated robot says of itself."""
+    assert json.loads(json_text({"truth": {"": value}})) == {"truth": {"": plain}}

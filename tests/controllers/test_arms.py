@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from _arm_feed import Arm, Scripted, joint_state, spec_of
 
+from tests._arm_bundle import arm_bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.controllers import RobotController
 from vlatool.errors import DeadlineMissed, UsageError
@@ -17,6 +19,7 @@ from vlatool.messages.geometry_msgs import Point, Pose, PoseStamped
 from vlatool.messages.sensor_msgs import Image, JointState
 from vlatool.messages.std_msgs import Header, String
 from vlatool.messages.trajectory_msgs import JointTrajectory
+from vlatool.nodes.launch import PolicyOptions, open_controller
 from vlatool.registry import load, names
 from vlatool.runtime.kinematics import ARMS
 
@@ -164,6 +167,60 @@ def test_an_old_joint_state_stops_the_arm(repeated: bool) -> None:
     assert (hardest <= [joint.acceleration + 1e-6 for joint in arm.controller.ROBOT.limits().joints]).all()
 
 
+@pytest.mark.parametrize("away", [0.3, 2.0])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_an_arm_that_is_elsewhere_after_a_silence_is_commanded_from_where_it_is(name: str, away: float) -> None:
+    """Its driver, or the robot, started again: the last command is no place to leap to."""
+    arm = Arm(built(name, lambda seen: seen["state"], speed=0.4))
+    arm.until("acting")
+    arm.steps(5)
+    command = arm.steps(80, silent=True)
+    assert arm.state.envelope.at_rest()
+    assert "joint state" in command.status
+    assert not command.messages  # what starts again finds no command of before
+    limits = arm.controller.ROBOT.limits(0.4, arm.controller.margin_rad).joints
+    shifts = [0.0 if joint.command == "range" else away for joint in limits]
+    arm.positions = np.array([
+        value + shift if value + shift < joint.bounds[1] else max(value - shift, joint.bounds[0])
+        for value, shift, joint in zip(arm.positions, shifts, limits, strict=True)
+    ])  # fmt: skip
+    places = [arm.positions]
+    for _ in range(60):
+        arm.step()
+        places.append(arm.positions)
+    fastest, _ = differences(np.array(places), arm.controller.rate)
+    assert all(speed <= joint.velocity[1] + 1e-9 for speed, joint in zip(fastest, limits, strict=True)
+               if joint.command != "range")  # fmt: skip
+    assert arm.commands[-1].status.startswith("acting")
+    assert arm.state.envelope.position == pytest.approx(places[0], abs=1e-6)
+
+
+def test_an_arm_that_is_beyond_its_limits_after_a_silence_is_not_commanded_to_leap_back() -> None:
+    arm = Arm(built("franka", lambda seen: seen["state"], start_pose=(0, 0, 0, -0.2, 0, 1.5, 0), margin_rad=0.02))
+    arm.until("acting")
+    arm.steps(80, silent=True)
+    before = arm.state.envelope.position
+    beyond = np.array(before)
+    beyond[3] = 0.05
+    for _ in range(10):
+        command = arm.step(state=joint_state(arm.names, beyond, arm.time_s + 0.02))
+        assert "joint4 is at 0.05; its limits are" in command.status
+        assert not command.messages
+    arm.steps(3, state=None)
+    assert command.status.startswith("acting")
+
+
+def test_what_an_arm_lags_behind_its_command_is_no_reason_to_command_another_place() -> None:
+    arm = Arm(built("franka", lambda seen: seen["state"] * 0 + arm.positions.astype(np.float32)))
+    arm.until("acting")
+    arm.steps(5)
+    before = arm.state.envelope.position
+    arm.steps(80, silent=True)
+    sagging = joint_state(arm.names, arm.positions - 0.01, arm.time_s + 0.02)
+    arm.step(state=sagging)
+    assert arm.state.envelope.position == pytest.approx(before, abs=1e-6)
+
+
 def test_nothing_is_sent_before_the_first_good_joint_state() -> None:
     arm = Arm(built("franka"))
     command = arm.step(silent=True, calls=1)
@@ -191,6 +248,19 @@ def test_the_service_brings_the_arm_back_and_answers_when_it_is_there() -> None:
     fastest, hardest = differences(arm.path(), 50.0)
     assert (fastest <= 0.5 * math.pi + 1e-9).all()
     assert (hardest <= 3.0 + 1e-6).all()
+
+
+@pytest.mark.parametrize("speed", [0.1, 1.0])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_call_of_the_service_waits_for_the_longest_way(name: str, speed: float) -> None:
+    """From one end of all joints to the other."""
+    joints = built(name).ROBOT.limits(speed, built(name).margin_rad).joints
+    low, high = (tuple(joint.bounds[side] for joint in joints) for side in (0, 1))
+    arm = Arm(built(name, speed=speed, start_pose=high), low)
+    arm.step()
+    while arm.state.phase == "returning":
+        arm.steps(10)
+    assert arm.controller.services[0].answer_s > arm.time_s
 
 
 @pytest.mark.parametrize("act", [lambda seen: np.full(7, np.nan, np.float32), lambda seen: np.zeros(3, np.float32),
@@ -269,6 +339,20 @@ def test_the_arms_of_aloha_never_come_near_each_other() -> None:
     assert distance(arm.path()[-1:])[0] > 0.2
 
 
+def test_no_joint_of_aloha_changes_the_distance_faster_than_its_reach_says() -> None:
+    """What lets the envelope leave out distances: for any two poses, near ones and far ones."""
+    keep, random = built("aloha")._apart(), np.random.default_rng(6)
+    joints = load("controllers", "aloha").ROBOT.limits().joints
+    low, high = (np.array([joint.bounds[side] for joint in joints]) for side in (0, 1))
+    poses = random.uniform(low, high, (4000, 14))
+    poses[:2000] = np.array(load("controllers", "aloha").ROBOT.start) + random.uniform(-0.8, 0.8, (2000, 14))
+    others = poses + random.standard_normal((4000, 14)) * 10.0 ** random.uniform(-3, 0, (4000, 1))
+    changes = np.abs(keep.distance(poses) - keep.distance(others))
+    bounds = np.abs(poses - others) @ np.array(keep.reach_m)
+    assert (changes <= bounds + 1e-12).all()
+    assert (changes / bounds).max() > 0.3  # and it says no more than it must
+
+
 def test_a_way_that_is_not_free_ends_where_it_is_and_the_call_is_told() -> None:
     """The start pose of the right arm is behind the left one, which reaches across."""
     pose = np.array(load("controllers", "aloha").ROBOT.start)
@@ -297,6 +381,7 @@ def test_a_policy_sees_targets_cameras_and_an_instruction() -> None:
         "/wrist/image_raw",
         "/instruction",
     ]
+    assert [entry.name for entry in arm.controller.inputs if entry.required] == ["joints", "target", "wrist"]
     assert "no target" in arm.step().status
     assert "no target" not in (status := arm.step(target=PoseStamped(pose=Pose(Point(0.1, 0.2, 0.3)))).status)
     assert "camera wrist: no image" in status
@@ -354,3 +439,29 @@ def test_without_a_policy_it_does_not_start() -> None:
     with pytest.raises(UsageError, match="--bundle"):
         controller.start()
     assert not controller.rest().messages
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a policy of a Panda that asks for where the arm is."""
+    folder = tmp_path_factory.mktemp("arm") / "bundle"
+    arm_bundle(folder)
+    return folder
+
+
+@pytest.mark.parametrize("robot", ["", "franka-panda"])
+def test_a_policy_acts_after_each_return_to_the_start_pose(bundle: Path, robot: str) -> None:
+    """Limits are kept once: what it said before the arm went back holds it nowhere."""
+    controller = open_controller("franka", {"return_at_start": False}, PolicyOptions(bundle, robot, deadline_ms=0))
+    arm = Arm(controller, np.array(controller.ROBOT.start) + 0.4)
+    for _ in range(2):
+        arm.until("acting")
+        commands = [arm.step() for _ in range(30)]
+        assert {command.status for command in commands[1:]} == {"acting"}
+        arm.step(calls=1)
+    assert arm.positions == pytest.approx(controller.ROBOT.start, abs=0.01)
+
+
+def test_another_robot_than_that_of_the_controller_is_refused(bundle: Path) -> None:
+    with pytest.raises(UsageError, match=r"keeps the limits of franka-panda, and --robot is ur5e"):
+        open_controller("franka", {}, PolicyOptions(bundle, "ur5e"))

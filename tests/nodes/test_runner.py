@@ -11,7 +11,7 @@ import pytest
 
 from tests._point_robot import Exchange, Failing, GoTo, MemoryBus, collect
 from vlatool.buses import QoS
-from vlatool.controllers import Command
+from vlatool.controllers import Command, Service
 from vlatool.errors import BusError, DataError, UsageError
 from vlatool.messages.geometry_msgs import Twist, Vector3
 from vlatool.messages.nav_msgs import Odometry
@@ -148,6 +148,15 @@ def test_call_that_no_step_answers(exchange):
     assert runner._stepper.calls.take() == ()
 
 
+def test_a_call_waits_as_long_as_its_service_says(exchange, others):
+    class Impatient(GoTo):
+        services = (Service("halt", "/halt", Bool, Bool, answer_s=0.01),)
+
+    runner_of(exchange, Impatient())
+    with pytest.raises(BusError, match=r"no step answered within 0\.01 s"):
+        others.call("/halt", Bool(True), Bool, 1)
+
+
 def test_too_many_calls_are_refused(exchange):
     calls = runner_of(exchange, GoTo())._stepper.calls
     for _ in range(64):
@@ -162,6 +171,19 @@ def test_another_publisher_is_refused(exchange, others):
         runner_of(exchange, GoTo())
     runner_of(exchange, GoTo(), topics={"cmd": "/other/cmd_vel"})
     runner_of(exchange, GoTo(), alone=False)
+
+
+def test_another_publisher_that_is_seen_late_is_refused_before_the_first_step(exchange, others):
+    """Networks list other nodes after a while: a controller that starts beside another one must not miss it."""
+    sent = collect(others, "/cmd_vel", Twist)
+    runner = runner_of(exchange, GoTo(rate_hz=100))
+    others.publisher("/cmd_vel", Twist, QoS())
+    with pytest.raises(BusError, match=r"/cmd_vel has the publishers others, vlatool_test: two would command one"):
+        runner.run(0.1)
+    assert not sent
+    assert runner.summary.steps == 0
+    runner_of(exchange, GoTo(rate_hz=100), alone=False).run(0.02)
+    assert sent
 
 
 def test_another_type_is_refused(exchange, others):

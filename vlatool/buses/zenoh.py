@@ -24,6 +24,9 @@ from vlatool.messages.type_hash import rihs01, service_rihs01
 M = TypeVar("M", bound=Message)
 SERVICE_QOS = QoS(reliable=True, depth=10)
 """ROS 2's quality of service for services (rmw_qos_profile_services_default)."""
+DISCOVERY_S = 0.25
+"""How long the nodes that the router names may take to be connected, and with them what they publish; then it is
+known who is on a topic."""
 HEARTBEAT_S = 0.5
 """Period at which a latched publisher repeats the number of its last message, so that a lost one is asked for."""
 
@@ -46,6 +49,7 @@ class Zenoh(GraphBus):
         super().__init__(node)
         self._domain = domain_id()
         self._session = open_session(address)
+        self._opened_s = time.monotonic()
         self._zenoh: Any = require("zenoh", "zenoh")
         self._advanced: Any = require("zenoh.ext", "zenoh")
         self._id = str(self._session.info.zid())
@@ -149,6 +153,9 @@ class Zenoh(GraphBus):
         if refusal and refusal != "Timeout":
             raise BusError(f"The service {name} refused: {refusal}.", "see the node that serves it")
         raise BusError(f"{name} did not answer within {timeout_s:g} s.", "see the node that serves it")
+
+    def _discover(self) -> None:
+        time.sleep(max(0.0, self._opened_s + DISCOVERY_S - time.monotonic()))
 
     def _leave_transport(self) -> None:
         self._graph.close()

@@ -29,6 +29,8 @@ from vlatool.runtime.envelope import Envelope, KeepApart, Level, RobotLimits
 Array = NDArray[Any]
 ATTEMPTS = 3
 """Ways to the start pose that the envelope may end before it stays where it is."""
+QUIET_S = 0.5
+"""Time without a joint state after which an arm at rest is commanded no longer, in seconds."""
 STOP_SHARE = 0.1
 """Margins of position by which a measured joint may be beyond its limit and still begin at it."""
 SETTINGS = """Args:
@@ -103,11 +105,22 @@ class ArmController:
         return start_pose(self.ROBOT, self.start_pose, self._limits)
 
     @cached_property
+    def _longest_return_s(self) -> float:
+        """Seconds from one end of all joints to the other, each attempt with a stop before it, and some to spare."""
+        low, high = (tuple(joint.bounds[side] for joint in self._limits.joints) for side in (0, 1))
+        return 2.0 * ATTEMPTS * plan_return(low, high, self._limits, 0.0).duration_s + 5.0
+
+    @cached_property
     def _sees(self) -> ArmPolicy:
         if self.policy is None:
             raise UsageError(f"{self.ROBOT.name} has no policy; allowed: one that vlatool.load returned.",
                              "name a bundle: --bundle DIR")  # fmt: skip
         return policy_of(self.policy.spec, self.ROBOT)
+
+    @property
+    def limits_of(self) -> str:
+        """The robot whose limits all commands keep; no further envelope is around the policy."""
+        return self.ROBOT.name
 
     @property
     def rate_hz(self) -> float:
@@ -128,7 +141,9 @@ class ArmController:
     @property
     def services(self) -> tuple[Service, ...]:
         """The way to the start pose."""
-        return (Service("return_to_start", "~/return_to_start", TriggerRequest, TriggerResponse),)
+        return (
+            Service("return_to_start", "~/return_to_start", TriggerRequest, TriggerResponse, self._longest_return_s),
+        )
 
     def start(self) -> ArmState:
         """Return the state before the first joint state; the policy is reset.
@@ -222,30 +237,44 @@ class ArmController:
     ) -> tuple[list[float] | None, ArmState]:
         """Return the positions that are wanted, in the order of the robot, or None for the next step of the stop."""
         if measured is None:
-            return None, state._replace(way=None, detail=problem)
-        late = self._lagging(envelope, measured)
+            since_s = snapshot.time_s if state.silent_since_s is None else state.silent_since_s
+            return None, state._replace(way=None, detail=problem, silent_since_s=since_s)
+        resumes = state.silent_since_s is not None and envelope.at_rest()
+        late = self._lagging(envelope, measured, resumes)
         if late:
-            state = self._begin_again(state, measured) if envelope.at_rest() else state
-            return None, state._replace(way=None, detail=late)
+            at_rest = envelope.at_rest()
+            state = self._begin_again(state, measured, late) if at_rest else state._replace(detail=late)
+            return None, state._replace(way=None)
+        state = state._replace(silent_since_s=None)
         if state.phase == RETURNING:
             return self._return(snapshot, state, envelope)
         if state.phase == HALT:
             return None, state
         return self._act(snapshot, state, envelope, measured)
 
-    def _lagging(self, envelope: Envelope, measured: Array) -> str:
-        """Return which joint is far from its command; empty if none is."""
+    def _lagging(self, envelope: Envelope, measured: Array, resumes: bool) -> str:
+        """Return which joint is far from its command; empty if none is.
+
+        Args:
+            resumes: Whether there were no joint states until now, and the arm stands: a command from which a joint is
+                farther than it goes in the time of a command would then let it leap.
+        """
         for joint, name, value, commanded in zip(
             self._limits.joints, self._names, measured.tolist(), envelope.position, strict=True
         ):
-            if joint.command != "range" and abs(value - commanded) > self.max_lag_rad:
+            if joint.command == "range":
+                continue
+            most = min(self.max_lag_rad, joint.velocity[1] * self._lead_s) if resumes else self.max_lag_rad
+            if abs(value - commanded) > most:
                 return f"{name} is {abs(value - commanded):.2f} {joint.unit} from its command"
         return ""
 
-    def _begin_again(self, state: ArmState, measured: Array) -> ArmState:
-        """Command what is measured: an arm that something else moved stays where it is."""
-        again, _ = self._begin(measured, state.last_s + 1.0 / self.rate, state)
-        return again._replace(phase=state.phase, attempts=state.attempts)
+    def _begin_again(self, state: ArmState, measured: Array, why: str) -> ArmState:
+        """Command what is measured: an arm that something else moved stays where it is, unless it is out of limits."""
+        again, problem = self._begin(measured, state.last_s + 1.0 / self.rate, state)
+        if again.envelope is state.envelope:
+            return state._replace(detail=problem)
+        return again._replace(phase=state.phase, attempts=state.attempts, silent_since_s=None, detail=why)
 
     def _return(self, snapshot: Snapshot, state: ArmState, envelope: Envelope) -> tuple[list[float] | None, ArmState]:
         way, now = state.way, snapshot.time_s
@@ -280,6 +309,7 @@ class ArmController:
         measured: Array | None,
     ) -> tuple[Command, ArmState]:
         """Let the envelope answer, and put its positions into messages."""
+        quiet = self._is_quiet(snapshot, state, envelope)
         result = envelope.step(wanted, elapsed_s=snapshot.time_s - state.last_s)
         state = state._replace(last_s=snapshot.time_s)
         if state.way is not None and wanted is not None and result.level >= Level.CRITICAL:
@@ -289,9 +319,17 @@ class ArmController:
         answers, state = self._answers(state)
         checks = ",".join(result.checks)
         status = ": ".join(part for part in (state.phase, state.detail or checks) if part)
-        messages = command_messages(self.output, self._names, envelope.position, snapshot.stamp, self._lead_s)
+        messages = (
+            {} if quiet
+            else command_messages(self.output, self._names, envelope.position, snapshot.stamp, self._lead_s)
+        )  # fmt: skip
         notes = self._notes(envelope, measured, checks)
         return Command(messages, answers, status, notes), state
+
+    def _is_quiet(self, snapshot: Snapshot, state: ArmState, envelope: Envelope) -> bool:
+        """Return whether nothing is sent: a robot that starts again elsewhere must not find a command of before."""
+        since_s = state.silent_since_s
+        return since_s is not None and snapshot.time_s - since_s > QUIET_S and envelope.at_rest()
 
     @property
     def _lead_s(self) -> float:

@@ -47,12 +47,12 @@ class ArmPolicy(NamedTuple):
     ranges: tuple[bool, ...]
 
     def inputs(self, robot: ArmRobot) -> tuple[Input, ...]:
-        """Return the topics that the policy needs, beside those of the joints."""
+        """Return the topics that the policy needs, beside those of the joints; it acts when all of them are there."""
         targets = [
-            Input(_target_of(arm), f"/{arm}/target" if arm else "/target", PoseStamped, required=False)
+            Input(_target_of(arm), f"/{arm}/target" if arm else "/target", PoseStamped)
             for arm in (robot.chains if self.targets else ())
         ]
-        cameras = [Input(name, f"/{name}/image_raw", Image, required=False) for name in self.cameras]
+        cameras = [Input(name, f"/{name}/image_raw", Image) for name in self.cameras]
         texts = [Input("instruction", "/instruction", String, required=False, reliable=True, latched=True)]
         return (*targets, *cameras, *(texts if self.text else ()))
 

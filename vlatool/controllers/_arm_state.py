@@ -25,6 +25,7 @@ class ArmState(NamedTuple):
         changes: When each input last changed.
         last_s: Time of the last command, in seconds of the snapshots.
         calls: Numbers of the calls that wait for the start pose.
+        silent_since_s: When there was last no joint state that it can use, and none since; None while there are some.
     """
 
     phase: str = WAITING
@@ -35,3 +36,4 @@ class ArmState(NamedTuple):
     changes: Changes = {}
     last_s: float = 0.0
     calls: tuple[int, ...] = ()
+    silent_since_s: float | None = None

@@ -28,7 +28,7 @@ class Input:
         topic: Topic, unless the user maps another.
         message: Class of its messages.
         depth: How many of the messages that came since the last step a snapshot holds; 1 for the newest alone.
-        required: Whether the controller does nothing until a message has come.
+        required: Whether the controller, or its policy, does nothing until a message has come.
         reliable: Whether the transport repeats what is lost; sensors do not ask for it.
         latched: Whether a message of before the start is wanted (ROS 2: transient local).
     """
@@ -62,12 +62,14 @@ class Service:
         service: Name on the bus, unless the user maps another.
         request: Class of its requests.
         response: Class of its responses.
+        answer_s: How long a caller waits for a step that answers, in seconds; then the call fails.
     """
 
     name: str
     service: str
     request: type[Message]
     response: type[Message]
+    answer_s: float = 5.0
 
 
 class Reading(NamedTuple):

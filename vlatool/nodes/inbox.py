@@ -9,8 +9,6 @@ from vlatool.controllers import Reading, Request
 from vlatool.errors import BusError
 from vlatool.messages import Message
 
-ANSWER_S = 5.0
-"""How long a caller of a service waits for a step that answers it, in seconds."""
 MAX_CALLS = 64
 """Calls of services that wait at a time; more than that are refused at once."""
 
@@ -67,7 +65,7 @@ class Calls:
         self._count = 0
         self._ended = False
 
-    def ask(self, service: str, message: Message, timeout_s: float = ANSWER_S) -> Message:
+    def ask(self, service: str, message: Message, timeout_s: float) -> Message:
         """Return the answer to a call.
 
         Raises:

@@ -33,7 +33,8 @@ class PolicyOptions:
 
     Args:
         bundle: The bundle; None for a controller without one.
-        robot: Robot whose limits no action leaves; empty for none.
+        robot: Robot whose limits no action leaves; empty for none. A controller with limits of its own
+            (``limits_of``) keeps them, and takes no other robot.
         deadline_ms: Time in which a step has its action; ``DEADLINE_SHARE`` of the period when None; 0 for none, as in
             a simulation, whose clock is not that of the processor.
         neutral: Label of the discrete action without motion.
@@ -99,9 +100,7 @@ def open_policy(options: PolicyOptions, controller: Any) -> Any:
         raise TypeError("a policy is opened from a bundle")
     spec = Bundle.open(options.bundle).manifest.spec
     limit_ms = deadline_of(options.deadline_ms, controller, spec)
-    robot = robot_name(options.robot)
-    if robot:
-        RobotLimits.named(robot)
+    robot = _robot_of(options, controller)
     opening: dict[str, Any] = {"engine": options.engine, "threads": options.threads, "seed": options.seed}
     if spec.action.kind == "discrete" and not (options.neutral or {*spec.action.labels} & {*NO_MOTION}):
         policy = load(options.bundle, **opening)
@@ -114,6 +113,20 @@ def open_policy(options: PolicyOptions, controller: Any) -> Any:
         deadline_ms=limit_ms,
         fallback=Fallback(neutral=options.neutral) if limit_ms is not None else None,
     )
+
+
+def _robot_of(options: PolicyOptions, controller: Any) -> str:
+    """Return the robot whose limits the policy's actions are to keep; empty where the controller keeps them itself.
+
+    A second envelope would know nothing of what the controller does between two actions, such as a way to a start pose.
+    """
+    robot, kept = robot_name(options.robot), getattr(controller, "limits_of", "")
+    if robot:
+        RobotLimits.named(robot)
+    if robot and kept and robot != kept:
+        raise UsageError(f"The controller keeps the limits of {kept}, and --robot is {robot}.",
+                         f"leave --robot out, or name {kept}")  # fmt: skip
+    return "" if kept else robot
 
 
 def deadline_of(deadline_ms: float | None, controller: Any, spec: PolicySpec) -> float | None:

@@ -96,8 +96,8 @@ class Runner:
         """Input, output or service -> topic, as the bus calls it: a launch file of ROS may remap it."""
         self.summary = RunSummary()
         self._observers, self._stop = tuple(observers), threading.Event()
-        self._stepper = Stepper(controller)
-        self._refuse_conflicts(alone)
+        self._stepper, self._alone = Stepper(controller), alone
+        self._refuse_conflicts()
         self._senders: dict[str, Callable[[Any], None]] = {}
         for output in controller.outputs:
             qos = QoS(output.reliable, 10 if output.reliable else 1, output.latched)
@@ -110,7 +110,7 @@ class Runner:
         for service in controller.services:
             bus.serve(self.written_topics[service.name], service.request, service.response, self._answering(service))
 
-    def _refuse_conflicts(self, alone: bool) -> None:
+    def _refuse_conflicts(self) -> None:
         """Raise BusError where a topic carries another type, or an output has a publisher already."""
         present = {info.topic: info for info in self.bus.topics()}
         for name, topic, message in ends_of(self.controller, self.topics):
@@ -120,7 +120,7 @@ class Runner:
                     f"The topic {topic} carries {', '.join(info.types)}; the controller's '{name}' is "
                     f"{message.TYPE}.", f"map '{name}' to a topic of that type: --map {name}=/TOPIC",
                 )  # fmt: skip
-        for output in self.controller.outputs if alone else ():
+        for output in self.controller.outputs if self._alone else ():
             info = present.get(self.topics[output.name])
             if info is not None and info.publishers:
                 raise BusError(
@@ -128,8 +128,20 @@ class Runner:
                     "one robot.", f"stop that node, or map the output: --map {output.name}=/TOPIC",
                 )  # fmt: skip
 
+    def _refuse_others(self) -> None:
+        """Raise BusError where an output has a publisher beside this node's: one that was not seen when it began."""
+        present = {info.topic: info for info in self.bus.topics()} if self._alone else {}
+        for output in self.controller.outputs:
+            info = present.get(self.topics[output.name])
+            if info is not None and len(info.publishers) > 1:
+                names = ", ".join(sorted(info.publishers))
+                raise BusError(
+                    f"The topic {info.topic} has the publishers {names}: two would command one robot.",
+                    f"stop the other node, or map the output: --map {output.name}=/TOPIC",
+                )
+
     def _answering(self, service: Service) -> Callable[[Message], Any]:
-        return lambda request: self._stepper.calls.ask(service.name, request)
+        return lambda request: self._stepper.calls.ask(service.name, request, service.answer_s)
 
     def missing(self, timeout_s: float) -> tuple[str, ...]:
         """Wait until each required input has a publisher; return the topics without one after this many seconds."""
@@ -146,9 +158,11 @@ class Runner:
         """Step at the controller's rate until the time is over or ``stop`` is called; then send its rest.
 
         Raises:
+            BusError: when an output has another publisher by now; nothing was sent then.
             Exception: what a step, the bus or an observer raised, after the rest was sent.
             SystemExit: with 143 at SIGTERM, where nobody else handles it; KeyboardInterrupt at Ctrl-C.
         """
+        self._refuse_others()
         began = time.monotonic()
         try:
             with _ended_by_sigterm():

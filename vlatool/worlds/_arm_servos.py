@@ -56,16 +56,16 @@ class TorqueServos:
         self._mujoco, self._model = mujoco, model
         self._controls = _actuators(model, joints)
         self._places, self._speeds = model.jnt_qposadr[list(joints)], model.jnt_dofadr[list(joints)]
-        self._inertia = np.zeros((model.nv, model.nv))
-        self._range = model.actuator_ctrlrange[self._controls]
+        self._inertia, self._square = np.zeros((model.nv, model.nv)), np.ix_(self._speeds, self._speeds)
+        self._least, self._most = model.actuator_ctrlrange[self._controls].T
 
     def control(self, data: Any, positions: Array, velocities: Array) -> None:
         """Set the controls for positions and velocities (A,)."""
         self._mujoco.mj_fullM(self._model, self._inertia, data.qM)
         error, slip = positions - data.qpos[self._places], velocities - data.qvel[self._speeds]
         wanted = BANDWIDTH**2 * error + 2.0 * BANDWIDTH * slip
-        torques = self._inertia[np.ix_(self._speeds, self._speeds)] @ wanted + data.qfrc_bias[self._speeds]
-        data.ctrl[self._controls] = np.clip(torques, self._range[:, 0], self._range[:, 1])
+        torques = self._inertia[self._square] @ wanted + data.qfrc_bias[self._speeds]
+        data.ctrl[self._controls] = np.minimum(np.maximum(torques, self._least), self._most)
 
 
 def _actuators(model: Any, joints: Sequence[int]) -> list[int]:

@@ -106,6 +106,7 @@ class ArmWorld:
             raise UsageError(f"spread is {self.spread!r}; allowed: 0 to 1 rad.", "change spread")
         self._mujoco = load_mujoco()
         self._model = compile_model(self.SETUP.file.find(self.models), self.contacts)
+        self._step_s = float(self._model.opt.timestep)
         self._names = tuple(self.SETUP.joints)
         self._joints = [self._joint(name) for name in self.SETUP.joints.values()]
         self._mirrors = [(self._joint(m.joint), self._names.index(m.of), m.factor) for m in self.SETUP.mirrors]
@@ -131,7 +132,7 @@ class ArmWorld:
     @property
     def time_s(self) -> float:
         """Simulated time since the reset, in seconds."""
-        return self._ticks * float(self._model.opt.timestep)
+        return self._ticks * self._step_s
 
     def reset(self, seed: int) -> None:
         """Start again, near the start pose, at rest; where each joint is, and the noise, are of this seed."""
@@ -146,16 +147,18 @@ class ArmWorld:
         for joint, of, factor in self._mirrors:
             self._data.qpos[self._model.jnt_qposadr[joint]] = factor * positions[of]
         self._setpoint = Setpoint(positions)
+        self._wanted = np.zeros((2, len(positions) + len(self._mirrors)))
         faults = (self._knobs["delay"], self._knobs["drop"], self._knobs["freeze"], np.random.default_rng([seed, 2]))
         self._outbox, self._ticks, self._sent, self._refused = Outbox(*faults), 0, 0, ""
         self._mujoco.mj_forward(self._model, self._data)
         self._lowest, self._highest = positions.copy(), positions.copy()
         self._fastest = np.zeros(len(positions))
-        self._least = self._distance.measure(self._data) if self._distance else float("inf")
+        self._measured = (-1, float("inf"))
+        self._least = self._distance_now()
 
     def advance(self, seconds: float) -> None:
         """Simulate this much time, in steps of the model."""
-        end = self._ticks + round(seconds / self._model.opt.timestep)
+        end = self._ticks + round(seconds / self._step_s)
         while self._ticks < end:
             self._tick()
             if self.time_s * self.rate >= self._sent + 1 - 1e-9:
@@ -163,22 +166,25 @@ class ArmWorld:
                 self._report()
 
     def _tick(self) -> None:
-        data = self._data
+        data, count = self._data, len(self._names)
         positions, velocities = self._setpoint.at(self.time_s)
         if self._mirrors:
-            positions = np.append(positions, [factor * positions[of] for _, of, factor in self._mirrors])
-            velocities = np.append(velocities, [factor * velocities[of] for _, of, factor in self._mirrors])
+            wanted, speeds = self._wanted
+            wanted[:count], speeds[:count] = positions, velocities
+            for place, (_, of, factor) in enumerate(self._mirrors, count):
+                wanted[place], speeds[place] = factor * positions[of], factor * velocities[of]
+            positions, velocities = wanted, speeds
         self._servos.control(data, positions, velocities)
         advance_model(self._mujoco, self._model, data)
         self._ticks += 1
         reached = data.qpos[self._places]
-        self._lowest, self._highest = np.minimum(self._lowest, reached), np.maximum(self._highest, reached)
-        self._fastest = np.maximum(self._fastest, np.abs(data.qvel[self._speeds]))
+        np.minimum(self._lowest, reached, out=self._lowest)
+        np.maximum(self._highest, reached, out=self._highest)
+        np.maximum(self._fastest, np.abs(data.qvel[self._speeds]), out=self._fastest)
 
     def _report(self) -> None:
         data = self._data
-        if self._distance is not None:
-            self._least = min(self._least, self._distance.measure(data))
+        self._least = min(self._least, self._distance_now())
         noise = self._knobs["noise"].get("joints", 0.0)
         positions = data.qpos[self._places] + (noise * self._random.standard_normal(len(self._names)) if noise else 0.0)
         message = JointState(
@@ -186,6 +192,14 @@ class ArmWorld:
             data.qfrc_actuator[self._speeds].copy(),
         )  # fmt: skip
         self._outbox.put("joints", SENSORS["joints"].topic, message, self.time_s)
+
+    def _distance_now(self) -> float:
+        """Return the distance of two arms in metres, infinity for one; it is computed once in a step."""
+        if self._distance is None:
+            return float("inf")
+        if self._measured[0] != self._ticks:
+            self._measured = self._ticks, self._distance.measure(self._data)
+        return self._measured[1]
 
     def reports(self) -> list[tuple[str, Message]]:
         """Return the joint states that arrived since the last call, in order."""
@@ -241,7 +255,7 @@ class ArmWorld:
             "refused": self._refused,
         }  # fmt: skip
         if self._distance is not None:
-            values["distance_m"] = self._distance.measure(data)
+            values["distance_m"] = self._distance_now()
             values["least_distance_m"] = min(self._least, values["distance_m"])
         return values
 

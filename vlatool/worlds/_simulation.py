@@ -42,6 +42,8 @@ def advance_model(mujoco: Any, model: Any, data: Any) -> None:
         InputError: when the simulation is unstable: MuJoCo would start again from its first pose and go on.
     """
     mujoco.mj_step(model, data)
+    if not data.warning.number.any():
+        return
     kinds = mujoco.mjtWarning
     if any(data.warning[kind].number for kind in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)):
         raise InputError(

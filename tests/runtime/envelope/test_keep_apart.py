@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from _two_arms import two_arms
@@ -55,6 +57,41 @@ def test_random_commands_never_bring_the_arms_nearer() -> None:
         ]
 
     assert distance(np.array(drive(envelope, 250, ask))).min() >= 0.15 - 1e-6
+
+
+class Forgetful(KeepApart):
+    """Computes the distance at each step, whatever it knows."""
+
+    def allows(self, *arguments: Any) -> bool:
+        self._measured.clear()
+        return super().allows(*arguments)
+
+
+def test_a_distance_that_is_known_saves_time_and_changes_no_command() -> None:
+    distance, calls = two_arms(), []
+
+    def counted(positions: np.ndarray) -> np.ndarray:
+        calls.append(len(positions))
+        return distance(positions)
+
+    paths, counts = [], []
+    for kind in (KeepApart, Forgetful):
+        random = np.random.default_rng(4)
+        goals = random.uniform(-2.5, 2.5, (12, 2))
+        goals[::3] = [[0.0, 0.0]] * 4  # towards each other
+        envelope = Envelope(LIMITS, PERIOD, apart=kind(counted, 0.15, (0.5, 0.5)))
+        envelope.start([1.0, 1.0])
+        calls.clear()
+
+        def ask(step: int, at: tuple[float, ...], goals: np.ndarray = goals) -> list[float]:
+            steps = np.clip(goals[step // 50] - np.array(at), -0.038, 0.038)
+            return (np.array(at) + steps).tolist()
+
+        paths.append(drive(envelope, 600, ask))
+        counts.append(len(calls))
+    assert paths[0] == paths[1]
+    assert counts[0] < 0.7 * counts[1]
+    assert distance(np.array(paths[0])).min() < 0.25  # they did come near
 
 
 def test_from_too_near_only_ways_apart_are_allowed() -> None:

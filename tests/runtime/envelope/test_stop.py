@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vlatool.runtime.envelope import Envelope, RobotLimits
-from vlatool.runtime.envelope.stop import stop_phases, stop_range, stop_state
+from vlatool.runtime.envelope.stop import stop_phases, stop_positions, stop_range, stop_state
 
 LIMITS = ((2.0, 8.0), (15.0, 7500.0), (1.0, 100.0), (5.0, 3.0))
 
@@ -96,3 +96,15 @@ def test_no_stop_is_longer_than_that_of_ruckig():
         trajectory = ruckig.Trajectory(1)
         assert ruckig.Ruckig(1).calculate(wanted, trajectory) == ruckig.Result.Working
         assert sum(stop_phases(velocity, acceleration, most, jerk)[:3]) <= 1.001 * trajectory.duration + 1e-9
+
+
+def test_many_stops_at_many_times_are_each_of_them_bit_for_bit():
+    cases = starts(200)
+    begin = np.random.default_rng(3).uniform(-2, 2, len(cases))
+    phases = [stop_phases(*case) for case in cases]
+    ends = np.array([sum(each[:3]) for each in phases])
+    times = np.linspace(0.0, 1.2, 9)[:, None] * ends
+    found = stop_positions(begin, *np.array(cases).T[:2], np.array(phases).T, times)
+    for column, ((velocity, acceleration, _, _), each) in enumerate(zip(cases, phases, strict=True)):
+        start = (float(begin[column]), velocity, acceleration)
+        assert found[:, column].tolist() == [stop_state(*start, each, float(t))[0] for t in times[:, column]]

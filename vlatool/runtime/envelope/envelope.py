@@ -196,7 +196,7 @@ class Envelope:
     def copy(self) -> Envelope:
         """Return an envelope that goes on from here by itself, as this one would."""
         twin = copy.copy(self)
-        twin._axes = [copy.copy(axis) for axis in self._axes]
+        twin._axes = [axis.copy() for axis in self._axes]
         return twin
 
     def emergency(self, reason: str = "emergency") -> None:

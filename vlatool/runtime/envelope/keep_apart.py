@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import ceil
 from typing import Any
 
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from vlatool.runtime.arguments import check_positive
 from vlatool.runtime.envelope.axis import PositionAxis, Sample
-from vlatool.runtime.envelope.stop import Phases, stop_phases, stop_state
+from vlatool.runtime.envelope.stop import Phases, stop_phases, stop_positions
 
 Array = NDArray[Any]
+Place = tuple[float, ...]
 MAX_POINTS = 24
 """Points of a stop that are looked at; a longer one is looked at less closely."""
 ROUNDING = 1e-9
@@ -28,7 +29,7 @@ class KeepApart:
         distance: Returns distances in metres (K,) for positions (K, A) of the joints, in the order of the envelope.
         minimum_m: Least distance. It is one of commands: add what the robot lags behind them.
         reach_m: For each joint, how much the distance can change at most when it turns by 1 rad, in metres: with it,
-            most ways are allowed without computing the distance along them. None where nobody knows.
+            most ways are allowed without computing a distance. None where nobody knows.
         step_s: Time between two positions of a stop at which it is computed, in seconds.
 
     Raises:
@@ -39,6 +40,11 @@ class KeepApart:
     minimum_m: float
     reach_m: tuple[float, ...] | None = None
     step_s: float = 0.02
+    _measured: list[tuple[Place, float, bool]] = field(default_factory=list, init=False, repr=False, compare=False)
+    """The place whose distance was computed last, that distance, and whether the way had to be looked at.
+
+    It changes how fast answers are, never which.
+    """
 
     def __post_init__(self) -> None:
         check_positive("minimum_m", self.minimum_m, "a number of metres")
@@ -54,31 +60,64 @@ class KeepApart:
             samples: The command, with the stop of each axis.
             interval: Time from the last command, in seconds.
         """
-        now = np.array([axis.value for axis in axes])
-        if self.reach_m is not None:
-            ways = [
-                reach * max(sample.high - axis.value, axis.value - sample.low)
-                for axis, sample, reach in zip(axes, samples, self.reach_m, strict=True)
-            ]
-            if float(self.distance(now[None])[0]) - sum(ways) >= self.minimum_m:
+        now = tuple(axis.value for axis in axes)
+        way = self._longest_way(axes, samples)
+        if self._at_least(now) - way >= self.minimum_m + ROUNDING:
+            return True
+        near = self._measured[-1][2] if self._measured else self.reach_m is None
+        if not near:
+            here = float(self.distance(np.array([now]))[0])
+            self._measured[:] = [(now, here, here - way < self.minimum_m)]
+            if here - way >= self.minimum_m:
                 return True
-        stops = [_stop_of(axis, sample, interval) for axis, sample in zip(axes, samples, strict=True)]
-        longest = max(left for _, _, left in stops)
-        count = min(ceil(longest / self.step_s), MAX_POINTS - 2)
-        times = np.linspace(0.0, longest, count + 1)[1:] if count else np.empty(0)
-        positions = np.empty((len(times) + 2, len(axes)))
-        for index, (axis, sample, (start, phases, left)) in enumerate(zip(axes, samples, stops, strict=True)):
-            positions[:2, index] = now[index], sample.value
-            offset = 0.0 if sample.start is not None else axis.elapsed + interval
-            for row, time in enumerate(times.tolist(), 2):
-                still = phases is None or left <= 0.0
-                positions[row, index] = sample.value if still else stop_state(*start, phases, offset + time)[0]
-        distances = self.distance(positions)
-        limit = min(self.minimum_m, float(distances[0]))
-        return bool(np.min(distances) >= limit - ROUNDING)
+        distances = self.distance(_path(now, axes, samples, interval, self.step_s))
+        here = float(distances[0])
+        self._measured[:] = [(now, here, here - way < self.minimum_m)]
+        return here - way >= self.minimum_m or bool(np.min(distances) >= min(self.minimum_m, here) - ROUNDING)
+
+    def _longest_way(self, axes: Sequence[PositionAxis], samples: Sequence[Sample]) -> float:
+        """Return by how much the distance can change at most until the stop ends, in metres; infinity if unknown."""
+        if self.reach_m is None:
+            return float("inf")
+        return sum(
+            reach * max(sample.high - axis.value, axis.value - sample.low)
+            for axis, sample, reach in zip(axes, samples, self.reach_m, strict=True)
+        )
+
+    def _at_least(self, place: Place) -> float:
+        """Return a distance that is not above that of a place, by the one that was computed last."""
+        if self.reach_m is None or not self._measured:
+            return -float("inf")
+        ((before, distance, _),) = self._measured
+        return distance - sum(
+            reach * abs(one - other) for reach, one, other in zip(self.reach_m, place, before, strict=True)
+        )
 
 
-def _stop_of(axis: PositionAxis, sample: Sample, interval: float) -> tuple[tuple[float, float, float], Any, float]:
+def _path(now: Place, axes: Sequence[PositionAxis], samples: Sequence[Sample], interval: float, step_s: float) -> Array:
+    """Return positions (K, A): where the axes are, the command, and the stop behind it at ``step_s`` or wider."""
+    stops = [_stop_of(axis, sample, interval) for axis, sample in zip(axes, samples, strict=True)]
+    longest = max(left for _, _, left in stops)
+    count = min(ceil(longest / step_s), MAX_POINTS - 2)
+    times = np.linspace(0.0, longest, count + 1)[1:] if count else np.empty(0)
+    positions = np.empty((len(times) + 2, len(axes)))
+    positions[0] = now
+    positions[1:] = [sample.value for sample in samples]
+    moving = [index for index, (_, phases, left) in enumerate(stops) if phases is not None and left > 0.0]
+    if moving and count:
+        offsets = [0.0 if samples[index].start is not None else axes[index].elapsed + interval for index in moving]
+        (position, velocity, acceleration), phases = (
+            np.array([stops[index][part] for index in moving]).T for part in (0, 1)
+        )
+        positions[2:, moving] = stop_positions(
+            position, velocity, acceleration, phases, np.array(offsets) + times[:, None]
+        )
+    return positions
+
+
+def _stop_of(
+    axis: PositionAxis, sample: Sample, interval: float
+) -> tuple[tuple[float, float, float], Phases | None, float]:
     """Return start, phases (None for an axis that has no stop) and remaining time of the stop behind a sample."""
     if axis.max_jerk <= 0.0:
         return (sample.value, 0.0, 0.0), None, 0.0

@@ -9,7 +9,12 @@ velocities has it: Berscheid and Kroeger, "Jerk-limited Real-time Trajectory Gen
 from __future__ import annotations
 
 from math import sqrt
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
 Range = tuple[float, float, float, float]
 Phases = tuple[float, float, float, float]
 
@@ -57,6 +62,27 @@ def stop_state(
         if time <= 0:
             return position, velocity
     return position, 0.0
+
+
+def stop_positions(position: Array, velocity: Array, acceleration: Array, phases: Array, times: Array) -> Array:
+    """Return positions of many stops at many times, bit for bit those of ``stop_state``.
+
+    Args:
+        position, velocity, acceleration: (A,) at the start of each.
+        phases: (4, A), as ``stop_phases`` returns them for each.
+        times: (K, A) in s, from 0, after the start of each.
+
+    Returns:
+        (K, A) float64.
+    """
+    first, constant, last, jerk = phases
+    for duration, rate in ((first, jerk), (constant, np.zeros_like(jerk)), (last, -jerk)):
+        step = np.minimum(duration, times)
+        position = position + step * (velocity + step * (acceleration / 2 + step * rate / 6))
+        velocity = velocity + step * (acceleration + step * rate / 2)
+        acceleration = acceleration + step * rate
+        times = times - step
+    return position
 
 
 def stop_range(velocity: float, acceleration: float, max_acceleration: float, max_jerk: float) -> Range:

@@ -81,6 +81,13 @@ class Chain:
         """Names of the joints."""
         return tuple(link.name for link in self.links)
 
+    def turns(self) -> tuple[Array, Array, Array]:
+        """Return (N, 4, 4) each: a link's transform is the first, plus sine and cosine of its angle times the others.
+
+        The base is in that of the first link.
+        """
+        return self._parts
+
     @cached_property
     def _parts(self) -> tuple[Array, Array, Array]:
         """(N, 4, 4) each: the transform of each link is the first, plus sine and cosine of its angle times the others.

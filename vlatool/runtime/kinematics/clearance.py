@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,26 +54,86 @@ class Clearance:
             (...) float64.
         """
         values = np.asarray(positions, np.float64)
-        ends, radii = [], []
-        for chain, joints, capsules in zip(self.chains, self.joints, self.capsules, strict=True):
-            frames = chain.frames(values[..., list(joints)])
-            base = np.broadcast_to(chain.base.matrix(), (*frames.shape[:-3], 1, 4, 4))
-            ends.append(_segments(np.concatenate([frames, base], axis=-3), capsules))
-            radii.append(np.array([capsule.radius for capsule in capsules]))
-        (one_begin, one_end), (two_begin, two_end) = ends
+        both = self._both
+        begin, end = both.segments(both.frames(values[..., both.joints]))
         distances = segment_distances(
-            one_begin[..., :, None, :], one_end[..., :, None, :], two_begin[..., None, :, :], two_end[..., None, :, :]
+            begin[..., 0, :, None, :], end[..., 0, :, None, :], begin[..., 1, None, :, :], end[..., 1, None, :, :]
         )
-        nearest: Array = (distances - radii[0][:, None] - radii[1][None, :]).min(axis=(-2, -1))
+        nearest: Array = (distances - both.radii[0, :, None] - both.radii[1]).min(axis=(-2, -1))
         return nearest
 
+    @cached_property
+    def _both(self) -> _Both:
+        return _Both.of(self.chains, self.joints, self.capsules)
 
-def _segments(frames: Array, capsules: Sequence[Capsule]) -> tuple[Array, Array]:
-    """Return begin and end of each capsule's segment in the world, (..., C, 3) each; the base is the last frame."""
-    own = frames[..., [capsule.link for capsule in capsules], :, :]
-    begin, end = (np.array([getattr(capsule, side) for capsule in capsules]) for side in ("begin", "end"))
-    origins, rotations = own[..., :3, 3], own[..., :3, :3]
-    return origins + (rotations @ begin[..., None])[..., 0], origins + (rotations @ end[..., None])[..., 0]
+
+class _Both(NamedTuple):
+    """Two arms as one array, for half of the calls: the shorter one has links that turn nothing, and capsules again.
+
+    Args:
+        joints: (2, N) places of the joints in the vector.
+        constant, sine, cosine: (2, N, 4, 4), as in ``Chain``.
+        base: (2, 4, 4) in the world.
+        arms, links: (2, 1) and (2, C) index of the frame of each capsule; the last frame of an arm is its base.
+        begin, end: (2, C, 3, 1) in those frames.
+        radii: (2, C).
+    """
+
+    joints: Array
+    constant: Array
+    sine: Array
+    cosine: Array
+    base: Array
+    arms: Array
+    links: Array
+    begin: Array
+    end: Array
+    radii: Array
+
+    @classmethod
+    def of(
+        cls, chains: Sequence[Chain], joints: Sequence[Sequence[int]], capsules: Sequence[Sequence[Capsule]]
+    ) -> _Both:
+        """Return those of two arms."""
+        count = max(len(chain.links) for chain in chains)
+        parts = np.zeros((3, 2, count, 4, 4))
+        parts[0] = np.eye(4)
+        for arm, chain in enumerate(chains):
+            parts[:, arm, : len(chain.links)] = chain.turns()
+        width = max(map(len, capsules))
+        own = [[*each, *[each[0]] * (width - len(each))] for each in capsules]
+        begin, end = (np.array([[getattr(one, side) for one in each] for each in own])[..., None]
+                      for side in ("begin", "end"))  # fmt: skip
+        return cls(
+            np.array([[*places, *[places[-1]] * (count - len(places))] for places in joints]),
+            *parts,
+            np.array([chain.base.matrix() for chain in chains]),
+            np.array([[0], [1]]),
+            np.array([[count if one.link < 0 else one.link for one in each] for each in own]),
+            begin,
+            end,
+            np.array([[one.radius for one in each] for each in own]),
+        )
+
+    def frames(self, angles: Array) -> Array:
+        """Return the frames of all links and of the bases in the world, (..., 2, N + 1, 4, 4), for angles (..., 2, N).
+
+        As ``Chain.frames`` computes them, bit for bit.
+        """
+        turned = angles[..., None, None]
+        count = angles.shape[-1]
+        frames = np.empty((*angles.shape[:-1], count + 1, 4, 4))
+        frames[..., :count, :, :] = self.constant + np.sin(turned) * self.sine + np.cos(turned) * self.cosine
+        for index in range(1, count):
+            frames[..., index, :, :] = frames[..., index - 1, :, :] @ frames[..., index, :, :]
+        frames[..., count, :, :] = self.base
+        return frames
+
+    def segments(self, frames: Array) -> tuple[Array, Array]:
+        """Return begin and end of each capsule's segment in the world, (..., 2, C, 3) each."""
+        own = frames[..., self.arms, self.links, :, :]
+        origins, rotations = own[..., :3, 3], own[..., :3, :3]
+        return origins + (rotations @ self.begin)[..., 0], origins + (rotations @ self.end)[..., 0]
 
 
 def segment_distances(one_begin: Array, one_end: Array, two_begin: Array, two_end: Array) -> Array:
