@@ -7,6 +7,7 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -123,8 +124,22 @@ class TestDds(NetworkBus):
             expected = "between this node and robot: the subscriber asks for 'reliable'"
             assert wait_until(lambda: expected in "".join(str(fault.error) for fault in controller.faults()))
             robot.close()
-            assert wait_until(lambda: not controller.topics()[0].subscribers)
+            assert wait_until(lambda: not any(info.subscribers for info in controller.topics()))
             assert expected in str(controller.faults()[0].error)
+
+    def test_names_of_all_nodes_are_heard_however_late_this_node_listens(self, open_node: Open) -> None:
+        with opened(open_node, "robot") as (robot,), robot._graph._changed:  # whoever hears a name waits for this
+            names = [f"node_{count}" for count in range(6)]
+            with opened(open_node, *names) as nodes:
+                for node in nodes:
+                    node.publisher("/say", Twist, QUALITY)
+                time.sleep(0.5)
+                robot._graph._changed.release()
+                try:
+                    wait_until(lambda: any(info.publishers == tuple(names) for info in robot.topics()))
+                    assert [info.publishers for info in robot.topics() if info.topic == "/say"] == [tuple(names)]
+                finally:
+                    robot._graph._changed.acquire()
 
     def test_one_process_uses_a_domain_on_one_interface(self, open_node: Open) -> None:
         with (

@@ -26,6 +26,9 @@ from vlatool.messages.schema import string, uint8_16, zeros
 NODES = "ros_discovery_info"
 """Topic on which each participant of ROS 2 says which endpoints belong to which node."""
 NODES_QOS = QoS(reliable=True, depth=1, latched=True)
+HEARD_NODES_QOS = QoS(reliable=True, depth=1000, latched=True)
+"""The topic has no key: with a depth of 1, a participant that speaks before the reader has looked would replace what
+the one before it said. ROS 2 keeps all."""
 PREFIXES = {
     ("rt", PUBLISHER): PUBLISHER, ("rt", SUBSCRIBER): SUBSCRIBER,
     ("rq", SUBSCRIBER): SERVICE, ("rq", PUBLISHER): CLIENT,
@@ -80,7 +83,7 @@ class DdsGraph(Graph):
         self._nodes: dict[str, dict[str, str]] = {}
         described = describe(ParticipantEntities)
         self._write = endpoints.writer(NODES, described, NODES_QOS, "")
-        endpoints.reader(NODES, described, NODES_QOS, "", self._hear_nodes)
+        endpoints.reader(NODES, described, HEARD_NODES_QOS, "", self._hear_nodes)
         builtin = require("cyclonedds.builtin", "dds")
         endpoints.watch(builtin.BuiltinTopicDcpsPublication, lambda sample: self._hear_endpoint(sample, PUBLISHER))
         endpoints.watch(builtin.BuiltinTopicDcpsSubscription, lambda sample: self._hear_endpoint(sample, SUBSCRIBER))

@@ -84,13 +84,13 @@ class KeepApart:
             for axis, sample, reach in zip(axes, samples, self.reach_m, strict=True)
         )
 
-    def _at_least(self, place: Place) -> float:
-        """Return a distance that is not above that of a place, by the one that was computed last."""
+    def _at_least(self, positions: Place) -> float:
+        """Return a distance that is not above that at some positions, by the one that was computed last."""
         if self.reach_m is None or not self._measured:
             return -float("inf")
         ((before, distance, _),) = self._measured
         return distance - sum(
-            reach * abs(one - other) for reach, one, other in zip(self.reach_m, place, before, strict=True)
+            reach * abs(one - other) for reach, one, other in zip(self.reach_m, positions, before, strict=True)
         )
 
 
