@@ -141,26 +141,32 @@ def spread(values: list[float]) -> str:
     return f"p50 {p50:.3f}, p99 {p99:.3f}, max {max(values):.3f}"
 
 
+def times(kills: list[Kill]) -> list[str]:
+    """Return lines on when and where bases stood."""
+    prompt = [kill.stood_s or 0.0 for kill in kills if kill.lag_s <= MOST_LAG_S]
+    return [
+        f"  s until it stands, {len(prompt)} whose simulation kept to {MOST_LAG_S:g} s: {spread(prompt)}",
+        f"  s until it stands, all: {spread([kill.stood_s or 0.0 for kill in kills])}",
+        f"  s by the clock of the simulation, all: {spread([kill.simulated_s or 0.0 for kill in kills])}",
+        f"  m until it stands: {spread([kill.way_m for kill in kills])}",
+        f"  m/s at the kill: {spread([kill.linear for kill in kills])}, min {min(kill.linear for kill in kills):.3f}",
+    ]
+
+
 def table(bus: str, kills: list[Kill]) -> list[str]:
     """Return what was seen, a few lines for each thing that was killed."""
     lines = []
     for what in dict.fromkeys(kill.what for kill in kills):
         those = [kill for kill in kills if kill.what == what and kill.decides]
-        late = [kill for kill in kills if kill.what == what and not kill.decides]
-        stood = [kill for kill in those if kill.stood_s is not None]
-        after = sum(kill.drove_on for kill in stood)
-        how = f"; it drives on after {after}, until the controller is killed, too" if after else ""
-        lines.append(f"{bus}, kill -9 of the {what}: {len(those)}, the base stands after {len(stood)}{how}")
-        lines.append(f"  s until it stands: {spread([kill.stood_s or 0.0 for kill in stood])}")
-        lines.append(f"  s by the clock of the simulation: {spread([kill.simulated_s or 0.0 for kill in stood])}")
-        lines.append(f"  m until it stands: {spread([kill.way_m for kill in stood])}")
-        lines.append(f"  m/s at the kill: from {min(kill.linear for kill in those):.3f}, "
-                     f"{spread([kill.linear for kill in those])}; largest gap between ticks "
-                     f"{max(kill.gap_s for kill in those):.3f} s")  # fmt: skip
+        late = [kill.simulated_s or 0.0 for kill in kills if kill.what == what and not kill.decides]
+        on = [kill for kill in those if kill.drove_on]
+        stood = [kill for kill in on or those if kill.stood_s is not None]
+        how = f"base drives on after {len(on)}; once the controller is killed, too, it" if on else "base"
+        lines.append(f"{bus}, kill -9 of the {what}: {len(those)}, the {how} stands after {len(stood)}")
+        lines += times(stood) if stood else []
         lines += [f"  FAIL {kill.problem}: {kill}" for kill in those if kill.problem]
         if late:
-            clock = spread([kill.simulated_s for kill in late if kill.simulated_s is not None])
-            lines.append(f"  repeated {len(late)} in which the simulation did not keep up; s by its clock: {clock}")
+            lines.append(f"  repeated {len(late)} whose simulation did not keep up; s by its clock: {spread(late)}")
     return lines
 
 
