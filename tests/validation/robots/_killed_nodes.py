@@ -39,7 +39,7 @@ MODULES = ("vlatool.cli", "vlatool.cli.run", "vlatool.nodes.session", "vlatool.c
            "vlatool.controllers.roi_follower", "vlatool.controllers.cloud_follower")  # fmt: skip
 """What ``vlatool run`` imports; and for each bus:"""
 LIBRARIES = {"zenoh": ("vlatool.buses.zenoh", "zenoh", "zenoh.ext"), "dds": ("vlatool.buses.dds", "cyclonedds.core"),
-             "ros1": ("vlatool.buses.ros1", "rospy", "rosmaster")}  # fmt: skip
+             "ros1": ("vlatool.buses.ros1", "rospy")}  # fmt: skip
 LIBRARIES["zenoh-client"] = LIBRARIES["zenoh"]
 
 
@@ -192,7 +192,8 @@ class Robot:
             self._world = subprocess.Popen(
                 list(map(str, command)), env=environment | own, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
             )
-            threading.Thread(target=self._read, args=(self._world,), daemon=True).start()
+            self._reader = threading.Thread(target=self._read, args=(self._world,), daemon=True)
+            self._reader.start()
             common = ["--bus", address, *(["--shared"] if bus == "dds" else [])]
             for name, what in (("monitor", "safety-monitor"), ("controller", controller)):
                 run = ["-m", "vlatool", "run", what, *common]
@@ -210,12 +211,12 @@ class Robot:
             return
         self.nodes["bus"] = Node("bus", self._nursery, self._folder, {}, hub)
         until = time.monotonic() + PATIENCE_S
-        while time.monotonic() < until:
+        while time.monotonic() < until and not self.nodes["bus"].ended():
             with socket.socket() as attempt:
                 if attempt.connect_ex(("127.0.0.1", self._port)) == 0:
                     return
             time.sleep(0.05)
-        raise SystemExit(f"the bus did not start within {PATIENCE_S:g} s: {self.nodes['bus'].ended()}")
+        raise SystemExit(f"the bus did not start: {self.nodes['bus'].ended()}")
 
     def _read(self, world: subprocess.Popen[str]) -> None:
         for line in world.stdout or ():
@@ -271,6 +272,10 @@ class Robot:
         if self._world is not None:
             self._world.kill()
             self._world.wait()
+            self._reader.join()
+            for stream in (self._world.stdin, self._world.stdout):
+                if stream is not None:
+                    stream.close()
 
 
 def client_settings(folder: Path, port: int) -> Path:
