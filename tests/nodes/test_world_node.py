@@ -69,6 +69,18 @@ def test_slow_processor_is_counted(exchange):
     assert node.summary.behind_s > 0.25
 
 
+def test_sensors_are_offered_reliably_for_subscribers_that_ask_for_it(exchange):
+    offered = {}
+
+    class Noting(MemoryBus):
+        def publisher(self, topic, message, qos):
+            offered[topic] = qos
+            return super().publisher(topic, message, qos)
+
+    node = WorldNode(PointWorld(), Noting(exchange, "robot"))
+    assert {topic: qos.reliable for topic, qos in offered.items()} == {each.topic: True for each in node.world.sensors}
+
+
 def test_bus_that_fails_ends_it(exchange):
     bus = MemoryBus(exchange, "robot")
     node = WorldNode(PointWorld(), bus)

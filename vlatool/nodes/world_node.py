@@ -20,6 +20,8 @@ TICK_S = 0.01
 MAX_BEHIND_S = 0.25
 """Simulated time that is caught up on at most; what is beyond it is given up and counted."""
 MAX_COMMANDS = 100
+SENSOR_QOS = QoS(reliable=True)
+"""Of a sensor: subscribers that ask for reliable hear nobody who does not offer it, and others hear both."""
 LATCHED_QOS = QoS(reliable=True, latched=True)
 """Of a topic that a robot sends once, such as its task, for nodes that come later."""
 
@@ -59,7 +61,7 @@ class WorldNode:
         self._commands: queue.Queue[tuple[str, Message]] = queue.Queue(MAX_COMMANDS)
         world.reset(seed)
         self._senders = {
-            channel.topic: bus.publisher(channel.topic, channel.message, QoS() if channel.rate_hz else LATCHED_QOS)
+            channel.topic: bus.publisher(channel.topic, channel.message, SENSOR_QOS if channel.rate_hz else LATCHED_QOS)
             for channel in world.sensors
         }
         for channel in world.commands:
