@@ -10,7 +10,8 @@ import pytest
 
 from tests._point_robot import GoTo, PointWorld
 from vlatool import registry
-from vlatool.buses import QoS, open_bus
+from vlatool.buses import Fault, QoS, open_bus
+from vlatool.cli._controllers import _lines
 from vlatool.errors import BusError, OutputError, UsageError
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.std_msgs import String
@@ -61,6 +62,18 @@ def test_run_moves_the_robot_and_its_log_is_replayed(plan, world, tmp_path):
     again = replay(GoTo(**plan.settings), read_log(tmp_path / "log"), None)
     assert (again.equal, again.steps, again.note) == (True, found["steps"], "")
     json.dumps(found, allow_nan=False)
+
+
+def test_what_went_wrong_on_the_bus_is_in_the_result(plan, world, monkeypatch):
+    def open_faulty(address, node):
+        bus = open_bus(address, node)
+        bus.faults = lambda: [Fault("/odom", 2, BusError("No messages pass on /odom.", "give both ends one quality"))]
+        return bus
+
+    monkeypatch.setattr(session, "open_bus", open_faulty)
+    result = run_on_bus(replace(plan, seconds=0.1))
+    assert result.to_dict()["faults"] == [{"topic": "/odom", "count": 2, "error": "No messages pass on /odom."}]
+    assert "  /odom: No messages pass on /odom. (2 times; give both ends one quality)" in list(_lines(result))
 
 
 def test_without_a_robot_it_waits_and_says_so(plan):

@@ -243,6 +243,8 @@ def _plan_lines(found: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _lines(result: RunResult) -> Iterator[str]:
+    from vlatool.nodes.session import fault_lines
+
     found = result.to_dict()
     late, compute, over = (found[name] for name in ("late_ms", "compute_ms", "overhead_ms"))
     yield printable(
@@ -257,3 +259,4 @@ def _lines(result: RunResult) -> Iterator[str]:
     if found["lost_records"] or found["failure"] or found["log_full"]:
         reason = found["failure"] or ("the log was full" if found["log_full"] else f"{found['lost_records']} were lost")
         yield printable(f"  the records of the steps are not whole: {reason}")
+    yield from map(printable, fault_lines(result.faults))

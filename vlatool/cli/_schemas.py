@@ -145,13 +145,13 @@ def definitions(report: Schema) -> dict[str, Schema]:
 def _documents_of_robots() -> dict[str, Schema]:
     """Return the documents about robot controllers, buses and simulated robots."""
     end = record(name=TEXT, topic=TEXT, type=TEXT)
-    texts = many(TEXT)
+    texts, faults = many(TEXT), many(record(topic=TEXT, count=INTEGER, error=TEXT))
     return {
         "controller_run": document(
             "A run of a robot controller; times of its steps in ms.",
             controller=TEXT, node=TEXT, topics=by_name(TEXT), steps=INTEGER, skipped=INTEGER, seconds=NUMBER,
             status=TEXT, late_ms=SPREAD, compute_ms=SPREAD, overhead_ms=SPREAD, overwritten=by_name(INTEGER),
-            lost_records=INTEGER, log_full=FLAG, failure=TEXT,
+            lost_records=INTEGER, log_full=FLAG, failure=TEXT, faults=faults,
         ),
         "planned_run": document(
             "What a run of a robot controller would be.", controller=TEXT, node=TEXT, rate_hz=NUMBER, inputs=many(end),
@@ -159,7 +159,7 @@ def _documents_of_robots() -> dict[str, Schema]:
         ),
         "simulated_robot": document(
             "What a simulated robot did.", robot=TEXT, seconds=NUMBER, reports=INTEGER, commands=INTEGER,
-            behind_s=NUMBER, truth=ANY_OBJECT,
+            behind_s=NUMBER, truth=ANY_OBJECT, faults=faults,
         ),
         "bus_topics": document("Topics on a bus.", bus=TEXT, topics=many(record(
             topic=TEXT, types=texts, publishers=texts, subscribers=texts, messages=INTEGER, hz=NUMBER, age_ms=NUMBER,

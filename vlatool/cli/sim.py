@@ -90,6 +90,7 @@ def _simulate(
 ) -> None:  # fmt: skip
     """Simulate a robot on a bus."""
     from vlatool.buses import open_bus
+    from vlatool.nodes.session import fault_lines, faults_as_json
     from vlatool.nodes.settings import build, read_settings
     from vlatool.nodes.world_node import WorldNode
 
@@ -104,9 +105,12 @@ def _simulate(
             with stopped_by_signals(simulated.stop):
                 simulated.run(seconds)
         finally:
-            found = {"robot": name, **vars(simulated.summary), "truth": dict(robot.truth())}
+            faults = opened.faults()
+            found = {"robot": name, **vars(simulated.summary), "truth": dict(robot.truth()),
+                     "faults": faults_as_json(faults)}  # fmt: skip
             simulated.summary.seconds = robot.time_s
     finally:
         opened.close()
     answer(as_json, found, [f"{found['seconds']:.1f} s simulated, {found['reports']} reports, {found['commands']} "
-                            f"commands, {found['behind_s']:.1f} s behind real time"])  # fmt: skip
+                            f"commands, {found['behind_s']:.1f} s behind real time",
+                            *map(printable, fault_lines(faults))])  # fmt: skip

@@ -61,6 +61,8 @@ def _summary(found: Mapping[str, Any], points: Sequence[TracePoint]) -> Iterator
         yield f"Messages that came faster than the controller reads: {many}."
     if found["lost_records"] or found["failure"]:
         yield f"The records of the steps are not whole: {found['failure'] or found['lost_records']}."
+    for fault in found["faults"]:
+        yield f"{fault['topic']}: {fault['error']}"
 
 
 def _sections(trace: Trace) -> Iterator[str]:

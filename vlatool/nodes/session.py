@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vlatool.buses import ActionBus, Bus, QoS, open_bus
+from vlatool.buses import ActionBus, Bus, Fault, QoS, open_bus
 from vlatool.errors import OutputError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.std_msgs import String
@@ -76,6 +76,7 @@ class RunResult:
         lost: Reports of steps that were neither published nor logged, because the disk or the bus was too slow.
         log_full: Whether the log reached its limit before the end.
         failure: Why the records of the steps ended before the run did; empty where they did not.
+        faults: What went wrong on the bus, such as a topic on which no messages pass.
     """
 
     about: ControllerRecord
@@ -83,6 +84,7 @@ class RunResult:
     lost: int = 0
     log_full: bool = False
     failure: str = ""
+    faults: tuple[Fault, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
@@ -92,8 +94,20 @@ class RunResult:
             "steps": summary.steps, "skipped": summary.skipped, "seconds": summary.seconds, "status": summary.status,
             "late_ms": spread(summary.late_ms), "compute_ms": spread(summary.compute_ms),
             "overhead_ms": spread(summary.overhead_ms), "overwritten": summary.overwritten, "lost_records": self.lost,
-            "log_full": self.log_full, "failure": self.failure,
+            "log_full": self.log_full, "failure": self.failure, "faults": faults_as_json(self.faults),
         }  # fmt: skip
+
+
+def faults_as_json(faults: Sequence[Fault]) -> list[dict[str, Any]]:
+    """Return what went wrong on a bus as plain values."""
+    return [{"topic": fault.topic, "count": fault.count, "error": fault.error.message} for fault in faults]
+
+
+def fault_lines(faults: Sequence[Fault]) -> Iterator[str]:
+    """Return what went wrong on a bus, a line for each topic."""
+    for fault in faults:
+        often = "once" if fault.count == 1 else f"{fault.count} times"
+        yield f"  {fault.topic}: {fault.error.message} ({often}; {fault.error.fix})"
 
 
 def spread(times: list[float]) -> dict[str, float | int | None]:
@@ -154,7 +168,7 @@ def run_on_bus(
         try:
             runner.run(plan.seconds)
         finally:
-            result = _closed(about, runner.summary, background, log)
+            result = _closed(about, runner.summary, background, log, bus.faults())
             on_end(result, trace)
     return result
 
@@ -219,12 +233,14 @@ def node_of(plan: RunPlan) -> str:
     return plan.node or f"vlatool_{plan.controller.replace('-', '_')}"
 
 
-def _closed(about: ControllerRecord, summary: RunSummary, background: Background, log: RunLog | None) -> RunResult:
+def _closed(
+    about: ControllerRecord, summary: RunSummary, background: Background, log: RunLog | None, faults: list[Fault]
+) -> RunResult:
     background.close()
     if log is not None:
         log.close(background.lost)
     failure = "" if background.failure is None else f"{type(background.failure).__name__}: {background.failure}"
-    return RunResult(about, summary, background.lost, log is not None and log.full, failure)
+    return RunResult(about, summary, background.lost, log is not None and log.full, failure, tuple(faults))
 
 
 def refuse_output(path: Path | None) -> None:
