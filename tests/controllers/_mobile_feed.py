@@ -9,7 +9,15 @@ import numpy as np
 from vlatool.controllers import Reading, Snapshot
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
-from vlatool.messages.geometry_msgs import Point, Pose, PoseWithCovariance, Quaternion, Twist, Vector3
+from vlatool.messages.geometry_msgs import (
+    Point,
+    Pose,
+    PoseWithCovariance,
+    Quaternion,
+    Twist,
+    TwistWithCovariance,
+    Vector3,
+)
 from vlatool.messages.nav_msgs import Odometry
 from vlatool.messages.pixels import image_message
 from vlatool.messages.sensor_msgs import CameraInfo, Image
@@ -45,9 +53,12 @@ def depth_image(metres: np.ndarray, stamp_s: float = 0.0) -> Image:
     return image_message(metres.astype(np.float32), "32FC1", header(stamp_s))
 
 
-def odometry(x: float, y: float, yaw: float, stamp_s: float = 0.0) -> Odometry:
+def odometry(
+    x: float, y: float, yaw: float, stamp_s: float = 0.0, linear: float = 0.0, angular: float = 0.0
+) -> Odometry:
     turn = Quaternion(0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
-    return Odometry(header(stamp_s), "base_link", PoseWithCovariance(Pose(Point(x, y, 0.0), turn)))
+    pose = PoseWithCovariance(Pose(Point(x, y, 0.0), turn))
+    return Odometry(header(stamp_s), "base_link", pose, TwistWithCovariance(velocity(linear, angular)))
 
 
 def velocity(linear: float, angular: float = 0.0) -> Twist:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from _mobile_feed import Feed, depth_image, header, odometry, speeds
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.controllers import Snapshot
 from vlatool.controllers.vln import Vln
 from vlatool.errors import UsageError
 from vlatool.messages.pixels import image_message
@@ -67,6 +69,37 @@ class Drive:
             self.time += 0.1
 
 
+class HeavyDrive(Drive):
+    """A base that takes half a second to stop, and says so; its camera is 200 ms late."""
+
+    def __init__(self, controller: Vln, depth_ticks: int = 0) -> None:
+        super().__init__(controller)
+        self.linear, self.speeds, self.frames = 0.0, [], []
+        self.depth_ticks, self.depths = depth_ticks, []
+
+    def run(self, seconds: float, *, camera: bool = True, **messages: Any) -> None:
+        for _ in range(round(seconds * 10)):
+            tick = len(self.speeds)
+            self.speeds.append(self.linear)
+            pixels = np.full((6, 8, 3), tick, np.uint8)
+            self.frames.append(image_message(pixels, "rgb8", header(tick / 10)))
+            if tick >= 2 and camera:
+                messages["image"] = self.frames[tick - 2]
+            messages["odometry"] = odometry(*self.pose, stamp_s=tick / 10, linear=self.linear)
+            self.depths.append(depth_image(np.full((8, 8), self.ahead, np.float32), tick / 10))
+            if tick >= self.depth_ticks:
+                messages["depth"] = self.depths[tick - self.depth_ticks]
+            command, self.state = self.controller.step(self.feed.snapshot(tick / 10, **messages), self.state)
+            messages = {}
+            self.linear += max(-0.06, min(0.06, speeds(command)[0] - self.linear))
+            self.pose[0] += self.linear * 0.1
+
+
+def newest_frames(policy: Route) -> list[int]:
+    """Return at which tick of ``HeavyDrive`` the newest frame of each observation was taken."""
+    return [int(seen["image"][-1].max()) for seen in policy.seen]
+
+
 def test_labels_become_motions_that_odometry_ends_and_it_stops_by_its_stop_label():
     policy = Route(LEFT, FORWARD, RIGHT, STOP)
     drive = Drive(Vln(policy=policy, forward_m=0.5))
@@ -92,6 +125,95 @@ def test_the_policy_sees_the_instruction_its_past_actions_and_frames_that_were_t
     assert not first["image"][0].any()
     assert np.array_equal(second["image"][0], first["image"][1])
     assert third["image"][1].max() > second["image"][1].max() > first["image"][1].max()
+
+
+@pytest.mark.parametrize("change", ["another instruction", "something in the way"])
+def test_a_motion_that_is_broken_off_is_over_when_the_robot_stands_and_the_next_frame_is_later(change: str):
+    policy = Route(FORWARD, STOP)
+    drive = HeavyDrive(Vln(policy=policy))
+    drive.run(0.1, instruction=String("go"))
+    drive.run(2.0)
+    moment = len(drive.speeds)
+    assert drive.linear == pytest.approx(0.3)
+    if change == "another instruction":
+        drive.run(0.1, instruction=String("come"))
+    else:
+        drive.ahead = 0.2
+    drive.run(3.0)
+    before, after = newest_frames(policy)
+    assert drive.speeds[before] == 0.0
+    assert after > moment
+    assert drive.speeds[after] == pytest.approx(0.0, abs=0.02)
+    assert drive.state.phase == "arrived"
+
+
+def test_the_first_frame_of_an_instruction_was_taken_after_it_came():
+    policy = Route(STOP, STOP)
+    drive = HeavyDrive(Vln(policy=policy))
+    drive.run(0.1, instruction=String("go"))
+    drive.run(2.0)
+    moment = len(drive.speeds)
+    drive.run(0.1, instruction=String("come"))
+    drive.run(1.0)
+    assert newest_frames(policy)[1] > moment
+
+
+def test_a_depth_image_of_before_the_turn_does_not_say_that_the_way_is_free():
+    policy = Route(LEFT, FORWARD, STOP)
+    drive = HeavyDrive(Vln(policy=policy), depth_ticks=4)
+    drive.run(0.1, instruction=String("go"))
+    drive.run(2.0)
+    drive.pose[2], drive.ahead = math.pi / 2, 0.6
+    drive.run(5.0)
+    assert drive.state.actions == (LEFT, FORWARD, STOP)
+    assert max(drive.speeds) == 0.0
+
+
+def test_odometry_whose_speed_is_never_zero_delays_a_decision_until_a_frame_that_came_a_second_later():
+    policy = Route(STOP)
+    drive = HeavyDrive(Vln(policy=policy))
+    for tick in range(20):
+        drive.linear = 0.1
+        drive.run(0.1, camera=not 8 <= tick < 12, **({} if tick else {"instruction": String("go")}))
+    assert drive.state.phase == "arrived"
+    assert newest_frames(policy) == [10]
+
+
+def test_it_does_not_choose_before_the_word_on_arrival_that_was_sent_after_the_frame():
+    policy = Route(LEFT, LEFT, LEFT, LEFT)
+    drive = Drive(Vln(policy=policy))
+    drive.run(0.1, instruction=String("go"), arrived=Bool(False))
+    drive.run(0.1)
+    drive.run(0.1, arrived=Bool(True))
+    assert drive.state.phase == "arrived"
+    assert not policy.seen
+    drive.run(0.1, instruction=String("go on"), arrived=Bool(False))
+    drive.run(0.1, arrived=Bool(False))
+    assert len(policy.seen) == 1
+
+
+def test_words_on_arrival_that_come_just_before_each_frame_do_not_hold_it_up_for_ever():
+    policy = Route(LEFT, STOP)
+    drive = Drive(Vln(policy=policy))
+    snapshot_of = drive.feed.snapshot
+
+    def snapshot(time_s: float, **messages: Any) -> Snapshot:
+        found = snapshot_of(time_s, **messages)
+        word = found.newest["arrived"]._replace(received_s=time_s - 0.01)
+        return replace(found, newest={**found.newest, "arrived": word}, readings={**found.readings, "arrived": (word,)})
+
+    drive.feed.snapshot = snapshot
+    for tick in range(4):
+        drive.run(0.1, arrived=Bool(False), **({} if tick else {"instruction": String("go")}))
+    assert len(policy.seen) == 1
+
+
+def test_a_word_on_arrival_that_does_not_come_again_is_not_waited_for():
+    policy = Route(LEFT, STOP)
+    drive = Drive(Vln(policy=policy))
+    drive.run(0.1, instruction=String("go"), arrived=Bool(False))
+    drive.run(0.7)
+    assert len(policy.seen) == 1
 
 
 def test_it_never_moves_without_an_instruction_and_an_empty_one_ends_it():
@@ -157,6 +279,22 @@ def test_it_stops_when_it_is_told_that_it_arrived_and_gives_up_after_its_actions
     drive.run(0.1, instruction=String("go"))
     drive.run(20.0)
     assert drive.statuses[-1] == "failed no arrival in 2 actions"
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_a_word_on_arrival_while_it_is_paused_ends_the_task_once_it_runs_again(camera: bool):
+    policy = Route(FORWARD, LEFT)
+    drive = Drive(Vln(policy=policy))
+    drive.run(0.1, instruction=String("go"))
+    drive.run(1.0)
+    drive.run(0.7, camera=False)
+    assert drive.state.phase == "paused"
+    drive.run(0.1, camera=camera, arrived=Bool(True))
+    drive.run(0.5)
+    assert len(policy.seen) == 1
+    words = [status.partition(" ")[0] for status in drive.statuses]
+    assert list(dict.fromkeys(words[words.index("paused") :])) == ["paused", "running", "arrived"]
+    assert speeds(drive.command) == (0.0, 0.0)
 
 
 def test_a_new_instruction_resets_the_policy_and_begins_again():

@@ -12,9 +12,11 @@ from vlatool.buses import QoS
 from vlatool.errors import BusError
 from vlatool.messages.geometry_msgs import Twist, Vector3
 from vlatool.messages.nav_msgs import Odometry
+from vlatool.messages.sensor_msgs import Image
 from vlatool.messages.std_msgs import String
 from vlatool.nodes.runner import Runner
 from vlatool.nodes.world_node import MAX_COMMANDS, WorldNode
+from vlatool.worlds import Channel
 
 
 @pytest.fixture
@@ -67,6 +69,23 @@ def test_slow_processor_is_counted(exchange):
     slow = iter([0.4])
     node.run(0.05, observer=lambda world: time.sleep(next(slow, 0.0)))
     assert node.summary.behind_s > 0.25
+
+
+def test_sensors_are_offered_reliably_for_subscribers_that_ask_for_it_and_pictures_are_not(exchange):
+    offered = {}
+
+    class Seeing(PointWorld):
+        sensors = (*PointWorld().sensors, Channel("/image", Image, 10.0), Channel("/plan", String))
+
+    class Noting(MemoryBus):
+        def publisher(self, topic, message, qos):
+            offered[topic] = qos
+            return super().publisher(topic, message, qos)
+
+    WorldNode(Seeing(), Noting(exchange, "robot"))
+    assert {topic: (qos.reliable, qos.latched) for topic, qos in offered.items()} == {
+        "/odom": (True, False), "/image": (False, False), "/plan": (True, True)
+    }  # fmt: skip
 
 
 def test_bus_that_fails_ends_it(exchange):

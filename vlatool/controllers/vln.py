@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.controllers._discrete_policy import Observed, choose, observation, observed_by
-from vlatool.controllers._freshness import age_s, note_changes
+from vlatool.controllers._freshness import age_s, note_changes, stamp_of
 from vlatool.controllers._geometry import PlanarPose, pose_of, twist
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
 from vlatool.controllers._motions import BACKWARD, FORWARD, STOP, WAIT, Motion, Speeds, drive, motions_of, plan
@@ -33,6 +33,9 @@ from vlatool.messages.std_msgs import Bool, String
 ALLOWED_SPEED = {"linear": 0.306, "angular": 1.9}
 """Fastest of a Create 3 with its safety on, in m/s and rad/s (Create 3 documentation, "Safety")."""
 
+RESTING_SPEED = {"linear": 0.02, "angular": 0.05}
+"""Speeds in odometry up to which a robot stands, in m/s and rad/s: what an encoder or a gyroscope may say at rest."""
+
 
 @dataclass(frozen=True)
 class Vln:
@@ -40,12 +43,14 @@ class Vln:
 
     The policy sees a frame when the robot stands, and its action becomes a motion: a turn by ``turn_deg`` or a step of
     ``forward_m``, from the pose at which the last motion was to end, so that small errors do not add up. Odometry ends
-    it. The next frame is one that was taken after that. A step forward that depth says is blocked is not driven, and
-    the policy is asked again, with the action among its past ones.
+    it. The next frame, and depth where there is one, were taken after that, and after odometry said that the robot
+    stands; the first one after the instruction came. A step forward that depth says is blocked is not driven, and the
+    policy is asked again, with the action among its past ones.
 
-    It ends with a ``stop`` label or when ``/vln/arrived`` says so. It never moves without an instruction; an empty one
-    ends it. It stands while the camera or the odometry is older than ``max_age_s``. The first word of ``/vln/status``
-    is ``idle``, ``running``, ``paused``, ``arrived`` or ``failed``.
+    It ends with a ``stop`` label or when ``/vln/arrived`` says so; where that is said again and again, the policy is
+    asked once it was said after the frame came. It never moves without an instruction; an empty one ends it. It stands
+    while the camera or the odometry is older than ``max_age_s``. The first word of ``/vln/status`` is ``idle``,
+    ``running``, ``paused``, ``arrived`` or ``failed``.
 
     Args:
         rate: Steps in a second.
@@ -59,7 +64,8 @@ class Vln:
         way_share: Share of the width of the depth image, in its middle, that is the way ahead.
         max_age_s: Age of the camera and of odometry above which the robot stands, in seconds.
         motion_s: Time after which a motion that did not reach its end is over, in seconds.
-        settle_s: Time after a motion after which a frame is used whatever its stamp, in seconds.
+        settle_s: Time after a motion or an instruction after which a frame that comes is used whatever its stamp and
+            the speed of odometry, in seconds.
         max_actions: Actions after which it gives up; 0 for none.
         motions: ``LABEL=MOTION`` for labels whose words do not say it, separated by commas.
         policy: What ``vlatool.load`` returned.
@@ -157,6 +163,8 @@ class Vln:
         if trouble or pose is None:
             return self._stand(state._replace(phase=PAUSED_PHASE, detail=trouble))
         state = state._replace(phase=RUNNING_PHASE)
+        if state.has_arrived:
+            return self._stand(state._replace(detail="looking"))
         if state.motion is not None:
             return self._move(snapshot, state, state.motion, pose)
         return self._decide(snapshot, state, pose)
@@ -172,14 +180,14 @@ class Vln:
             text = reading.message.data.strip() if isinstance(reading.message, String) else ""
             self.policy.reset()
             phase = RUNNING_PHASE if text else IDLE_PHASE
-            return VlnState(phase=phase, instruction=text, heard=reading.sequence, changes=state.changes)
-        arrived = snapshot.readings.get("arrived", ())
-        if state.phase in (RUNNING_PHASE, PAUSED_PHASE) and any(
-            getattr(item.message, "data", False) for item in arrived
-        ):
-            return state._replace(
-                phase=ARRIVED_PHASE if state.phase == RUNNING_PHASE else state.phase, motion=None, detail=""
-            )
+            heard = VlnState(phase=phase, instruction=text, heard=reading.sequence, changes=state.changes)
+            return self._ended(snapshot, heard)
+        if state.phase not in (RUNNING_PHASE, PAUSED_PHASE):
+            return state
+        if any(getattr(item.message, "data", False) for item in snapshot.readings.get("arrived", ())):
+            state = state._replace(motion=None, has_arrived=True)
+        if state.has_arrived and state.phase == RUNNING_PHASE:  # it runs again before it ends
+            return state._replace(phase=ARRIVED_PHASE, detail="")
         return state
 
     def _trouble(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose | None) -> str:
@@ -200,14 +208,14 @@ class Vln:
         if not over and (late or hit):
             over, waypoint, linear, angular = True, pose, 0.0, 0.0
         if over:
-            stamp = self._odometry_stamp(snapshot)
-            state = state._replace(motion=None, waypoint=waypoint, ended_s=snapshot.time_s, ended_stamp=stamp)
+            state = self._ended(snapshot, state._replace(motion=None, waypoint=waypoint))
             return self._stand(state._replace(detail="blocked on the way" if hit else "looking"))
         return self._command(state._replace(detail=motion.kind), linear, angular), state
 
     def _decide(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose) -> tuple[Command, VlnState]:
         """Ask the policy, once there is a frame that was taken while the robot stood."""
-        if not self._has_settled(snapshot, state):
+        state = self._note_frame(snapshot, state)
+        if not self._may_choose(snapshot, state):
             return self._stand(state._replace(detail="looking"))
         if self.max_actions and len(state.actions) >= self.max_actions:
             return self._stand(state._replace(phase=FAILED_PHASE, detail=f"no arrival in {self.max_actions} actions"))
@@ -230,7 +238,7 @@ class Vln:
 
     def _begin(self, snapshot: Snapshot, state: VlnState, kind: str, waypoint: PlanarPose) -> tuple[Command, VlnState]:
         """Begin the motion of an action at a pose; nothing is driven at this step."""
-        over = state._replace(ended_s=snapshot.time_s, ended_stamp=self._odometry_stamp(snapshot))
+        over = self._ended(snapshot, state)
         if kind == STOP:
             return self._stand(state._replace(phase=ARRIVED_PHASE, detail="by its stop label"))
         if kind == WAIT:
@@ -240,16 +248,32 @@ class Vln:
         motion = plan(kind, waypoint, math.radians(self.turn_deg), self.forward_m, snapshot.time_s)
         return self._stand(state._replace(motion=motion, detail=kind if kind != BACKWARD else "backward"))
 
-    def _has_settled(self, snapshot: Snapshot, state: VlnState) -> bool:
-        """Whether the newest frame was taken after the last motion."""
-        if state.ended_s is None or snapshot.time_s - state.ended_s >= self.settle_s:
-            return True
-        image = snapshot.message("image", Image)
-        return image is not None and image.header.stamp.seconds > state.ended_stamp
-
-    def _odometry_stamp(self, snapshot: Snapshot) -> float:
+    def _ended(self, snapshot: Snapshot, state: VlnState) -> VlnState:
+        """Return the state in which a frame has to be later than now, and of a robot that stands."""
         odometry = snapshot.message("odometry", Odometry)
-        return odometry.header.stamp.seconds if odometry is not None else 0.0
+        stamp = odometry.header.stamp.seconds if odometry is not None else 0.0
+        return _note_rest(
+            snapshot, state._replace(ended_s=snapshot.time_s, ended_stamp=stamp, rest_stamp=None, frame_s=None)
+        )
+
+    def _note_frame(self, snapshot: Snapshot, state: VlnState) -> VlnState:
+        """Note when the first frame, and depth where there is one, came that are of a robot that stands."""
+        state, image = _note_rest(snapshot, state), snapshot.newest.get("image")
+        if image is None or state.frame_s is not None:
+            return state
+        stamps = [
+            stamp_of(snapshot.newest[name].message).seconds for name in ("image", "depth") if name in snapshot.newest
+        ]
+        rests = state.rest_stamp is not None and all(state.rest_stamp <= at > state.ended_stamp for at in stamps)
+        late = image.received_s - state.ended_s >= self.settle_s
+        return state._replace(frame_s=image.received_s) if rests or late else state
+
+    def _may_choose(self, snapshot: Snapshot, state: VlnState) -> bool:
+        """Whether there is such a frame and, where ``arrived`` comes again and again, a word of after it."""
+        arrived = snapshot.newest.get("arrived")
+        if state.frame_s is None or arrived is None:
+            return state.frame_s is not None
+        return arrived.received_s >= state.frame_s or snapshot.time_s - arrived.received_s > self.max_age_s
 
     def _ahead(self, snapshot: Snapshot) -> float:
         """Return the depth of the way ahead in metres: the 5th percentile of the middle; infinity where unknown."""
@@ -269,3 +293,13 @@ class Vln:
         text = f"{state.phase} {state.detail}".strip()
         messages = {"cmd_vel": (twist(linear, angular),), "status": (String(text),)}
         return Command(messages, status=text, notes={"actions": float(len(state.actions))})
+
+
+def _note_rest(snapshot: Snapshot, state: VlnState) -> VlnState:
+    """Note the stamp of the first odometry since the last motion by which the robot stands."""
+    odometry = snapshot.message("odometry", Odometry)
+    if odometry is None or state.rest_stamp is not None:
+        return state
+    speeds = odometry.twist.twist
+    moves = abs(speeds.linear.x) > RESTING_SPEED["linear"] or abs(speeds.angular.z) > RESTING_SPEED["angular"]
+    return state if moves else state._replace(rest_stamp=odometry.header.stamp.seconds)

@@ -13,13 +13,18 @@ from typing import Any
 from vlatool.buses import Bus, QoS, Reception
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
-from vlatool.worlds import World
+from vlatool.messages.sensor_msgs import Image, PointCloud2
+from vlatool.worlds import Channel, World
 
 TICK_S = 0.01
 """Simulated time between two looks at the commands and the sensors."""
 MAX_BEHIND_S = 0.25
 """Simulated time that is caught up on at most; what is beyond it is given up and counted."""
 MAX_COMMANDS = 100
+SENSOR_QOS = QoS(reliable=True)
+"""Of a sensor: subscribers that ask for reliable hear nobody who does not offer it, and others hear both."""
+LARGE_QOS = QoS()
+"""Of pictures and clouds: what a subscriber that stands still has not acknowledged would hold the robot."""
 LATCHED_QOS = QoS(reliable=True, latched=True)
 """Of a topic that a robot sends once, such as its task, for nodes that come later."""
 
@@ -59,7 +64,7 @@ class WorldNode:
         self._commands: queue.Queue[tuple[str, Message]] = queue.Queue(MAX_COMMANDS)
         world.reset(seed)
         self._senders = {
-            channel.topic: bus.publisher(channel.topic, channel.message, QoS() if channel.rate_hz else LATCHED_QOS)
+            channel.topic: bus.publisher(channel.topic, channel.message, _quality_of(channel))
             for channel in world.sensors
         }
         for channel in world.commands:
@@ -117,6 +122,12 @@ class WorldNode:
         for topic, message in self.world.reports():
             self._senders[topic](restamp(message, epoch_s))
             self.summary.reports += 1
+
+
+def _quality_of(channel: Channel) -> QoS:
+    if not channel.rate_hz:
+        return LATCHED_QOS
+    return LARGE_QOS if channel.message in (Image, PointCloud2) else SENSOR_QOS
 
 
 def restamp(message: Any, epoch_s: float) -> Any:

@@ -99,12 +99,12 @@ class Master:
         self._process = subprocess.Popen(
             [sys.executable, script, "--core", "-p", str(self.port)], env=environment, stdout=subprocess.DEVNULL
         )
-        for _ in range(300):
+        for _ in range(1200):
             with socket.socket() as attempt:
                 if attempt.connect_ex(("127.0.0.1", self.port)) == 0:
                     return
             time.sleep(0.05)
-        raise SystemExit("rosmaster did not start within 15 s")
+        raise SystemExit("rosmaster did not start within 60 s")
 
     def kill(self) -> None:
         """End it as a crash does."""

@@ -9,7 +9,8 @@ after it is gone, whether the robot stands. ``collisions``: a room with pillars,
 safety monitor on, its emergencies released every two seconds; ``--hostile`` adds, in turns, things that step in 0.5 m
 ahead, a frozen depth camera, lidar gaps, a delay of 300 ms, a policy (or target) of noise, and all of them. ``vln``:
 the sample policy through continuous motion beside the same seeds in its discrete environment. BUNDLE is the int8
-bundle of ``sample_models/vln-babyai``. Ends with 1 where a collision or a fall happened, or a step failed.
+bundle of ``sample_models/vln-babyai``. Ends with 1 where a collision or a fall happened, a step failed, or success in
+continuous motion is more than a point lower.
 """
 
 from __future__ import annotations
@@ -24,22 +25,23 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[3]
-sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "sample_models/vln-babyai")]
+sys.path.insert(0, str(Path(__file__).parent))
 
-from _loop import Loop  # noqa: E402
+from _loop import Loop
+from _vln_episodes import FIRST_SEED, RESTING, paired_episodes, rate_of
 
-from vlatool.controllers._interface import Request  # noqa: E402
-from vlatool.controllers.cloud_follower import CloudFollower  # noqa: E402
-from vlatool.controllers.roi_follower import RoiFollower  # noqa: E402
-from vlatool.controllers.roi_tracker import RoiTracker  # noqa: E402
-from vlatool.controllers.safety_monitor import SafetyMonitor  # noqa: E402
-from vlatool.controllers.vln import Vln  # noqa: E402
-from vlatool.messages.sensor_msgs import Image  # noqa: E402
-from vlatool.messages.std_msgs import String  # noqa: E402
-from vlatool.messages.std_srvs import SetBoolRequest  # noqa: E402
-from vlatool.worlds import open_world  # noqa: E402
-from vlatool.worlds._turtlebot4_sensors import HFOV_RAD  # noqa: E402
+from vlatool.controllers._interface import Request
+from vlatool.controllers.cloud_follower import CloudFollower
+from vlatool.controllers.roi_follower import RoiFollower
+from vlatool.controllers.roi_tracker import RoiTracker
+from vlatool.controllers.safety_monitor import SafetyMonitor
+from vlatool.controllers.vln import Vln
+from vlatool.messages.sensor_msgs import Image
+from vlatool.messages.std_msgs import String
+from vlatool.messages.std_srvs import SetBoolRequest
+from vlatool.stats.intervals import paired_drop
+from vlatool.worlds import open_world
+from vlatool.worlds._turtlebot4_sensors import HFOV_RAD
 
 FOLLOWERS = {"roi-tracker": RoiTracker, "roi-follower": RoiFollower, "cloud-follower": CloudFollower}
 FRONT = {"roi-follower": 0.840, "cloud-follower": 0.785, "roi-tracker": 0.785}
@@ -47,7 +49,6 @@ FRONT = {"roi-follower": 0.840, "cloud-follower": 0.785, "roi-tracker": 0.785}
 RADIUS = 0.12
 SENSORS = "roi,info,depth,cloud,odom,scan,person,joints,battery"
 HOSTILE = ("intruder", "frozen depth", "lidar gaps", "delay", "noise", "all")
-RESTING = 0.01
 
 
 def step_episode(name: str, seed: int) -> tuple[bool, bool, float]:
@@ -173,30 +174,26 @@ class Lead:
         return self.at
 
 
-def vln_episode(task: str, seed: int, policy: Any) -> dict[str, Any]:
-    """Return how the discrete and the continuous episode of a seed ended."""
-    import environment
-
-    discrete = environment.make(task)
-    observation, _ = discrete.reset(seed=seed)
-    policy.reset()
-    over, actions, success = False, [], False
-    while not over:
-        actions.append(int(np.asarray(policy.infer(observation).chunk).reshape(-1)[0]))
-        observation, _, ended, truncated, info = discrete.step(actions[-1])
-        over, success = ended or truncated, bool(info["success"])
-    world = open_world("babyai", task=task)
-    world.reset(seed)
-    loop = Loop(world, [Vln(policy=policy, max_actions=world.max_actions)])
-    while loop.nodes[0].state.phase not in ("arrived", "failed") and world.time_s < 3600.0:
-        loop.run(0.5)
-    loop.run(1.0)
-    truth, state = world.truth(), loop.nodes[0].state
-    stands = max(map(abs, truth["velocity"])) < RESTING
-    return {
-        "discrete": success, "continuous": truth["arrived"] and state.phase == "arrived" and stands,
-        "same": list(state.actions) == actions, "collisions": truth["collisions"], "seconds": world.time_s,
-    }  # fmt: skip
+def vln_trial(task: str, seeds: range, policy: Any, file: Path | None) -> int:
+    """Print how discrete and continuous episodes of the same seeds ended; return 1 where success is a point lower."""
+    started = time.process_time()
+    pairs = paired_episodes(task, [FIRST_SEED + seed for seed in seeds], policy, file)
+    discrete, continuous = map(list, zip(*pairs, strict=True))
+    lost = sum(one.success and not other.success for one, other in pairs)
+    won = sum(other.success and not one.success for one, other in pairs)
+    drop, low, high = (100 * share for share in paired_drop(lost, won, len(pairs)))
+    same = sum(one.actions == other.actions for one, other in pairs)
+    seconds = sum(end.seconds for end in continuous) / len(pairs)
+    print(f"vln {task}, seeds {discrete[0].seed} to {discrete[-1].seed}, {time.process_time() - started:.0f} CPU-s")
+    print(f"  success in continuous motion: {rate_of(continuous)}")
+    print(f"  in the discrete environment:  {rate_of(discrete)}")
+    print(f"  {lost} lost, {won} won: {drop:.1f} points lower ({low:.1f} to {high:.1f}); the same actions in {same}; "
+          f"stopped by itself in {sum(end.stopped for end in continuous)}, "
+          f"{sum(end.collisions for end in continuous)} collisions, {seconds:.1f} s each", flush=True)  # fmt: skip
+    for one, other in pairs:
+        if one.success != other.success or not other.stopped:
+            print(f"  {one}\n  {other}")
+    return int(drop > 1.0 or not all(end.stopped for end in continuous if end.success))
 
 
 def report(title: str, rows: list[dict[str, Any]], started: float) -> None:
@@ -212,6 +209,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--bundle", type=Path)
     parser.add_argument("--task", default="GoToLocalS6N3")
+    parser.add_argument("--lines", type=Path, help="vln: JSON lines of the episodes, to go on after an interruption")
     parser.add_argument("--hostile", action="store_true")
     parser.add_argument("--only", default="")
     options = parser.parse_args()
@@ -222,10 +220,7 @@ def main() -> int:
 
         policy = load(options.bundle, threads=1)
     if options.what == "vln":
-        started = time.process_time()
-        rows = [vln_episode(options.task, 1_000_000 + seed, policy) for seed in seeds]
-        report(f"vln {options.task}", rows, started)
-        return 0
+        return vln_trial(options.task, seeds, policy, options.lines)
     names = [*FOLLOWERS] if options.what == "steps" else [*FOLLOWERS, "vln"]
     for name in (name for name in names if options.only in ("", name)):
         started = time.process_time()
