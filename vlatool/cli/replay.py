@@ -83,6 +83,9 @@ def _replay_controller(
     options = PolicyOptions(bundle, recording.about.robot, deadline_ms=0)
     found = compare(open_controller(name, chosen, options), recording.items(), recording.topics)
     answer(as_json, found.to_dict(), map(printable, replay_lines(found)))
+    if found.altered and found.difference is None:
+        raise GateFailed(f"{found.altered} commands in {file} are others than their steps sent.",
+                         "look for a second publisher; the recorded topic is not what was computed")  # fmt: skip
     if not found.equal:
         raise GateFailed(
             f"{found.differing} of {found.steps} steps of {file} are not computed again as they were.",

@@ -29,7 +29,8 @@ class VlnState(NamedTuple):
         ended_stamp: Stamp of the odometry that ended it, in seconds.
         frames: Last frames that the policy saw, uint8 (H, W, 3) each.
         actions: Indices of all actions since the instruction.
-        changes: When camera and odometry last changed.
+        changes: When camera, odometry and depth last changed.
+        arrived: Whether the robot was told that it arrived while it was paused.
     """
 
     phase: str = IDLE_PHASE
@@ -43,3 +44,4 @@ class VlnState(NamedTuple):
     frames: tuple[NDArray[Any], ...] = ()
     actions: tuple[int, ...] = ()
     changes: Mapping[str, Change] = {}
+    arrived: bool = False

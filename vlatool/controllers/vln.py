@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.controllers._discrete_policy import Observed, choose, observation, observed_by
-from vlatool.controllers._freshness import age_s, note_changes
+from vlatool.controllers._freshness import CLOCK_STEP_S, age_s, note_changes
 from vlatool.controllers._geometry import PlanarPose, pose_of, twist
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
 from vlatool.controllers._motions import BACKWARD, FORWARD, STOP, WAIT, Motion, Speeds, drive, motions_of, plan
@@ -32,6 +32,13 @@ from vlatool.messages.std_msgs import Bool, String
 
 ALLOWED_SPEED = {"linear": 0.306, "angular": 1.9}
 """Fastest of a Create 3 with its safety on, in m/s and rad/s (Create 3 documentation, "Safety")."""
+LARGEST = {
+    "position_m": 1.0, "angle_deg": 45.0, "clearance_m": 10.0, "way_share": 1.0, "max_age_s": CLOCK_STEP_S,
+    "motion_s": 600.0, "settle_s": 60.0,
+}  # fmt: skip
+"""Setting -> its largest value; the least is 0. With larger ones no motion would be checked."""
+ASTRAY_M = 0.5
+"""Distance that a step's end may be farther away than at its start, in metres: the odometry has jumped beyond it."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +51,8 @@ class Vln:
     the policy is asked again, with the action among its past ones.
 
     It ends with a ``stop`` label or when ``/vln/arrived`` says so. It never moves without an instruction; an empty one
-    ends it. It stands while the camera or the odometry is older than ``max_age_s``. The first word of ``/vln/status``
-    is ``idle``, ``running``, ``paused``, ``arrived`` or ``failed``.
+    ends it. It stands while the camera, the odometry or a depth camera that was there is older than ``max_age_s``. The
+    first word of ``/vln/status`` is ``idle``, ``running``, ``paused``, ``arrived`` or ``failed``.
 
     Args:
         rate: Steps in a second.
@@ -57,7 +64,7 @@ class Vln:
         angle_deg: Angle from its end at which a turn ends, in degrees.
         clearance_m: Depth beyond a step that must be free, in metres.
         way_share: Share of the width of the depth image, in its middle, that is the way ahead.
-        max_age_s: Age of the camera and of odometry above which the robot stands, in seconds.
+        max_age_s: Age of the camera, odometry and depth above which the robot stands, in seconds.
         motion_s: Time after which a motion that did not reach its end is over, in seconds.
         settle_s: Time after a motion after which a frame is used whatever its stamp, in seconds.
         max_actions: Actions after which it gives up; 0 for none.
@@ -91,8 +98,8 @@ class Vln:
         check_range("forward_m", self.forward_m, 0.01, 10.0)
         check_range("max_linear_speed", self.max_linear_speed, 0.01, ALLOWED_SPEED["linear"])
         check_range("max_angular_speed", self.max_angular_speed, 0.01, ALLOWED_SPEED["angular"])
-        for name in ("position_m", "angle_deg", "clearance_m", "way_share", "max_age_s", "motion_s", "settle_s"):
-            check_range(name, getattr(self, name), 0.0)
+        for name, high in LARGEST.items():
+            check_range(name, getattr(self, name), 0.0, high)
         check_range("max_actions", self.max_actions, 0)
         if self.policy is not None:
             motions_of(self._observed.labels, self.motions)
@@ -148,7 +155,7 @@ class Vln:
     def step(self, snapshot: Snapshot, state: VlnState) -> tuple[Command, VlnState]:
         """Return the velocity and the status at this step."""
         state = self._listen(snapshot, state)
-        changes = note_changes(snapshot, ("image", "odometry"), state.changes)
+        changes = note_changes(snapshot, ("image", "odometry", "depth"), state.changes)
         state = state._replace(changes=changes)
         if state.phase in (IDLE_PHASE, ARRIVED_PHASE, FAILED_PHASE):
             return self._stand(state)
@@ -157,6 +164,8 @@ class Vln:
         if trouble or pose is None:
             return self._stand(state._replace(phase=PAUSED_PHASE, detail=trouble))
         state = state._replace(phase=RUNNING_PHASE)
+        if state.arrived:  # the next step says so: nobody arrives who is paused
+            return self._stand(state._replace(detail="looking"))
         if state.motion is not None:
             return self._move(snapshot, state, state.motion, pose)
         return self._decide(snapshot, state, pose)
@@ -173,19 +182,19 @@ class Vln:
             self.policy.reset()
             phase = RUNNING_PHASE if text else IDLE_PHASE
             return VlnState(phase=phase, instruction=text, heard=reading.sequence, changes=state.changes)
-        arrived = snapshot.readings.get("arrived", ())
-        if state.phase in (RUNNING_PHASE, PAUSED_PHASE) and any(
-            getattr(item.message, "data", False) for item in arrived
-        ):
-            return state._replace(
-                phase=ARRIVED_PHASE if state.phase == RUNNING_PHASE else state.phase, motion=None, detail=""
-            )
+        said = any(getattr(item.message, "data", False) for item in snapshot.readings.get("arrived", ()))
+        if state.phase in (RUNNING_PHASE, PAUSED_PHASE) and (said or state.arrived):
+            if state.phase == PAUSED_PHASE:
+                return state._replace(arrived=True, motion=None, detail="")
+            return state._replace(phase=ARRIVED_PHASE, arrived=False, motion=None, detail="")
         return state
 
     def _trouble(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose | None) -> str:
         """Return why the robot cannot move now; empty when it can."""
-        for name, what in (("odometry", "odometry"), ("image", "camera")):
+        for name, what in (("odometry", "odometry"), ("image", "camera"), ("depth", "depth")):
             age = age_s(snapshot, name, state.changes)
+            if name == "depth" and name not in snapshot.newest:
+                continue
             if not age <= self.max_age_s:
                 return f"no {what} yet" if math.isinf(age) else f"{what} {age:.1f} s old"
         return "odometry is not a pose" if pose is None else ""
@@ -197,12 +206,15 @@ class Vln:
         waypoint = motion.goal
         late = snapshot.time_s - motion.began_s > self.motion_s
         hit = motion.kind == FORWARD and self._ahead(snapshot) < self.clearance_m
-        if not over and (late or hit):
+        left_m = math.hypot(motion.goal.x - pose.x, motion.goal.y - pose.y)
+        astray = motion.kind in (FORWARD, BACKWARD) and left_m > self.forward_m + ASTRAY_M
+        if not over and (late or hit or astray):
             over, waypoint, linear, angular = True, pose, 0.0, 0.0
         if over:
             stamp = self._odometry_stamp(snapshot)
             state = state._replace(motion=None, waypoint=waypoint, ended_s=snapshot.time_s, ended_stamp=stamp)
-            return self._stand(state._replace(detail="blocked on the way" if hit else "looking"))
+            detail = "blocked on the way" if hit else "odometry jumped" if astray else "looking"
+            return self._stand(state._replace(detail=detail))
         return self._command(state._replace(detail=motion.kind), linear, angular), state
 
     def _decide(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose) -> tuple[Command, VlnState]:

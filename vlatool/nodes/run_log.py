@@ -150,15 +150,23 @@ class Received(NamedTuple):
     digest: str
 
 
-Item = ControllerRecord | StepRecord | Received
+class LogEnd(NamedTuple):
+    """The end of a log, and why it is not whole; an empty note where it is."""
+
+    note: str
+
+
+Item = ControllerRecord | StepRecord | Received | LogEnd
+CUT = "the log has no end: its process was killed, or the file was cut"
 
 
 def read_log(path: Path) -> Iterator[Item]:
-    """Return what a log holds, in order.
+    """Return what a log holds, in order; last what its end says, or that it has none.
 
     Raises:
         DataError: when it is damaged, or the log of something else than a controller.
     """
+    end = LogEnd(CUT)
     for frame in read_run(path):
         try:
             if frame.kind is FrameKind.HEADER:
@@ -168,9 +176,12 @@ def read_log(path: Path) -> Iterator[Item]:
             elif frame.kind is FrameKind.CALL:
                 message = decode(find_type(frame.values["type"]), frame.arrays["cdr"].tobytes())
                 yield Received(str(frame.values["input"]), message, str(frame.values["digest"]))
+            else:
+                end = LogEnd(str(frame.values["note"]))
         except (KeyError, AttributeError, BusError, UsageError) as error:
             raise DataError(f"{path} is not the log of a controller: {error}.",
                             "name a file of vlatool run --record, or a bag") from None  # fmt: skip
+    yield end
 
 
 def is_log(path: Any) -> bool:

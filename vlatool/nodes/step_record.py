@@ -160,14 +160,22 @@ def topic_of(node: str, part: str) -> str:
     return f"/{node.strip('/')}/{part}"
 
 
-def differences(recorded: Mapping[str, tuple[str, ...]], command: Command) -> list[tuple[str, int, str, str]]:
-    """Return where a computed command differs from a recorded one: output, index, recorded text, computed text."""
+def differences(record: StepRecord, command: Command) -> list[tuple[str, int, str, str]]:
+    """Return where a computed command differs from a recorded step: output, index, recorded text, computed text.
+
+    Answers of services and the status are compared behind the messages.
+    """
+    recorded = {**record.messages, **{f"response {number}": (text,) for number, text in record.responses.items()}}
+    computed = {name: tuple(map(to_text, messages)) for name, messages in command.messages.items()}
+    computed |= {f"response {number}": (to_text(response),) for number, response in command.responses.items()}
     found = []
-    for name in sorted({*recorded, *command.messages}):
-        old, new = recorded.get(name, ()), tuple(map(to_text, command.messages.get(name, ())))
+    for name in sorted({*recorded, *computed}, key=lambda name: (name not in command.messages, name)):
+        old, new = recorded.get(name, ()), computed.get(name, ())
         for index in range(max(len(old), len(new))):
             one = old[index] if index < len(old) else ""
             other = new[index] if index < len(new) else ""
             if one != other:
                 found.append((name, index, one, other))
+    if record.status != command.status:
+        found.append(("status of the step", 0, record.status, command.status))
     return found

@@ -161,8 +161,8 @@ def read_run(path: str | os.PathLike[str]) -> Iterator[Frame]:
     """Return the frames of a file, up to one that was not written to its end.
 
     Raises:
-        DataError: when the file cannot be read or is none of a recorded run, or at the first frame that is not as it
-            was written.
+        DataError: when the file cannot be read or is none of a recorded run, at the first frame that is not as it was
+            written, or where something follows its end.
     """
     try:
         with Path(path).open("rb") as file:
@@ -175,6 +175,8 @@ def read_run(path: str | os.PathLike[str]) -> Iterator[Frame]:
                 _check_place(frame, number, f"{path}: frame {number}")
                 yield frame
                 left, number = left - taken, number + 1
+                if frame.kind is FrameKind.END and left:
+                    raise DataError(f"{path}: {left:,} bytes follow its end.", "use the frames before its end")
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.", "check the path") from None
 
