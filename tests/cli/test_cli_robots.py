@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
+import signal
 import threading
 import time
 from pathlib import Path
@@ -18,6 +21,7 @@ from vlatool.buses import QoS, open_bus
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.sensor_msgs import JointState
 from vlatool.messages.std_msgs import Header, String
+from vlatool.nodes.run_log import RunLog
 
 WEIGHTS = ", ".join(["0.01"] * 14)
 PRODUCT = f"g (float[1,7] q) => (float[1,2] y) <float[7,2] w = {{{WEIGHTS}}}> {{ y = MatMul(q, w) }}"
@@ -98,6 +102,44 @@ def test_json_of_a_run(vlatool, bus, joints, bundle, map_file):
     found = json.loads(out)
     assert (code, found["controller"], found["lost_records"], found["failure"]) == (0, "policy", 0, "")
     assert found["compute_ms"]["samples"] == found["steps"]
+
+
+def test_a_run_that_is_interrupted_says_what_it_was(vlatool, bus, joints, bundle, map_file):
+    words = ("run", "policy", "--bundle", bundle, "--map", map_file, "--bus", bus, "--threads", 1, "--settle-s", 0)
+    found = []
+    for flags in ((), ("--json",)):
+        threading.Timer(0.8, os.kill, (os.getpid(), signal.SIGINT)).start()
+        code, out, err = vlatool(*words, *flags)
+        assert code == 130, err
+        found.append(out)
+    assert re.search(r"^\d+ steps in 0\.\d s", found[0])
+    document = json.loads(found[1])
+    assert document["error"]["type"] == "Interrupted"
+    assert document["steps"] > 0
+
+
+def test_records_that_are_not_whole_and_a_report_that_is_not_written_are_errors_with_the_result(
+    vlatool, bus, joints, bundle, map_file, tmp_path, monkeypatch
+):
+    words = ("run", "policy", "--bundle", bundle, "--map", map_file, "--bus", bus, "--seconds", 0.2, "--threads", 1,
+             "--json")  # fmt: skip
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RunLog, "__call__", full)
+    code, out, _ = vlatool(*words, "--record", tmp_path / "log", "--report", tmp_path / "run.html")
+    found = json.loads(out)
+    assert (code, found["error"]["type"]) == (3, "OutputError")
+    assert "No space left on device" in found["error"]["message"]
+    assert found["steps"] > 0
+    assert (tmp_path / "run.html").exists()
+    monkeypatch.setattr(Path, "replace", full)
+    code, out, _ = vlatool(*words, "--report", tmp_path / "second.html")
+    found = json.loads(out)
+    assert (code, found["error"]["type"]) == (3, "OutputError")
+    assert found["error"]["message"] == f"{tmp_path / 'second.html'} cannot be written: No space left on device."
+    assert found["steps"] > 0
 
 
 def test_topics_lists_what_is_there(vlatool, bus, joints):

@@ -17,7 +17,7 @@ from vlatool.cli import _complete
 from vlatool.cli._default import DefaultGroup
 from vlatool.cli._document import answer
 from vlatool.cli._stages import build_command, failing_command
-from vlatool.errors import PluginError, UsageError, fix_for, suggest
+from vlatool.errors import OutputError, PluginError, UsageError, fix_for, suggest
 from vlatool.files.printable import one_line, printable
 
 if TYPE_CHECKING:
@@ -205,11 +205,12 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
     result = run_on_bus(
         plan,
         lambda about: _say(about.node, about.topics),
-        lambda *ended: _write_report(plan, *ended),
+        lambda *ended: _end(plan, as_json, *ended),
         lambda topics: typer.echo(f"... {printable(waiting(topics))}", err=True),
         lambda fault: typer.echo(f"... {printable(fault_text(fault))}", err=True),
     )
-    answer(as_json, result.to_dict(), _lines(result))
+    if result.failure:
+        raise OutputError(f"The records of the run are not whole: {result.failure}.", "free some space, and run it again")
 
 
 def _say(node: str, topics: Mapping[str, str]) -> None:
@@ -217,8 +218,9 @@ def _say(node: str, topics: Mapping[str, str]) -> None:
     typer.echo(printable(f"{node} runs: {text}"), err=True)
 
 
-def _write_report(plan: RunPlan, result: RunResult, trace: Trace) -> None:
-    """Write the HTML report of a run, however it ended."""
+def _end(plan: RunPlan, as_json: bool, result: RunResult, trace: Trace) -> None:
+    """Hand over what a run was and write its HTML report, however it ended."""
+    answer(as_json, result.to_dict(), _lines(result))
     if plan.report is None:
         return
     from vlatool.nodes.report_page import write_page

@@ -103,7 +103,7 @@ class RunWriter:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        self._crc = 0
+        self._crc, self._path = 0, path
         self.size = 0
         """Bytes that were written."""
         try:
@@ -120,11 +120,18 @@ class RunWriter:
             ) from None
 
     def append(self, frame: Frame, most: float = math.inf) -> bool:
-        """Write a frame, unless the file would then be larger than ``most`` bytes; returns whether it was written."""
+        """Write a frame, unless the file would then be larger than ``most`` bytes; returns whether it was written.
+
+        Raises:
+            OSError: when the disk takes no more; names the file.
+        """
         content, crc = _encoded(frame, self._crc)
         if self.size + len(content) > most:
             return False
-        self._write(content)
+        try:
+            self._write(content)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, os.fspath(self._path)) from error
         self._crc = crc
         return True
 
