@@ -270,8 +270,8 @@ class Events:
             if t.startswith("obstacle") and random.random() < 0.7:
                 low, high = {"far": (0.7, 0.8), "near": (0.5, 0.62), "close": (0.15, 0.45)}[t.split()[1]]
                 scan[random.integers(AHEAD - 1, AHEAD + 2)] = random.uniform(low, high)
-                behind = AHEAD + RAYS // 2 + random.integers(0, 2)
-                scan[behind] = random.uniform(low, high) if random.random() < 0.3 else 3.0
+                behind = random.uniform(low, high) if random.random() < 0.3 else 3.0
+                scan[AHEAD + RAYS // 2 + random.integers(0, 2)] = behind
             if t == "gap":
                 scan[AHEAD - 2 : AHEAD + 3] = math.nan
             if random.random() < 0.01:

@@ -255,6 +255,8 @@ def edited(path, value):
         (edited("inputs/image/type", "acme/msg/X"), "Unknown type of message 'acme/msg/X'"),
         (edited("inputs/image/stale_s", 0), "stale_s is 0; it must be above 0"),
         (edited("inputs/image/stale_s", "x"), "stale_s is 'x'; it must be a number"),
+        (edited("inputs/image/noisy", "no"), "noisy is 'no'; it must be true or false"),
+        (edited("inputs/task/text", 5), "its text is 5; it must be a text"),
         (edited("inputs/state/elements/pan", None), "does not say what is 'pan'"),
         (edited("inputs/state/elements/wrist", "x"), "has 'wrist', which the policy does not have"),
         (edited("inputs/state/elements", ["pan"]), "they must be a mapping"),

@@ -153,6 +153,17 @@ def test_levels_leave_their_share_and_fall_one_step_a_second_emergency_only_by_i
     assert seen[60:] == [0.04] * 20 + [0.1] * 20 + [0.2] * 20
 
 
+def test_a_monitor_that_holds_at_its_start_passes_nothing_on_until_it_is_released():
+    feed, monitor = Feed(), SafetyMonitor(hold_at_start=True)
+    (linear, _, status), state = passed_on(feed, monitor, monitor.start(), 0.0)
+    assert (linear, status) == (0.0, "EMERGENCY")
+    messages = ready(feed, 0.1, cmd_vel=velocity(0.2))
+    requests = [Request("emergency", SetBoolRequest(False), 1)]
+    command, state = monitor.step(feed.snapshot(0.1, requests=requests, **messages), state)
+    assert command.responses[1].success
+    assert speeds(command, "safe_cmd_vel")[0] == pytest.approx(0.04)
+
+
 def test_emergency_is_not_released_while_its_condition_holds_and_the_answer_names_it():
     feed, monitor = Feed(), SafetyMonitor()
     stopped = ready(feed, 0.0, emergency_stop=Bool(True))

@@ -210,7 +210,9 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any]) -> None:
         lambda fault: typer.echo(f"... {printable(fault_text(fault))}", err=True),
     )
     if result.failure:
-        raise OutputError(f"The records of the run are not whole: {result.failure}.", "free some space, and run it again")
+        raise OutputError(
+            f"The records of the run are not whole: {result.failure}.", "free some space, and run it again"
+        )
 
 
 def _say(node: str, topics: Mapping[str, str]) -> None:

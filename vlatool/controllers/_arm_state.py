@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from vlatool.controllers._arm_return import Return
+from vlatool.controllers._arm_track import Track
 from vlatool.controllers._freshness import Changes
 from vlatool.runtime.envelope import Envelope
 
@@ -25,6 +26,7 @@ class ArmState(NamedTuple):
         changes: When each input last changed.
         last_s: Time of the last command, in seconds of the snapshots.
         calls: Numbers of the calls that wait for the start pose.
+        track: Joint states that were believed.
     """
 
     phase: str = WAITING
@@ -35,3 +37,4 @@ class ArmState(NamedTuple):
     changes: Changes = {}
     last_s: float = 0.0
     calls: tuple[int, ...] = ()
+    track: Track = Track()

@@ -78,6 +78,7 @@ class SafetyMonitor:
         fence: ``X_MIN,Y_MIN,X_MAX,Y_MAX`` in the frame of the odometry, in metres; none when empty.
         fence_warning_m: Distance to the fence that is a WARNING, in metres.
         task_s: Time for which a task may run, in seconds.
+        hold_at_start: Whether it begins with an EMERGENCY, for one that is restarted by itself.
 
     Raises:
         UsageError: for a setting out of its range.
@@ -110,6 +111,7 @@ class SafetyMonitor:
     fence: str = ""
     fence_warning_m: float = 0.3
     task_s: float = 600.0
+    hold_at_start: bool = False
     _robot: Robot = field(init=False, repr=False, compare=False)
     _table: tuple[Rule, ...] = field(default=TABLE, init=False, repr=False, compare=False)
 
@@ -166,8 +168,8 @@ class SafetyMonitor:
         return (Service("emergency", "/safety_monitor/emergency", SetBoolRequest, SetBoolResponse),)
 
     def start(self) -> _State:
-        """Return the state at NORMAL, before anything was measured."""
-        return _State()
+        """Return the state before anything was measured: at NORMAL, or at EMERGENCY where it holds at its start."""
+        return _State(Status(Level.EMERGENCY if self.hold_at_start else Level.NORMAL))
 
     def step(self, snapshot: Snapshot, state: _State) -> tuple[Command, _State]:
         """Return the velocity for the base at this step; zero, and an EMERGENCY, where the monitor fails."""

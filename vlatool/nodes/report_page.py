@@ -30,7 +30,9 @@ def write_page(path: Path, result: RunResult, trace: Trace) -> None:
     try:
         write_own_file(path, page(result, trace), force=False, comment="<!-- {} -->")
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}.", "free some space, or check the path") from error
+        raise OutputError(
+            f"{path} cannot be written: {error.strerror}.", "free some space, or check the path"
+        ) from error
 
 
 def page(result: RunResult, trace: Trace) -> str:
