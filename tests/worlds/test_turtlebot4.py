@@ -198,8 +198,10 @@ def test_something_steps_in_and_people_give_way():
     "knobs",
     [
         {"only": "radar"}, {"delay": "scan=soon"}, {"drop": "sonar=0.1"}, {"size_m": 1.0}, {"pillars": -1},
-        {"noise": "-1"},
+        {"noise": "-1"}, {"width": 0}, {"width": 1_000_000}, {"height": -1}, {"battery": math.nan}, {"battery": -1.0},
+        {"battery": 90.0}, {"gaps": 5.0}, {"drop": "2"}, {"freeze": "scan=1.5"}, {"pillars": 100_000},
     ],
+    ids=str,
 )  # fmt: skip
 def test_knobs_out_of_range_are_refused(knobs: dict[str, Any]):
     with pytest.raises(UsageError) as caught:

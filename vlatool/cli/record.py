@@ -100,7 +100,9 @@ def _record_bus(bus: str, output: Path, topics: list[str], seconds: float | None
     from vlatool.nodes.bus_recorder import BusRecorder, RecordSummary
     from vlatool.nodes.fault_watch import fault_text, to_plain_faults
 
-    if not str(output).strip() or ":" in str(output):
+    if not str(output).strip(" ."):
+        raise UsageError(f"'{output}' is not the name of a bag.", "write for example -o run.mcap")
+    if ":" in str(output):
         raise UsageError(f"The bag '{output}' has a colon in its name, which separates bags.", "name it without one")
     opened = open_bus(bus, NODE)
     summary = RecordSummary()

@@ -10,6 +10,7 @@ from typing import Any
 
 from vlatool.controllers import Reading, Request, RobotController, Snapshot
 from vlatool.errors import DataError
+from vlatool.files.printable import amount
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.nodes.content import digest, digest_of, from_text
@@ -247,7 +248,7 @@ def lines(report: ReplayReport) -> Iterator[str]:
         yield f"  recorded  {_shown(first.recorded)}"
         yield f"  computed  {_shown(first.computed)}"
     if report.altered:
-        yield f"{report.altered} recorded commands were sent by no step: they were altered, or others sent them"
+        yield f"{amount(report.altered, 'recorded command')} that no step sent: altered, or of another node"
     if report.unheard:
         yield f"{report.unheard} of them are not among the recorded messages of their topics"
     if report.note:
