@@ -151,6 +151,26 @@ def test_topics_lists_what_is_there(vlatool, bus, joints):
     assert [topic["topic"] for topic in json.loads(out)["topics"]] == ["/cmd_vel", "/joint_states"]
 
 
+@pytest.mark.parametrize(("name", "path"), [("run.mcap", "run"), ("run.db3", "run"), ("run.bag", "run.bag")])
+def test_record_names_the_bag_that_is_there(vlatool, bus, joints, tmp_path, name, path):
+    code, out, _ = vlatool(
+        "record", "--bus", bus, "-o", tmp_path / name, "--seconds", 0.3, "--json", "/joint_states", "/x"
+    )
+    found = json.loads(out)
+    assert (code, found["file"]) == (0, str(tmp_path / path))
+    assert Path(found["file"]).exists()
+    assert found["messages"]["/joint_states"] > 3
+    assert found["unknown"] == {"/x": "nobody published it"}
+    code, out, _ = vlatool("topics", "--bus", f"bag:{tmp_path / path}", "--seconds", 0.1)
+    assert out.startswith("/joint_states")
+
+
+@pytest.mark.parametrize("name", ["", "  ", ".", "a:b"])
+def test_record_refuses_what_names_no_bag(vlatool, bus, name):
+    code, _, err = vlatool("record", "--bus", bus, "-o", name, "--seconds", 0.1)
+    assert code == 2, err
+
+
 def test_dry_run_of_a_controller(vlatool):
     code, out, err = vlatool("run", "roi-tracker", "--dry-run", "--map", "roi=/face", "--rate", 20)
     assert (code, err) == (0, "")

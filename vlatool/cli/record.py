@@ -97,6 +97,7 @@ def record(
 def _record_bus(bus: str, output: Path, topics: list[str], seconds: float | None, as_json: bool) -> None:
     """Record topics of a bus to a new bag."""
     from vlatool.buses import open_bus
+    from vlatool.buses.bag import Bag
     from vlatool.nodes.bus_recorder import BusRecorder, RecordSummary
     from vlatool.nodes.fault_watch import fault_text, to_plain_faults
 
@@ -107,7 +108,7 @@ def _record_bus(bus: str, output: Path, topics: list[str], seconds: float | None
     opened = open_bus(bus, NODE)
     summary = RecordSummary()
     try:
-        bag = open_bus(f"bag::{output}", NODE)
+        bag = Bag(f":{output}", NODE)
         try:
             recorder = BusRecorder(opened, bag, NODE, topics)
             summary = recorder.summary
@@ -118,9 +119,10 @@ def _record_bus(bus: str, output: Path, topics: list[str], seconds: float | None
         faults = opened.faults()
     finally:
         opened.close()
-    lines = [f"{output}: {sum(summary.messages.values())} messages of {len(summary.messages)} topics in "
+    path = bag.new_path or output
+    lines = [f"{path}: {sum(summary.messages.values())} messages of {len(summary.messages)} topics in "
              f"{summary.seconds:.1f} s"]  # fmt: skip
     lines += [f"  {topic}  {count}" for topic, count in sorted(summary.messages.items())]
     lines += [f"  {topic} is not recorded: {why}" for topic, why in sorted(summary.unknown.items())]
     lines += [f"  on the bus: {fault_text(fault)}" for fault in faults]
-    answer(as_json, {"file": str(output), **vars(summary), "faults": to_plain_faults(faults)}, map(printable, lines))
+    answer(as_json, {"file": str(path), **vars(summary), "faults": to_plain_faults(faults)}, map(printable, lines))

@@ -79,12 +79,12 @@ def survey(bus: Bus, node: str, seconds: float) -> list[TopicReport]:
     watches: dict[str, _Watch] = {}
     refused: dict[str, str] = {}
     recorded = {info.topic for info in bus.topics() if not info.publishers and not info.subscribers}
-    bus.wait_for_peers((), 0.0)  # from here on, a recording plays
     end = time.monotonic() + seconds
     while True:
         for info in bus.topics():
             if info.topic not in watches and info.topic not in refused and info.types:
                 _watch(bus, info, watches, refused)
+        bus.wait_for_peers((), 0.0)  # a recording plays the topics that are watched by then
         left = end - time.monotonic()
         if left <= 0:
             break
