@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
+import signal
 import threading
 import time
 from pathlib import Path
@@ -18,6 +21,7 @@ from vlatool.buses import QoS, open_bus
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.sensor_msgs import JointState
 from vlatool.messages.std_msgs import Header, String
+from vlatool.nodes.run_log import RunLog
 
 WEIGHTS = ", ".join(["0.01"] * 14)
 PRODUCT = f"g (float[1,7] q) => (float[1,2] y) <float[7,2] w = {{{WEIGHTS}}}> {{ y = MatMul(q, w) }}"
@@ -100,6 +104,44 @@ def test_json_of_a_run(vlatool, bus, joints, bundle, map_file):
     assert found["compute_ms"]["samples"] == found["steps"]
 
 
+def test_a_run_that_is_interrupted_says_what_it_was(vlatool, bus, joints, bundle, map_file):
+    words = ("run", "policy", "--bundle", bundle, "--map", map_file, "--bus", bus, "--threads", 1, "--settle-s", 0)
+    found = []
+    for flags in ((), ("--json",)):
+        threading.Timer(0.8, os.kill, (os.getpid(), signal.SIGINT)).start()
+        code, out, err = vlatool(*words, *flags)
+        assert code == 130, err
+        found.append(out)
+    assert re.search(r"^\d+ steps in 0\.\d s", found[0])
+    document = json.loads(found[1])
+    assert document["error"]["type"] == "Interrupted"
+    assert document["steps"] > 0
+
+
+def test_records_that_are_not_whole_and_a_report_that_is_not_written_are_errors_with_the_result(
+    vlatool, bus, joints, bundle, map_file, tmp_path, monkeypatch
+):
+    words = ("run", "policy", "--bundle", bundle, "--map", map_file, "--bus", bus, "--seconds", 0.2, "--threads", 1,
+             "--json")  # fmt: skip
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RunLog, "__call__", full)
+    code, out, _ = vlatool(*words, "--record", tmp_path / "log", "--report", tmp_path / "run.html")
+    found = json.loads(out)
+    assert (code, found["error"]["type"]) == (3, "OutputError")
+    assert "No space left on device" in found["error"]["message"]
+    assert found["steps"] > 0
+    assert (tmp_path / "run.html").exists()
+    monkeypatch.setattr(Path, "replace", full)
+    code, out, _ = vlatool(*words, "--report", tmp_path / "second.html")
+    found = json.loads(out)
+    assert (code, found["error"]["type"]) == (3, "OutputError")
+    assert found["error"]["message"] == f"{tmp_path / 'second.html'} cannot be written: No space left on device."
+    assert found["steps"] > 0
+
+
 def test_topics_lists_what_is_there(vlatool, bus, joints):
     code, out, err = vlatool("topics", "--bus", bus, "--seconds", 0.3)
     assert (code, err) == (0, "")
@@ -107,6 +149,26 @@ def test_topics_lists_what_is_there(vlatool, bus, joints):
     assert re.search(r"/joint_states +sensor_msgs/msg/JointState .* Hz .* ms  arm -> -", out)
     code, out, _ = vlatool("topics", "--bus", bus, "--seconds", 0, "--json")
     assert [topic["topic"] for topic in json.loads(out)["topics"]] == ["/cmd_vel", "/joint_states"]
+
+
+@pytest.mark.parametrize(("name", "path"), [("run.mcap", "run"), ("run.db3", "run"), ("run.bag", "run.bag")])
+def test_record_names_the_bag_that_is_there(vlatool, bus, joints, tmp_path, name, path):
+    code, out, _ = vlatool(
+        "record", "--bus", bus, "-o", tmp_path / name, "--seconds", 0.3, "--json", "/joint_states", "/x"
+    )
+    found = json.loads(out)
+    assert (code, found["file"]) == (0, str(tmp_path / path))
+    assert Path(found["file"]).exists()
+    assert found["messages"]["/joint_states"] > 3
+    assert found["unknown"] == {"/x": "nobody published it"}
+    code, out, _ = vlatool("topics", "--bus", f"bag:{tmp_path / path}", "--seconds", 0.1)
+    assert out.startswith("/joint_states")
+
+
+@pytest.mark.parametrize("name", ["", "  ", ".", "a:b"])
+def test_record_refuses_what_names_no_bag(vlatool, bus, name):
+    code, _, err = vlatool("record", "--bus", bus, "-o", name, "--seconds", 0.1)
+    assert code == 2, err
 
 
 def test_dry_run_of_a_controller(vlatool):
@@ -211,8 +273,8 @@ WRONG = [
     ((*POLICY, "--map", "absent.yaml"), 3, "absent.yaml cannot be read"),
     ((*POLICY, "--map", "broken.yaml"), 3, "is not valid YAML"),
     ((*POLICY, "--map", "latin.yaml"), 3, "is not valid YAML"),
-    ((*POLICY, "--map", "tag.yaml"), 3, "is not valid YAML"),
-    ((*POLICY, "--map", "list.yaml"), 3, "is not a mapping"),
+    ((*POLICY, "--map", "tag.yaml"), 3, "only plain values are read"),
+    ((*POLICY, "--map", "list.yaml"), 3, "must be a mapping"),
     ((*POLICY, "--map", "empty.yaml", "--map", "list.yaml"), 2, "Two maps are named"),
     ((*POLICY, "--map", "part.yaml"), 2, "does not say what is 'joint2'"),
     ((*POLICY, "--deadline-ms", "5000", "--map", "empty.yaml"), 2, "longer than the control period"),

@@ -15,6 +15,8 @@ from vlatool.messages.sensor_msgs import BatteryState, JointState, LaserScan
 from vlatool.messages.std_msgs import Bool, String
 
 RAYS, ROWS, COLUMNS = 36, 24, 32
+AHEAD = RAYS // 4
+"""Ray that points where the robot goes: the lidar of a TurtleBot 4 is turned by 90 degrees to the left."""
 FENCE = (-3.0, -3.0, 3.0, 3.0)
 HFOV, TASK_S = math.radians(69.0), 3.0
 FOLLOWS = {
@@ -62,7 +64,13 @@ class Reference:
         if not usable:
             return self.level, 0.0, 0.0, answers
         scale = (1.0, 0.5, 0.2)[self.level]
-        return self.level, scale * min(max(linear, -0.306), 0.306), scale * min(max(angular, -1.9), 1.9), answers
+        linear, angular = self.within(linear, angular)
+        return self.level, scale * linear, scale * angular, answers
+
+    @staticmethod
+    def within(linear: float, angular: float) -> tuple[float, float]:
+        """Speeds that are passed on at most: those of the way that is looked at, too."""
+        return min(max(linear, -0.306), 0.306), min(max(angular, -1.9), 1.9)
 
     def demand(self, time: float, event: dict[str, Any]) -> int:
         for name, value in event.items():
@@ -71,7 +79,7 @@ class Reference:
         asked = [0]
         linear, angular = self.last.get("command", (0.0, 0.0))
         finite = math.isfinite(linear) and math.isfinite(angular)
-        way = self.way(linear, angular) if finite else []
+        way = self.way(*self.within(linear, angular)) if finite else []
         out = self.out(time, event)
         gap, near, cliff = self.look(way, event)
         if gap:
@@ -87,12 +95,13 @@ class Reference:
         asked += [2] if self.jumped(time, event) else []
         for limit, level in ((0.2, 1), (0.1, 2), (0.05, 3)):
             asked += [level] if self.last.get("battery", 1.0) < limit else []
-        amperes = max((abs(value) for value in self.last.get("current", [])), default=0.0)
+        amperes = max((abs(value) for value in self.last.get("current", []) if not math.isnan(value)), default=0.0)
         asked += [2] if amperes > 3.0 else []
         asked += [3] if amperes > 6.0 else []
         if self.pose is not None:
             x, y = self.pose[0][:2]
-            inside = min(x - FENCE[0], FENCE[2] - x, y - FENCE[1], FENCE[3] - y)
+            unknown_s = time - min(self.pose[1], self.stamp["odometry"][1])
+            inside = min(x - FENCE[0], FENCE[2] - x, y - FENCE[1], FENCE[3] - y) - 0.306 * unknown_s
             asked += [1] if inside < 0.3 else []
             asked += [3] if inside < 0.0 else []
         asked += [2] if self.tasked(time, event) else []
@@ -149,12 +158,12 @@ class Reference:
             unknown = rays = 0
             ahead = math.atan2(way[4][1], way[4][0]) if way else 0.0
             for index, value in enumerate(self.last["scan"].tolist()):
-                angle = -math.pi + index * 2 * math.pi / RAYS
+                angle = -math.pi / 2 + index * 2 * math.pi / RAYS  # the lidar is turned to the left, 4 cm behind
                 if way and abs(math.remainder(angle - ahead, 2 * math.pi)) < math.radians(20):
                     rays, unknown = rays + 1, unknown + math.isnan(value)
                 if math.isfinite(value):
-                    points.append((value * math.cos(angle), value * math.sin(angle)))
-            gap = bool(way) and (rays == 0 or unknown / rays > 0.1)
+                    points.append((value * math.cos(angle) - 0.04, value * math.sin(angle)))
+            gap = bool(way) and (rays < 3 or unknown / rays > 0.1)
         focal = COLUMNS / (2 * math.tan(HFOV / 2))
         for row in range(2, ROWS, 4):
             for column in range(2, COLUMNS, 4):
@@ -260,10 +269,11 @@ class Events:
             scan = random.uniform(3, 3.1, RAYS)
             if t.startswith("obstacle") and random.random() < 0.7:
                 low, high = {"far": (0.7, 0.8), "near": (0.5, 0.62), "close": (0.15, 0.45)}[t.split()[1]]
-                scan[random.integers(RAYS // 2 - 1, RAYS // 2 + 2)] = random.uniform(low, high)
-                scan[random.integers(0, 2)] = random.uniform(low, high) if random.random() < 0.3 else 3.0
+                scan[random.integers(AHEAD - 1, AHEAD + 2)] = random.uniform(low, high)
+                behind = random.uniform(low, high) if random.random() < 0.3 else 3.0
+                scan[AHEAD + RAYS // 2 + random.integers(0, 2)] = behind
             if t == "gap":
-                scan[RAYS // 2 - 2 : RAYS // 2 + 3] = math.nan
+                scan[AHEAD - 2 : AHEAD + 3] = math.nan
             if random.random() < 0.01:
                 scan[:] = math.inf
             self.put("scan", scan.astype(np.float32), t == "scan frozen", t, event)
@@ -311,7 +321,7 @@ class Events:
         charge = {"low": (0.1, 0.2), "very low": (0.05, 0.1), "empty": (0.0, 0.05)}.get(t, (0.2, 1.0))
         event["battery"] = float(np.float32(random.uniform(*charge)))
         ampere = {"current": 4.0, "high current": 7.0}.get(t, 1.0)
-        event["current"] = [float(-ampere * random.uniform(0.9, 1.1)), 0.5]
+        event["current"] = [float(-ampere * random.uniform(0.9, 1.1)), 0.5, math.nan if random.random() < 0.5 else 0.2]
         event["person"], event["stop"] = t == "person", t == "stop"
         if random.random() < 0.2 and t != "long task":
             self.task = str(random.choice(FOLLOWS[self.task])) if self.task in FOLLOWS else "idle"

@@ -74,7 +74,7 @@ def test_an_arm_goes_to_its_start_pose_within_its_limits_and_then_does_what_the_
 
 def test_commands_are_stamped_trajectories_by_the_driver_s_names() -> None:
     arm = Arm(built("ur5e", lead_s=0.04))
-    command = arm.step()
+    command = arm.steps(3)
     (message,) = command.messages["trajectory"]
     assert isinstance(message, JointTrajectory)
     assert message.joint_names[0] == "shoulder_pan_joint"
@@ -84,7 +84,7 @@ def test_commands_are_stamped_trajectories_by_the_driver_s_names() -> None:
 
 def test_joint_states_are_an_output_for_ros_1() -> None:
     arm = Arm(built("so101", output="joint_state", joint_names=tuple("abcdef")))
-    (message,) = arm.step().messages["command"]
+    (message,) = arm.steps(3).messages["command"]
     assert isinstance(message, JointState)
     assert message.name == tuple("abcdef")
     assert message.header.stamp.seconds == pytest.approx(arm.time_s)
@@ -228,7 +228,8 @@ def test_nothing_is_sent_before_the_first_good_joint_state() -> None:
     assert [response.success for response in command.responses.values()] == [False]
     outside = arm.positions.copy()
     outside[3] = 0.5
-    command = arm.step(state=joint_state(arm.names, outside, 0.1))
+    for count in range(1, 4):
+        command = arm.step(state=joint_state(arm.names, outside, 0.1 * count))
     assert command.status.startswith("waiting: joint4 is at 0.5; its limits are")
     assert not command.messages
 
@@ -289,18 +290,62 @@ def test_differences_and_velocities_go_on_from_the_command(mode: str, value: flo
     assert np.diff(arm.path()[-2:], axis=0)[0] == pytest.approx([0.004] * 6, rel=1e-5)
 
 
-def test_an_arm_that_is_held_stops_and_stays_where_it_is() -> None:
-    arm = Arm(built("franka", lambda seen: seen["state"] + np.float32(0.01), max_lag_rad=0.1))
+def test_an_arm_that_is_moved_by_hand_stops_and_stays_where_it_is() -> None:
+    pose = np.array(load("controllers", "franka").ROBOT.start, np.float32)
+    arm = Arm(built("franka", lambda _: pose, max_lag_rad=0.1))
     arm.until("acting")
     arm.steps(10)
-    elsewhere = arm.positions.copy()
-    elsewhere[0] += 0.3
+    elsewhere, statuses = arm.positions.copy(), []
     for _ in range(60):
-        command = arm.step(state=joint_state(arm.names, elsewhere, arm.time_s + 0.02))
-        if arm.positions[0] == pytest.approx(elsewhere[0]):
-            break
-    assert "panda_joint1 is 0." in command.status
-    assert arm.positions == pytest.approx(elsewhere)
+        elsewhere[0] += 0.02  # a radian a second
+        statuses.append(arm.step(state=joint_state(arm.names, elsewhere, arm.time_s + 0.02)).status)
+    assert any("panda_joint1 is 0.1" in status for status in statuses)
+    assert arm.positions[0] == pytest.approx(elsewhere[0], abs=0.11)
+
+
+@pytest.mark.parametrize("count", [1, 2, 50])
+def test_joint_states_that_jump_move_no_arm(count: int) -> None:
+    arm = Arm(built("franka", max_lag_rad=0.1))
+    arm.until("acting")
+    arm.steps(10)
+    before = arm.positions.copy()
+    wrong = before.copy()
+    wrong[1] += 1.0
+    for _ in range(count):
+        command = arm.step(state=joint_state(arm.names, wrong, arm.time_s + 0.02))
+        assert command.status == "acting: panda_joint2 jumped by 1.00 rad"
+        assert arm.positions == pytest.approx(before, abs=1e-3)
+    assert "jumped" not in arm.step().status
+    assert arm.positions == pytest.approx(before, abs=1e-3)
+
+
+def test_an_arm_that_moved_while_nothing_was_heard_is_believed() -> None:
+    arm = Arm(built("franka", max_lag_rad=0.1))
+    arm.until("acting")
+    for _ in range(50):
+        arm.step(silent=True)
+    elsewhere = arm.positions.copy()
+    elsewhere[0] += 0.5
+    arm.step(state=joint_state(arm.names, elsewhere, arm.time_s + 0.02))
+    assert arm.positions == pytest.approx(elsewhere, abs=1e-3)
+
+
+def test_a_driver_that_begins_with_zeros_begins_no_way_from_there() -> None:
+    arm = Arm(built("franka"), positions=load("controllers", "franka").ROBOT.start)
+    for positions in (np.zeros(7), np.zeros(7)):
+        command = arm.step(state=joint_state(arm.names, positions, arm.time_s + 0.02))
+        assert not command.messages
+        arm.positions = np.array(arm.controller.ROBOT.start)
+    assert command.status == "waiting: joint states that agree"
+    arm.until("acting")
+    assert all(np.allclose(arm.sent(command), arm.controller.ROBOT.start, atol=0.01)
+               for command in arm.commands if command.messages)  # fmt: skip
+
+
+@pytest.mark.parametrize("settings", [{"max_age_s": 1e9}, {"max_lag_rad": 1e9}, {"max_lag_rad": -1.0}])
+def test_settings_that_switch_a_check_off_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(UsageError, match=r"allowed: from 0\.001 to"):
+        built("franka", **settings)
 
 
 def test_the_same_snapshot_and_state_give_the_same_command() -> None:
@@ -361,7 +406,7 @@ def test_a_way_that_is_not_free_ends_where_it_is_and_the_call_is_told() -> None:
     arm = Arm(
         built("aloha", return_at_start=False, start_pose=(*across[:7], *across[7:8], 0.5, 0.4, *across[10:])), pose
     )
-    arm.step()
+    arm.steps(3)
     command = arm.step(calls=1)
     for _ in range(400):
         if command.responses:
@@ -382,7 +427,7 @@ def test_a_policy_sees_targets_cameras_and_an_instruction() -> None:
         "/instruction",
     ]
     assert [entry.name for entry in arm.controller.inputs if entry.required] == ["joints", "target", "wrist"]
-    assert "no target" in arm.step().status
+    assert "no target" in arm.steps(3).status
     assert "no target" not in (status := arm.step(target=PoseStamped(pose=Pose(Point(0.1, 0.2, 0.3)))).status)
     assert "camera wrist: no image" in status
     pixels = np.arange(18, dtype=np.uint8)

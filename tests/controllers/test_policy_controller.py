@@ -214,6 +214,51 @@ def test_policy_that_fails_stops_the_robot():
     assert command.messages["action"][0].linear.x == 0
 
 
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [([0.1, math.nan], "not finite"), ([math.inf, 0.0], "not finite"), ([0.1], "has 1 numbers; 2 are mapped")],
+)
+def test_an_action_that_commands_no_number_stops_the_robot(action, words):
+    command = Feed(controller_of(Plays(spec_of((CAMERA,), SPEEDS), action)))(image=picture())
+    assert words in command.status
+    assert (command.messages["action"][0].linear.x, command.messages["action"][0].angular.z) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("index", [-1, 3, 10**9])
+def test_an_action_without_a_label_stops_the_robot(index):
+    command = Feed(controller_of(Plays(spec_of((CAMERA,), MOVES), index)))(image=picture())
+    assert "has no label" in command.status
+    assert command.messages["action"][0].linear.x == 0.0
+
+
+def arm_by_joint_states(mode):
+    """An arm that is commanded by JointStates, of whose joints the policy sees one alone."""
+    state = replace(STATE, shape=(1, 1), labels=("pan",), unit=("rad",))
+    spec = spec_of((state,), replace(ARM, mode=mode))
+    values = propose(spec)
+    values["output"]["type"] = JointState.TYPE
+    return Feed(controller_of(Plays(spec, [0.0, 0.0, 0.0]), values))
+
+
+@pytest.mark.parametrize("mode", ["absolute", "delta"])
+def test_joints_that_are_at_no_number_are_not_commanded_to_be_there(mode):
+    feed = arm_by_joint_states(mode)
+    assert "acting" in feed(state=joints([0.1, 0.2, 0.3])).status
+    for _ in range(12):
+        command = feed(state=joints([0.1, math.nan, 0.3], at=feed.tick / 10))
+        assert all(np.isfinite(message.position).all() for message in command.messages["action"])
+    if mode == "delta":
+        assert "not finite" in command.status
+
+
+def test_a_stop_commands_no_place_where_the_joints_were_long_ago():
+    feed = arm_by_joint_states("absolute")
+    feed(state=joints([0.1, 0.2, 0.3]))
+    commands = [feed() for _ in range(12)]
+    assert commands[-1].status.startswith("waiting: 'state' is 1.2 s old")
+    assert commands[-1].messages["action"] == ()
+
+
 def test_rest_of_each_output():
     arm = controller_of(Plays(spec_of()))
     assert arm.rest().messages["action"][0].points == ()
@@ -255,6 +300,8 @@ def edited(path, value):
         (edited("inputs/image/type", "acme/msg/X"), "Unknown type of message 'acme/msg/X'"),
         (edited("inputs/image/stale_s", 0), "stale_s is 0; it must be above 0"),
         (edited("inputs/image/stale_s", "x"), "stale_s is 'x'; it must be a number"),
+        (edited("inputs/image/noisy", "no"), "noisy is 'no'; it must be true or false"),
+        (edited("inputs/task/text", 5), "its text is 5; it must be a text"),
         (edited("inputs/state/elements/pan", None), "does not say what is 'pan'"),
         (edited("inputs/state/elements/wrist", "x"), "has 'wrist', which the policy does not have"),
         (edited("inputs/state/elements", ["pan"]), "they must be a mapping"),

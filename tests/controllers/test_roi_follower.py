@@ -62,6 +62,16 @@ def test_it_stands_half_a_second_after_the_target_is_gone():
     assert found[-2:] == [0.0, 0.0]
 
 
+def test_it_does_not_drive_by_a_depth_image_that_came_too_long_ago():
+    controller, feed, command, state = follow(np.full((HEIGHT, WIDTH), 1.4, np.float32))
+    assert speeds(command)[0] == pytest.approx(0.3)
+    for step in range(1, 31):
+        roi = RegionOfInterest(x_offset=11, y_offset=8, width=10, height=8)
+        command, state = controller.step(feed.snapshot(step * 0.1, roi=roi), state)
+    assert speeds(command)[0] < 0.01
+    assert command.status == "turning: depth 3.0 s old"
+
+
 def test_depth_of_nothing_but_nan_and_of_a_wrong_encoding_does_not_drive():
     assert speeds(follow(np.full((HEIGHT, WIDTH), np.nan, np.float32))[2]) == (0.0, 0.0)
     controller, feed, _, state = follow(np.full((HEIGHT, WIDTH), np.nan, np.float32))

@@ -50,14 +50,17 @@ class Drive:
         self.time, self.pose, self.ahead = 0.0, [0.0, 0.0, 0.0], ahead
         self.statuses: list[str] = []
 
-    def run(self, seconds: float, *, camera: bool = True, odom: bool = True, **messages: Any) -> None:
+    def run(
+        self, seconds: float, *, camera: bool = True, odom: bool = True, depth: bool = True, **messages: Any
+    ) -> None:
         for _ in range(round(seconds * 10)):
             if camera:
                 pixels = np.full((6, 8, 3), int(self.time * 10) % 256, np.uint8)
                 messages["image"] = image_message(pixels, "rgb8", header(self.time))
             if odom:
                 messages["odometry"] = odometry(*self.pose, stamp_s=self.time)
-            messages["depth"] = depth_image(np.full((8, 8), self.ahead, np.float32), self.time)
+            if depth:
+                messages["depth"] = depth_image(np.full((8, 8), self.ahead, np.float32), self.time)
             command, self.state = self.controller.step(self.feed.snapshot(self.time, **messages), self.state)
             messages = {}
             self.statuses.append(command.status)
@@ -230,8 +233,8 @@ def test_it_never_moves_without_an_instruction_and_an_empty_one_ends_it():
     assert drive.state.phase == "idle"
 
 
-@pytest.mark.parametrize("absent", ["camera", "odom"])
-def test_it_stands_while_camera_or_odometry_are_old_and_goes_on_afterwards(absent: str):
+@pytest.mark.parametrize("absent", ["camera", "odom", "depth"])
+def test_it_stands_while_a_sensor_is_old_and_goes_on_afterwards(absent: str):
     drive = Drive(Vln(policy=Route(FORWARD, STOP)))
     drive.run(0.1, instruction=String("go"))
     drive.run(1.0)
@@ -295,6 +298,18 @@ def test_a_word_on_arrival_while_it_is_paused_ends_the_task_once_it_runs_again(c
     words = [status.partition(" ")[0] for status in drive.statuses]
     assert list(dict.fromkeys(words[words.index("paused") :])) == ["paused", "running", "arrived"]
     assert speeds(drive.command) == (0.0, 0.0)
+
+
+def test_a_jump_of_the_odometry_ends_a_step_instead_of_making_it_longer():
+    drive = Drive(Vln(policy=Route(FORWARD, STOP)))
+    drive.run(0.1, instruction=String("go"))
+    drive.run(1.0)
+    assert speeds(drive.command)[0] > 0
+    drive.pose[0] -= 5.0
+    before = drive.pose[0]
+    drive.run(10.0)
+    assert drive.pose[0] - before < 0.1
+    assert any("odometry jumped" in status for status in drive.statuses)
 
 
 def test_a_new_instruction_resets_the_policy_and_begins_again():

@@ -72,6 +72,19 @@ def test_fields_of_several_elements() -> None:
     assert same(points(unset), POINTS)  # some drivers leave the count 0
 
 
+@pytest.mark.parametrize("several", ["x", "xyz"])
+def test_a_coordinate_of_several_elements_is_none(several: str) -> None:
+    columns = {name: np.zeros((4, 2) if name in several else 4, np.float32) for name in "xyz"}
+    with pytest.raises(BusError, match="'x' has 2 elements"):
+        points(_cloud(columns))
+
+
+def test_names_of_fields_are_shown_in_part() -> None:
+    with pytest.raises(BusError) as refused:
+        points(_cloud({"n" * 10_000 + str(number): np.zeros(4, np.float32) for number in range(9)}))
+    assert len(refused.value.message) < 1000
+
+
 def test_empty_clouds() -> None:
     for cloud in (PointCloud2(), points_message(POINTS[:0]), replace(points_message(POINTS), width=0)):
         assert same(points(cloud), np.zeros((0, 3), np.float32))

@@ -40,3 +40,9 @@ def test_missing_and_doubled_joints_are_named() -> None:
         joint_values(state, ["b", "c"])
     with pytest.raises(BusError, match="its joints: none"):
         joint_values(JointState(), ["c"])
+
+
+def test_names_of_joints_are_shown_in_part() -> None:
+    with pytest.raises(BusError) as refused:
+        joint_values(JointState(name=("n" * 10_000, "m" * 10_000), position=np.zeros(2)), ["a"])
+    assert len(refused.value.message) < 500

@@ -69,5 +69,5 @@ def test_rest_reaches_the_world():
 
 
 def test_two_types_on_a_topic_are_refused():
-    with pytest.raises(UsageError, match="/odom carries nav_msgs/msg/Odometry; the controller's 'cmd' is geometry"):
-        Simulation(PointWorld(), [Node(GoTo(), {"cmd": "/odom"})])
+    with pytest.raises(UsageError, match="/odom carries nav_msgs/msg/Odometry; the controller's 'instruction' is"):
+        Simulation(PointWorld(), [Node(GoTo(), {"instruction": "/odom"})])

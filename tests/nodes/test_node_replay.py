@@ -80,6 +80,68 @@ def test_one_bit_in_one_command_is_found(log):
     assert (found.differing, found.difference.step) == (1, 7)
 
 
+@pytest.mark.parametrize(
+    ("change", "output"),
+    [
+        ({"status": "arrived"}, "status of the step"),
+        ({"responses": {"0": to_text(Bool(True))}}, "response 0"),
+    ],
+)
+def test_a_status_and_an_answer_that_were_not_given_are_found(log, change, output):
+    items = [replace(item, **change) if isinstance(item, StepRecord) and item.step == 7 else item
+             for item in read_log(log)]  # fmt: skip
+    found = replay(GoTo(), items, None)
+    assert (found.equal, found.differing, found.difference.step, found.difference.output) == (False, 1, 7, output)
+    assert any("recorded" in line for line in lines(found))
+
+
+def test_a_record_of_a_message_that_is_none_is_shown_as_it_is(log):
+    items = [replace(item, messages={"cmd": ("a=b",)}) if isinstance(item, StepRecord) and item.step == 7 else item
+             for item in read_log(log)]  # fmt: skip
+    assert "  recorded  a=b" in list(lines(replay(GoTo(), items, None)))
+
+
+def test_a_log_without_its_end_says_so(log, reports):
+    content = log.read_bytes()
+    for size in (len(content) - 1, len(content) // 2):
+        log.write_bytes(content[:size])
+        found = replay(GoTo(), read_log(log), None)
+        assert found.equal
+        assert found.note == "the log has no end: its process was killed, or the file was cut"
+
+
+def test_why_a_log_is_not_whole_is_said(log, reports, tmp_path):
+    short = RunLog(tmp_path / "short.vla", ABOUT, max_bytes=log.stat().st_size // 2)
+    for report in reports:
+        short(report)
+    short.close()
+    assert replay(GoTo(), read_log(tmp_path / "short.vla"), None).note == "the log was full"
+
+
+def test_logs_one_behind_the_other_are_refused(log):
+    log.write_bytes(2 * log.read_bytes())
+    with pytest.raises(DataError, match="bytes follow its end"):
+        list(read_log(log))
+
+
+@pytest.mark.parametrize("fate", ["kept", "lost", "altered"])
+def test_a_recorded_command_that_is_another_than_its_step_sent_is_found(log, fate):
+    items, topics = [], {"odom": "odom", "instruction": "instruction", "cmd": "/cmd"}
+    for item in read_log(log):
+        items.append(item)
+        for text in item.messages.get("cmd", ()) if isinstance(item, StepRecord) else ():
+            message = from_text(text)
+            if item.step == 7:
+                message = {"kept": message, "lost": None, "altered": Twist(Vector3(9.0))}[fate]
+            items += [] if message is None else [Received("/cmd", message, digest(message))]
+    rest = GoTo().rest().messages["cmd"][0]
+    items.append(Received("/cmd", rest, digest(rest)))  # what a node sends last is in no step
+    found = replay(GoTo(), items, topics)
+    assert (found.equal, found.differing) == (fate != "altered", 0)
+    assert (found.unheard, found.altered) == {"kept": (0, 0), "lost": (1, 0), "altered": (1, 1)}[fate]
+    assert any("that no step sent" in line for line in lines(found)) == (fate == "altered")
+
+
 def test_bag_order_may_differ_by_a_little(log):
     """A recorder in another process may write a record before a message that it was made from."""
     items = [Received("/odom", item.message, item.digest) if isinstance(item, Received) and item.channel == "odom"
@@ -204,3 +266,10 @@ def test_nan_in_notes_survives():
     record = StepRecord(0, 1.5, (1, 2), notes={"far": float("nan"), "word": "x"})
     assert json.loads(record.to_json())["notes"]["word"] == "x"
     assert StepRecord.from_json(record.to_json()).notes["far"] != 0
+
+
+def test_records_of_a_newer_version_say_so():
+    with pytest.raises(DataError, match=r"has 'mood', which vlatool .* does not know: a newer one wrote it"):
+        StepRecord.from_json('{"step": 1, "time_s": 0, "mood": 1}')
+    with pytest.raises(DataError, match=r"has 'mood', which vlatool .* does not know: 99\.0 wrote it"):
+        ControllerRecord.from_json('{"controller": "vln", "version": "99.0", "mood": 1}')

@@ -62,8 +62,9 @@ def test_wanted_topics_alone(tmp_path, request):
     senders = [buses[0].publisher(topic, String, QoS(latched=True)) for topic in ("/a/controller", "/b")]
     for send in senders:
         send(String("x"))
-    summary = BusRecorder(buses[1], bag, "recorder", ["/a/controller"]).run(0.15)
+    summary = BusRecorder(buses[1], bag, "recorder", ["/a/controller", "/a/contrller"]).run(0.15)
     assert summary.messages == {"/a/controller": 1}
+    assert summary.unknown == {"/a/contrller": "nobody published it"}
     for bus in (bag, *buses):
         bus.close()
     with pytest.raises(DataError, match="cannot be read"):
@@ -87,7 +88,7 @@ def bag_of(path, contents):
         ([("/a/controller", ControllerRecord("go-to", node="a").to_json())], "", "lacks the topic /a/steps"),
         ([(f"/{name}/controller", ControllerRecord("go-to", node=name).to_json()) for name in "ab"], "",
          "has several runs of 'go-to': a, b"),
-        ([("/a/controller", ControllerRecord("go-to", node="a").to_json())], "b", "was recorded with 'go-to' .a."),
+        ([("/a/controller", ControllerRecord("go-to", node="a").to_json())], "b", "has no run of the node 'b'; .*: a"),
     ],
 )  # fmt: skip
 def test_bags_that_hold_no_run_or_several(tmp_path, contents, node, words):

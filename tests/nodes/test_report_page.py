@@ -10,6 +10,7 @@ import pytest
 
 from tests._point_robot import GoTo, PointWorld
 from vlatool.buses import QoS, open_bus
+from vlatool.controllers import Command, Snapshot
 from vlatool.errors import OutputError
 from vlatool.messages.std_msgs import String
 from vlatool.nodes import trace as trace_module
@@ -18,6 +19,7 @@ from vlatool.nodes.report_page import page, write_page
 from vlatool.nodes.runner import RunSummary
 from vlatool.nodes.session import RunResult
 from vlatool.nodes.step_record import ControllerRecord
+from vlatool.nodes.stepper import StepReport
 from vlatool.nodes.trace import Trace, phases, watch_levels
 
 ABOUT = ControllerRecord("go-to", {"goal_x": 1.0}, {"odom": "/odom"}, "vlatool_go_to", version="1")
@@ -64,6 +66,29 @@ def test_levels_of_a_monitor_are_drawn(run):
     assert words == ["NORMAL", "WARNING", "EMERGENCY"]
     trace.levels["/safety_monitor/level"] = [(trace.first_s + 2 * index, word) for index, word in enumerate(words)]
     assert "EMERGENCY, 4.0 to 7.9 s" in page(result, trace)
+
+
+def test_what_others_say_of_their_levels_takes_no_more_than_its_share(run, monkeypatch):
+    monkeypatch.setattr("vlatool.nodes.trace.MAX_CHANGES", 50)
+    bus, trace = open_bus("sim:many-levels", "monitor"), Trace()
+    say = bus.publisher("/evil/level", String, QoS(depth=200))
+    watch_levels(bus, trace)
+    for number in range(120):
+        say(String(f"{number}{'x' * 100_000}"))
+    assert bus.settle(5)
+    bus.close()
+    heard = [word for _, word in trace.levels["/evil/level"]]
+    assert len(heard) <= 50
+    assert heard[-1].startswith("119x")
+    assert max(map(len, heard)) < 200
+
+
+def test_statuses_are_kept_in_part(run):
+    report = StepReport(0, Snapshot(0.0), Command(status="late " + "x" * 100_000, notes={"why": "y" * 100_000}))
+    trace = Trace()
+    trace(report)
+    assert len(trace.points[0].status) < 500
+    assert len(trace.points[0].notes["why"]) < 500
 
 
 def test_texts_are_escaped(run):

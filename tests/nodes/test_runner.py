@@ -85,23 +85,27 @@ def test_step_that_raises_ends_in_rest(exchange, others, error):
 
 
 @pytest.fixture
-def unhandled_sigterm():
-    handler = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+def unhandled_signals():
+    handlers = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
     yield
-    signal.signal(signal.SIGTERM, handler)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
-@pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
-def test_signals_end_in_rest(exchange, others, number, raised, unhandled_sigterm):
+@pytest.mark.parametrize(
+    ("number", "raised"),
+    [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGHUP, SystemExit)],
+)
+def test_signals_end_in_rest(exchange, others, number, raised, unhandled_signals):
     sent = collect(others, "/cmd_vel", Twist)
     waiting = [number]
     others.subscribe("/cmd_vel", Twist, lambda _: waiting and os.kill(os.getpid(), waiting.pop()), QoS())
     with pytest.raises(raised) as left:
         runner_of(exchange, Failing(at=-1)).run(10)
-    assert getattr(left.value, "code", 143) == 143
+    assert getattr(left.value, "code", 128 + number) == 128 + number
     assert sent[-1].linear.x == 0
     assert all(message.linear.x == 1 for message in sent[:-1])
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)] == [signal.SIG_DFL] * 2
 
 
 def test_stop_from_another_thread(exchange, others):

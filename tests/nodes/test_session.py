@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import threading
 import time
 from dataclasses import replace
@@ -24,9 +26,10 @@ from vlatool.nodes.launch import PolicyOptions
 from vlatool.nodes.recordings import open_recording
 from vlatool.nodes.replay import replay
 from vlatool.nodes.report_page import write_page
-from vlatool.nodes.run_log import read_log
+from vlatool.nodes.run_log import CUT, LogEnd, read_log
 from vlatool.nodes.session import RunPlan, dry_run, run_on_bus
 from vlatool.nodes.world_node import WorldNode
+from vlatool.runtime.telemetry import run_file
 
 
 @pytest.fixture
@@ -94,6 +97,43 @@ def test_refusals_come_before_the_bus(plan, tmp_path, monkeypatch):
     ):
         with pytest.raises(error, match=words):
             run_on_bus(replace(plan, **changes))
+
+
+def test_an_output_that_would_be_heard_as_an_input_is_refused(plan):
+    plan = replace(plan, controller="safety-monitor", settings={}, topics={"safe_cmd_vel": "/cmd_vel"})
+    with pytest.raises(UsageError, match="'safe_cmd_vel' is mapped to /cmd_vel, which its input 'cmd_vel' reads"):
+        dry_run(plan)
+
+
+def test_one_file_for_log_and_report_is_refused_before_the_run(plan, tmp_path):
+    with pytest.raises(OutputError, match="is named twice"):
+        dry_run(replace(plan, record=tmp_path / "." / ".." / tmp_path.name / "same", report=tmp_path / "same"))
+
+
+def test_a_directory_that_takes_no_file_is_refused_before_the_run(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(session.os, "access", lambda path, mode: path != tmp_path)
+    with pytest.raises(OutputError, match="not writable"):
+        dry_run(replace(plan, report=tmp_path / "run.html"))
+
+
+def test_a_log_that_cannot_be_written_is_said_after_the_run_and_its_report(plan, world, tmp_path, monkeypatch):
+    written, limit, write = [0], 5_000, os.write
+
+    def full(handle, content):
+        if written[0] + len(content) > limit:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written[0] += len(content)
+        return write(handle, content)
+
+    monkeypatch.setattr(run_file.os, "write", full)
+    ended = []
+    result = run_on_bus(replace(plan, record=tmp_path / "log"), on_end=lambda *what: ended.append(what))
+    assert ended
+    assert ended[0][0] is result
+    assert result.failure == f"{tmp_path / 'log'}: No space left on device"
+    assert result.summary.steps > 20
+    monkeypatch.undo()
+    assert list(read_log(tmp_path / "log"))[-1] == LogEnd(CUT)
 
 
 def test_refusals_of_the_bus(plan):

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from tests._point_robot import Exchange, MemoryBus
-from vlatool.buses import QoS
+from vlatool.buses import QoS, open_bus
 from vlatool.errors import BusError
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.geometry_msgs import Twist
@@ -74,3 +74,17 @@ def test_faults_of_the_bus_are_problems_of_their_topics():
 
 def test_empty_bus():
     assert list(lines(survey(MemoryBus(Exchange(), "survey"), "survey", 0))) == ["no topic"]
+
+
+def test_topics_of_a_recording_are_listed_though_nobody_publishes_them(tmp_path):
+    written = open_bus(f"bag::{tmp_path / 'run'}", "recorder")
+    send = written.publisher("/words", String, QoS())
+    for number in range(5):
+        send(String(str(number)))
+        time.sleep(0.02)
+    written.close()
+    bus = open_bus(f"bag:{tmp_path / 'run'}", "survey")
+    (found,) = survey(bus, "survey", 0.3)
+    bus.close()
+    assert (found.topic, found.types, found.publishers, found.subscribers) == ("/words", (String.TYPE,), (), ())
+    assert found.messages == 5

@@ -85,8 +85,10 @@ def test_camera_lidar_and_cloud_see_the_same_walls():
     reports = drive(world, 0.1, 0.0)
     yaw = world.truth()["pose"][2]
     scan = newest(reports, "/scan")
-    angles = yaw - math.pi + scan.angle_increment * np.arange(360)
-    wall = 2.95 / np.maximum(abs(np.cos(angles)), abs(np.sin(angles)))
+    angles = yaw - math.pi / 2 + scan.angle_increment * np.arange(360)  # turned to the left, 4 cm behind the centre
+    place = np.array([-0.04 * math.cos(yaw), -0.04 * math.sin(yaw)])[:, None]
+    way = np.stack([np.cos(angles), np.sin(angles)])
+    wall = ((2.95 - np.sign(way) * place) / abs(way)).min(axis=0)
     assert scan.ranges == pytest.approx(wall, abs=0.02)
     depth = pixels.depth_m(newest(reports, "/camera/depth/image_raw"))
     assert depth.shape == (120, 160)
@@ -187,8 +189,8 @@ def test_something_steps_in_and_people_give_way():
     world = open_world("turtlebot4", only="scan,person", people=2, movers=2, intruder_s=1.0, noise="0")
     world.reset(3)
     reports = drive(world, 8.0, 0.0)
-    nearest = min(np.nanmin(message.ranges[175:185]) for topic, message in reports if topic == "/scan")
-    assert nearest == pytest.approx(0.5, abs=0.02)
+    nearest = min(np.nanmin(message.ranges[85:95]) for topic, message in reports if topic == "/scan")
+    assert nearest == pytest.approx(0.54, abs=0.02)
     assert world.truth()["collisions"] == 0
 
 
@@ -196,8 +198,10 @@ def test_something_steps_in_and_people_give_way():
     "knobs",
     [
         {"only": "radar"}, {"delay": "scan=soon"}, {"drop": "sonar=0.1"}, {"size_m": 1.0}, {"pillars": -1},
-        {"noise": "-1"},
+        {"noise": "-1"}, {"width": 0}, {"width": 1_000_000}, {"height": -1}, {"battery": math.nan}, {"battery": -1.0},
+        {"battery": 90.0}, {"gaps": 5.0}, {"drop": "2"}, {"freeze": "scan=1.5"}, {"pillars": 100_000},
     ],
+    ids=str,
 )  # fmt: skip
 def test_knobs_out_of_range_are_refused(knobs: dict[str, Any]):
     with pytest.raises(UsageError) as caught:

@@ -96,7 +96,8 @@ class BagWriter:
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
-            reason = " ".join(str(self._failure).split())[:160].rstrip(".") or type(self._failure).__name__
+            text_of = getattr(self._failure, "strerror", None) or str(self._failure)
+            reason = " ".join(text_of.split())[:160].rstrip(".") or type(self._failure).__name__
             raise OutputError(
                 f"{self.path} cannot be written: {reason}.", "free space, or name a path that can be written"
             ) from self._failure

@@ -67,6 +67,11 @@ class Bag:
         """Length of the recording, in seconds; 0 without one."""
         return (self._reader.end_ns - self._reader.start_ns) / SECOND if self._reader else 0.0
 
+    @property
+    def new_path(self) -> Path | None:
+        """File or directory of the new bag; None without one."""
+        return self._writer.path if self._writer else None
+
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
         """See ``Bus.subscribe``; a topic that the recording lacks stays silent, and ``qos`` is of no matter."""
         name = self._agreed(topic, message)

@@ -18,7 +18,7 @@ from vlatool.cli._default import DefaultGroup
 from vlatool.cli._document import answer
 from vlatool.cli._launch_words import parameters, ros_words, unused_remappings
 from vlatool.cli._stages import build_command, failing_command
-from vlatool.errors import PluginError, UsageError, fix_for, suggest
+from vlatool.errors import OutputError, PluginError, UsageError, fix_for, suggest
 from vlatool.files.printable import one_line, printable
 
 if TYPE_CHECKING:
@@ -212,11 +212,14 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any], words: R
     result = run_on_bus(
         plan,
         lambda about: _say(about.node, about.topics, unused_remappings(words, about.node, {*about.topics.values()})),
-        lambda *ended: _write_report(plan, *ended),
+        lambda *ended: _end(plan, as_json, *ended),
         lambda topics: typer.echo(f"... {printable(waiting(topics))}", err=True),
         lambda fault: typer.echo(f"... {printable(fault_text(fault))}", err=True),
     )
-    answer(as_json, result.to_dict(), _lines(result))
+    if result.failure:
+        raise OutputError(
+            f"The records of the run are not whole: {result.failure}.", "free some space, and run it again"
+        )
 
 
 def _say(node: str, topics: Mapping[str, str], notes: Iterator[str]) -> None:
@@ -225,8 +228,9 @@ def _say(node: str, topics: Mapping[str, str], notes: Iterator[str]) -> None:
         typer.echo(printable(line), err=True)
 
 
-def _write_report(plan: RunPlan, result: RunResult, trace: Trace) -> None:
-    """Write the HTML report of a run, however it ended."""
+def _end(plan: RunPlan, as_json: bool, result: RunResult, trace: Trace) -> None:
+    """Hand over what a run was and write its HTML report, however it ended."""
+    answer(as_json, result.to_dict(), _lines(result))
     if plan.report is None:
         return
     from vlatool.nodes.report_page import write_page

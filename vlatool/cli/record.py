@@ -110,15 +110,18 @@ def _record_bus(
 ) -> None:
     """Record topics of a bus to a new bag, under the names that they have there: remappings are left out."""
     from vlatool.buses import open_bus
+    from vlatool.buses.bag import Bag
     from vlatool.nodes.bus_recorder import BusRecorder, RecordSummary
     from vlatool.nodes.fault_watch import fault_text, to_plain_faults
 
-    if not str(output).strip() or ":" in str(output):
+    if not str(output).strip(" ."):
+        raise UsageError(f"'{output}' is not the name of a bag.", "write for example -o run.mcap")
+    if ":" in str(output):
         raise UsageError(f"The bag '{output}' has a colon in its name, which separates bags.", "name it without one")
     opened = open_bus(bus, NODE, None if words is None else words.without_topics())
     summary = RecordSummary()
     try:
-        bag = open_bus(f"bag::{output}", NODE)
+        bag = Bag(f":{output}", NODE)
         try:
             recorder = BusRecorder(opened, bag, NODE, topics)
             summary = recorder.summary
@@ -129,9 +132,10 @@ def _record_bus(
         faults = opened.faults()
     finally:
         opened.close()
-    lines = [f"{output}: {sum(summary.messages.values())} messages of {len(summary.messages)} topics in "
+    path = bag.new_path or output
+    lines = [f"{path}: {sum(summary.messages.values())} messages of {len(summary.messages)} topics in "
              f"{summary.seconds:.1f} s"]  # fmt: skip
     lines += [f"  {topic}  {count}" for topic, count in sorted(summary.messages.items())]
     lines += [f"  {topic} is not recorded: {why}" for topic, why in sorted(summary.unknown.items())]
     lines += [f"  on the bus: {fault_text(fault)}" for fault in faults]
-    answer(as_json, {"file": str(output), **vars(summary), "faults": to_plain_faults(faults)}, map(printable, lines))
+    answer(as_json, {"file": str(path), **vars(summary), "faults": to_plain_faults(faults)}, map(printable, lines))

@@ -12,8 +12,9 @@ from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._document import answer
 from vlatool.cli._options import AsJson
-from vlatool.errors import GateFailed, UsageError
-from vlatool.files.printable import printable
+from vlatool.errors import DataError, GateFailed, UsageError
+from vlatool.files.printable import amount, printable
+from vlatool.machine.version import VERSION
 
 if TYPE_CHECKING:
     from vlatool.runtime.telemetry.replay import ReplayResult
@@ -76,13 +77,22 @@ def _replay_controller(
     from vlatool.nodes.recordings import open_recording
     from vlatool.nodes.replay import lines as replay_lines
     from vlatool.nodes.replay import replay as compare
-    from vlatool.nodes.settings import read_settings
+    from vlatool.nodes.settings import read_settings, settings_of
 
     recording = open_recording(file, name, node)
+    known = {setting.name for setting in settings_of(registry.load("controllers", name))}
+    if newer := sorted({*recording.about.settings} - known):
+        raise DataError(
+            f"{file} was recorded with the setting '{newer[0]}', which {name} does not have in vlatool {VERSION}.",
+            f"replay it with vlatool {recording.about.version or 'as it was then'}",
+        )
     chosen = {**recording.about.settings, **({} if settings is None else read_settings(settings))}
     options = PolicyOptions(bundle, recording.about.robot, deadline_ms=0)
     found = compare(open_controller(name, chosen, options), recording.items(), recording.topics)
     answer(as_json, found.to_dict(), map(printable, replay_lines(found)))
+    if found.altered and found.difference is None:
+        raise GateFailed(f"{file} has {amount(found.altered, 'command')} that no step sent.",
+                         "look for a second publisher; the recorded topic is not what was computed")  # fmt: skip
     if not found.equal:
         raise GateFailed(
             f"{found.differing} of {found.steps} steps of {file} are not computed again as they were.",

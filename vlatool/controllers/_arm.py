@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +17,8 @@ from vlatool.controllers._arm_policy import ArmPolicy, policy_of
 from vlatool.controllers._arm_return import plan_return
 from vlatool.controllers._arm_robot import ArmRobot, driver_names, finite, start_pose
 from vlatool.controllers._arm_state import ACTING, HALT, RETURNING, WAITING, ArmState
-from vlatool.controllers._freshness import age_s, note_changes
+from vlatool.controllers._arm_track import believe
+from vlatool.controllers._freshness import CLOCK_STEP_S, age_s, note_changes
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
 from vlatool.controllers._settings import check_finite, check_range, check_rate
 from vlatool.errors import BusError, DataError, UsageError, VlatoolError
@@ -86,8 +88,8 @@ class ArmController:
         check_range("margin_rad", self.margin_rad, 0.0, 0.5)
         check_range("lead_s", self.lead_s, 0.0, 1.0)
         check_range("clearance_m", self.clearance_m, 0.01, 1.0)
-        for name in ("max_age_s", "max_lag_rad"):
-            check_range(name, getattr(self, name), 0.001)
+        check_range("max_age_s", self.max_age_s, 0.001, CLOCK_STEP_S)
+        check_range("max_lag_rad", self.max_lag_rad, 0.001, math.pi)
         _ = self._names, self._start
         if self.policy is not None:
             _ = self._sees
@@ -95,6 +97,13 @@ class ArmController:
     @cached_property
     def _limits(self) -> RobotLimits:
         return self.ROBOT.limits(self.speed, self.margin_rad)
+
+    @cached_property
+    def _fastest(self) -> Array:
+        """Largest speeds of the joints (A,) in units/s; infinite of those that have no limit."""
+        joints = self.ROBOT.limits().joints
+        speeds = [0.0 if joint.command == "range" else max(map(abs, joint.velocity)) for joint in joints]
+        return np.array([speed or math.inf for speed in speeds])
 
     @cached_property
     def _names(self) -> tuple[str, ...]:
@@ -158,7 +167,7 @@ class ArmController:
     def step(self, snapshot: Snapshot, state: ArmState) -> tuple[Command, ArmState]:
         """Return the positions to command at this step."""
         state = state._replace(changes=note_changes(snapshot, ("joints",), state.changes))
-        measured, problem = self._measure(snapshot, state)
+        measured, problem, state = self._believe(snapshot, state, *self._measure(snapshot, state))
         if state.envelope is None:
             if measured is not None:
                 state, problem = self._begin(measured, snapshot.time_s, state)
@@ -191,6 +200,21 @@ class ArmController:
             broken = [name for name, value in zip(self._names, values, strict=True) if not np.isfinite(value)]
             return None, f"no number for the joint {broken[0]}"
         return values, ""
+
+    def _believe(
+        self, snapshot: Snapshot, state: ArmState, measured: Array | None, problem: str
+    ) -> tuple[Array | None, str, ArmState]:
+        """Return positions that the arm can have, or None and what is wrong, and the state with them."""
+        if measured is None:
+            return None, problem, state
+        reading = snapshot.newest["joints"]
+        track, jumped = believe(state.track, measured, reading.received_s, reading.sequence, self._fastest)
+        state = state._replace(track=track)
+        if jumped >= 0:
+            away = abs(measured[jumped] - track.values[jumped])
+            unit = self._limits.joints[jumped].unit
+            return None, f"{self._names[jumped]} jumped by {away:.2f} {unit}", state
+        return (measured, "", state) if track.has_begun else (None, "joint states that agree", state)
 
     def _begin(self, measured: Array, now_s: float, state: ArmState) -> tuple[ArmState, str]:
         """Begin at rest where the robot is."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from vlatool.controllers._arm_return import Return
+from vlatool.controllers._arm_track import Track
 from vlatool.controllers._freshness import Changes
 from vlatool.runtime.envelope import Envelope
 
@@ -26,6 +27,7 @@ class ArmState(NamedTuple):
         last_s: Time of the last command, in seconds of the snapshots.
         calls: Numbers of the calls that wait for the start pose.
         silent_since_s: When there was last no joint state that it can use, and none since; None while there are some.
+        track: Joint states that were believed.
     """
 
     phase: str = WAITING
@@ -37,3 +39,4 @@ class ArmState(NamedTuple):
     last_s: float = 0.0
     calls: tuple[int, ...] = ()
     silent_since_s: float | None = None
+    track: Track = Track()

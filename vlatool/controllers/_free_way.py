@@ -66,13 +66,17 @@ def of_scan(angles: Array, ranges: Array) -> Array:
     return np.stack([ranges[seen] * np.cos(angles[seen]), ranges[seen] * np.sin(angles[seen])], axis=1)
 
 
-def has_gap(angles: Array, ranges: Array, way: Array, share: float = 0.1) -> bool:
-    """Whether a share of the rays along a path is unknown: those within 20 degrees of the direction it leads to."""
+def has_gap(angles: Array, ranges: Array, way: Array, share: float = 0.1, least: int = 3) -> bool:
+    """Whether a share of the rays along a path is unknown: those within 20 degrees of the direction it leads to.
+
+    Args:
+        least: Rays there without which nothing is known of the path.
+    """
     if len(way) < 2:
         return False
     ahead = math.atan2(way[4, 1], way[4, 0])
     near = abs(np.remainder(angles - ahead + math.pi, 2.0 * math.pi) - math.pi) < math.radians(20.0)
-    return not near.any() or float(np.isnan(ranges[near]).mean()) > share
+    return int(near.sum()) < least or float(np.isnan(ranges[near]).mean()) > share
 
 
 def of_depth(depth: Array, size: tuple[int, int], mount: Mount) -> Array:

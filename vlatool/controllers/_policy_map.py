@@ -149,13 +149,18 @@ def _input(tensor: TensorSpec, entry: Any) -> InputMap:
     kind, where = kind_of(tensor), f"The map of the input '{tensor.name}'"
     _check_keys(entry, KEYS[kind], where)
     stale_s = _number(entry.get("stale_s", 0.5), f"{where}: stale_s")
-    shared: dict[str, Any] = {"stale_s": stale_s, "noisy": bool(entry.get("noisy"))}
+    noisy = entry.get("noisy", False)
+    if not isinstance(noisy, bool):
+        raise UsageError(f"{where}: noisy is {noisy!r:.40}; it must be true or false.", "write noisy: true")
+    shared: dict[str, Any] = {"stale_s": stale_s, "noisy": noisy}
     if kind == ACTIONS:
         if entry.get("source") != "actions":
             raise UsageError(f"{where} is {entry!r:.60}; it holds past actions.", "write source: actions")
         return InputMap(tensor.name, kind, count=int(tensor.shape[1]))
     if kind == TEXT and "text" in entry:
-        return InputMap(tensor.name, kind, text=str(entry["text"]))
+        if not isinstance(text := entry["text"], str):
+            raise UsageError(f"{where}: its text is {text!r:.40}; it must be a text.", "write it in quotes")
+        return InputMap(tensor.name, kind, text=text)
     topic = _topic(entry, where)
     if kind == TEXT:
         return InputMap(tensor.name, kind, topic, _type(entry, (String,), where))

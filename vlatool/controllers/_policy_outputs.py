@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.controllers._policy_map import OutputMap
+from vlatool.errors import BusError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Duration, Time
 from vlatool.messages.geometry_msgs import Twist, TwistStamped, Vector3
@@ -17,6 +18,19 @@ from vlatool.messages.std_msgs import Header
 from vlatool.messages.trajectory_msgs import JointTrajectory, JointTrajectoryPoint
 
 Array = NDArray[Any]
+CHECK = "check the bundle: vlatool explain BUNDLE"
+
+
+def check_action(output: OutputMap, action: Array) -> None:
+    """Raise BusError for an action that commands no number, has another number of elements, or has no label."""
+    values = np.asarray(action, np.float64).reshape(-1)
+    if output.labels:
+        if len(values) != 1 or not 0 <= values[0] < len(output.labels):
+            raise BusError(f"The policy's action {values.tolist()!s:.40} has no label.", CHECK)
+    elif len(values) <= max(output.indices, default=-1):
+        raise BusError(f"The policy's action has {len(values)} numbers; {len(output.indices)} are mapped.", CHECK)
+    elif not np.isfinite(values[list(output.indices)]).all():
+        raise BusError("The policy's action is not finite.", CHECK)
 
 
 def message_of(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vlatool.controllers import _free_way as free_way
 from vlatool.controllers._freshness import Change, age_s, note_changes
-from vlatool.controllers._geometry import PlanarPose, pose_of, wrap
+from vlatool.controllers._geometry import PlanarPose, clamp, pose_of, wrap
 from vlatool.controllers._interface import Snapshot
 from vlatool.controllers._safety_table import Facts, Limits
 from vlatool.controllers._sensor_arrays import rays_of, thin_depth_of
@@ -22,7 +22,7 @@ from vlatool.messages.sensor_msgs import BatteryState, Image, JointState, LaserS
 from vlatool.messages.std_msgs import Bool, String
 
 Array = NDArray[Any]
-SENSORS = ("scan", "depth", "odometry")
+SENSORS = ("scan", "depth", "odometry", "person", "emergency_stop")
 LEGAL = {
     "idle": {"running"},
     "running": {"idle", "paused", "arrived", "failed"},
@@ -43,6 +43,8 @@ class Robot(NamedTuple):
     max_angular: float
     max_age_s: float
     mount: free_way.Mount
+    scan_yaw: float
+    scan_forward_m: float
     top_m: float
     cliff_m: float
     fence: tuple[float, ...]
@@ -76,7 +78,8 @@ def measure(snapshot: Snapshot, robot: Robot, memory: Memory) -> tuple[Facts, Me
     command = snapshot.message("cmd_vel", Twist)
     linear, angular = (command.linear.x, command.angular.z) if command is not None else (0.0, 0.0)
     finite = math.isfinite(linear) and math.isfinite(angular)
-    way = free_way.path(linear, angular) if finite else np.zeros((1, 2))
+    passed_on = clamp(linear, robot.max_linear), clamp(angular, robot.max_angular)
+    way = free_way.path(*passed_on) if finite else np.zeros((1, 2))
     out = {name for name in SENSORS if _age(snapshot, name, changes, contents) > robot.max_age_s}
     clear, cliff, gap = _look(snapshot, robot, way, out)
     if gap:
@@ -91,7 +94,7 @@ def measure(snapshot: Snapshot, robot: Robot, memory: Memory) -> tuple[Facts, Me
         jump=jump,
         battery=_battery(snapshot),
         current_a=_current(snapshot),
-        fence_m=_fence(pose[0] if pose else None, robot.fence),
+        fence_m=_fence(snapshot, robot, pose, changes),
         task_s=snapshot.time_s - since if since is not None else 0.0,
         illegal=illegal,
         person=_is_true(snapshot, "person"),
@@ -134,7 +137,8 @@ def _look(snapshot: Snapshot, robot: Robot, way: Array, out: set[str]) -> tuple[
     scan = snapshot.message("scan", LaserScan)
     if scan is not None:
         angles, ranges = rays_of(scan)
-        found.append(free_way.of_scan(angles, ranges))
+        angles = angles + robot.scan_yaw
+        found.append(free_way.of_scan(angles, ranges) + np.array([robot.scan_forward_m, 0.0]))
         gap = free_way.has_gap(angles, ranges, way)
     depth, size, _ = thin_depth_of(snapshot.message("depth", Image), free_way.STRIDE)
     if depth is not None and min(size) > free_way.STRIDE // 2:
@@ -178,20 +182,29 @@ def _battery(snapshot: Snapshot) -> float:
 
 
 def _current(snapshot: Snapshot) -> float:
+    """Return the largest current that is known; NaN without one."""
     joints = snapshot.message("joints", JointState)
     if joints is None or not len(joints.effort):
         return math.nan
-    return float(np.max(np.abs(joints.effort)))
+    return float(np.fmax.reduce(np.abs(joints.effort)))
 
 
-def _fence(pose: PlanarPose | None, fence: tuple[float, ...]) -> float:
-    """Return the distance to the nearest side of a rectangle from inside, negative outside, in metres."""
-    if pose is None or not fence:
+def _fence(
+    snapshot: Snapshot, robot: Robot, pose: tuple[PlanarPose, float] | None, changes: Mapping[str, Change]
+) -> float:
+    """Return the distance to the nearest side of the fence from inside, negative outside, in metres.
+
+    It is that of the last pose, less the way that the robot can have gone since.
+    """
+    if pose is None or not robot.fence:
         return math.inf
-    left, low, right, high = fence
-    return min(pose.x - left, right - pose.x, pose.y - low, high - pose.y)
+    (x, y, _), came_s = pose
+    left, low, right, high = robot.fence
+    unknown_s = snapshot.time_s - min(came_s, changes["odometry"].time_s)
+    return min(x - left, right - x, y - low, high - y) - robot.max_linear * unknown_s
 
 
 def _is_true(snapshot: Snapshot, name: str) -> bool:
-    message = snapshot.message(name, Bool)
-    return message is not None and message.data
+    """Whether the newest message is true, or any that came since the last step: a button may be pressed shortly."""
+    read = [reading.message for reading in snapshot.readings.get(name, ())]
+    return any(isinstance(message, Bool) and message.data for message in (*read, snapshot.message(name, Bool)))

@@ -62,11 +62,16 @@ def points_of(message: PointCloud2 | None) -> tuple[Array | None, str]:
 
 
 def rays_of(message: LaserScan | None) -> tuple[Array, Array]:
-    """Return angles and ranges of a scan, each float64 (N,): inf where nothing is in reach, NaN where unknown."""
+    """Return angles and ranges of a scan, each float64 (N,): inf where nothing is in reach, NaN where unknown.
+
+    Where its limits leave no range, as in a message whose driver did not set them, all are unknown.
+    """
     if message is None:
         return np.zeros(0), np.zeros(0)
     ranges = np.asarray(message.ranges, np.float64)
     angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
     known = (ranges >= message.range_min) & ~(ranges < 0)
     far = ranges > message.range_max
+    if message.range_max <= max(message.range_min, 0.0):
+        return angles, np.full(len(ranges), np.nan)
     return angles, np.where(far, np.inf, np.where(known, ranges, np.nan))

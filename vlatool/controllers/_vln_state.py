@@ -32,7 +32,7 @@ class VlnState(NamedTuple):
         frame_s: When the first frame of the standing robot came, in seconds of ``Snapshot.time_s``; None before it.
         frames: Last frames that the policy saw, uint8 (H, W, 3) each.
         actions: Indices of all actions since the instruction.
-        changes: When camera and odometry last changed.
+        changes: When camera, odometry and depth last changed.
     """
 
     phase: str = IDLE_PHASE

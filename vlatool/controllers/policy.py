@@ -24,7 +24,7 @@ from vlatool.controllers._policy_map import (
     read_inputs,
     read_output,
 )
-from vlatool.controllers._policy_outputs import message_of, stop_of
+from vlatool.controllers._policy_outputs import check_action, message_of, stop_of
 from vlatool.controllers._policy_proposal import propose
 from vlatool.controllers._settings import check_finite, check_range, check_rate
 from vlatool.errors import BusError, UsageError, VlatoolError
@@ -162,6 +162,7 @@ class Policy:
             return self._stop(snapshot, problem), state
         try:
             action = self._act(observation)
+            check_action(self._output, action)
             positions = self._positions(snapshot)
             message = message_of(self._output, action, snapshot.stamp, 1 / self.rate_hz, positions)
         except VlatoolError as error:
@@ -189,13 +190,26 @@ class Policy:
             positions = self._positions(snapshot)
         except BusError:
             positions = None
+        stale_s = next((entry.stale_s for entry in self._inputs if entry.name == self._joints), 0.0)
+        if positions is not None and snapshot.age_s(self._joints) > stale_s:
+            positions = None  # where they were is not where they are
         return Command({"action": stop_of(self._output, snapshot.stamp, positions)}, status=why)
 
     def _positions(self, snapshot: Snapshot) -> Array | None:
-        """Return where the commanded joints are, in SI units; None where no input says so."""
+        """Return where the commanded joints are, in SI units; None where no input says so.
+
+        Raises:
+            BusError: where a joint is missing, or its position is not finite.
+        """
         wanted = self._output.mode == "delta" or self._output.message is JointState
         joints = snapshot.message(self._joints, JointState) if wanted and self._joints else None
-        return None if joints is None else joint_values(joints, self._output.names)
+        if joints is None:
+            return None
+        values = joint_values(joints, self._output.names)
+        if not np.isfinite(values).all():
+            name = self._output.names[int(np.flatnonzero(~np.isfinite(values))[0])]
+            raise BusError(f"The position of the joint {name!r} is not finite.", "check the robot's driver")
+        return values
 
     def _take(self, snapshot: Snapshot, state: _State) -> _State:
         """Return the state with the messages that came."""

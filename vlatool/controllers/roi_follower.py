@@ -28,7 +28,8 @@ class RoiFollower(BaseDriver):
     ``max_z``. Where it is more than ``z_threshold`` away from ``goal_z``, and between ``min_z`` and ``max_z``, the
     robot drives at ``z_scale`` times the difference, at least ``min_linear_speed`` and at most ``max_linear_speed``;
     otherwise its speed falls to ``slow_down_factor`` of itself at each step. Without a new region both speeds fall in
-    this way; ``lost_s`` after the last one, which the tutorial does not know, the robot stands.
+    this way; ``lost_s`` after the last one, which the tutorial does not know, the robot stands. Nor does it drive by
+    a depth image that is older than that.
 
     Args:
         rate: Steps in a second.
@@ -100,6 +101,8 @@ class RoiFollower(BaseDriver):
             state = state.fade(self.slow_down_factor, snapshot.time_s, self.lost_s)
             return self._command(state, f"standing: {problem}", {}), state
         depth, problem = depth_of(snapshot.message("depth", Image))
+        if (age := snapshot.age_s("depth")) > self.lost_s and depth is not None:
+            depth, problem = None, f"depth {age:.1f} s old"
         distance = self.distance(depth, region) if depth is not None else None
         offset = offset_of(region, camera.width)
         state = Motion(self.linear(distance, state.linear), self.rotation(offset), snapshot.time_s, target)

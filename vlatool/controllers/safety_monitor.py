@@ -10,6 +10,7 @@ from vlatool.controllers._free_way import Mount
 from vlatool.controllers._geometry import clamp, twist
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
 from vlatool.controllers._safety_facts import SENSORS, Memory, Robot, measure
+from vlatool.controllers._safety_settings import check_settings, read_fence
 from vlatool.controllers._safety_table import (
     SCALES,
     TABLE,
@@ -23,7 +24,7 @@ from vlatool.controllers._safety_table import (
     next_level,
     release,
 )
-from vlatool.controllers._settings import check_finite, check_range, check_rate
+from vlatool.controllers._settings import check_finite
 from vlatool.errors import UsageError
 from vlatool.messages import Message
 from vlatool.messages.geometry_msgs import Twist
@@ -31,6 +32,9 @@ from vlatool.messages.nav_msgs import Odometry
 from vlatool.messages.sensor_msgs import BatteryState, Image, JointState, LaserScan
 from vlatool.messages.std_msgs import Bool, String
 from vlatool.messages.std_srvs import SetBoolRequest, SetBoolResponse
+
+WORDS = 100
+"""Words of danger that a step reads: none of them may be hidden by those that came after it."""
 
 
 class _State(NamedTuple):
@@ -53,12 +57,15 @@ class SafetyMonitor:
 
     Args:
         rate: Steps in a second.
-        expects: Sensors that the robot has, of ``scan``, ``depth`` and ``odometry``, separated by commas.
+        expects: Sensors that the robot has, of ``scan``, ``depth`` and ``odometry``, separated by commas; also
+            ``person`` and ``emergency_stop``, where those are sent again and again: one that falls silent is out, too.
         radius_m: Radius of the base.
         margin_m: Distance kept to the sides of the way.
         warning_m, critical_m, emergency_m: Ways ahead up to which an obstacle counts for each level, in metres.
         camera_height_m, camera_forward_m: Place of the depth camera above the floor and before the centre of the base.
         camera_hfov_deg: Horizontal field of view of the depth camera, in degrees.
+        scan_yaw_deg: Direction of the lidar's 0 degrees, to the left of the base's, in degrees: 90 on a TurtleBot 4.
+        scan_forward_m: Place of the lidar before the centre of the base, in metres.
         top_m: Height up to which things are obstacles.
         cliff_m: Depth below the floor that is a cliff; things are obstacles from that height above it.
         max_linear_speed, max_angular_speed: Largest speeds passed on, in m/s and rad/s.
@@ -71,6 +78,7 @@ class SafetyMonitor:
         fence: ``X_MIN,Y_MIN,X_MAX,Y_MAX`` in the frame of the odometry, in metres; none when empty.
         fence_warning_m: Distance to the fence that is a WARNING, in metres.
         task_s: Time for which a task may run, in seconds.
+        hold_at_start: Whether it begins with an EMERGENCY, for one that is restarted by itself.
 
     Raises:
         UsageError: for a setting out of its range.
@@ -86,6 +94,8 @@ class SafetyMonitor:
     camera_height_m: float = 0.244
     camera_forward_m: float = 0.0
     camera_hfov_deg: float = 69.0
+    scan_yaw_deg: float = 90.0
+    scan_forward_m: float = -0.04
     top_m: float = 0.6
     cliff_m: float = 0.06
     max_linear_speed: float = 0.306
@@ -101,32 +111,30 @@ class SafetyMonitor:
     fence: str = ""
     fence_warning_m: float = 0.3
     task_s: float = 600.0
+    hold_at_start: bool = False
     _robot: Robot = field(init=False, repr=False, compare=False)
     _table: tuple[Rule, ...] = field(default=TABLE, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_finite(self)
-        check_rate(self.rate)
-        for name in ("radius_m", "margin_m", "camera_height_m", "top_m", "cliff_m", "max_age_s", "command_s"):
-            check_range(name, getattr(self, name), 0.0)
-        if not 0.0 <= self.emergency_m <= self.critical_m <= self.warning_m:
-            raise UsageError(
-                f"The bands are {self.emergency_m:g}, {self.critical_m:g} and {self.warning_m:g} m; allowed: "
-                "emergency_m <= critical_m <= warning_m.",
-                "change the one that is out of order",
-            )
+        check_settings(self)
         object.__setattr__(self, "_robot", self._describe())
 
     def _describe(self) -> Robot:
         expects = tuple(filter(None, (part.strip() for part in self.expects.split(","))))
         if absent := [name for name in expects if name not in SENSORS]:
             raise UsageError.unknown(f"Unknown sensor '{absent[0]}' in expects", absent[0], SENSORS)
-        fence = _read_fence(self.fence)
+        fence = read_fence(self.fence)
+        if fence and "odometry" not in expects:
+            raise UsageError(
+                "There is a fence, and the odometry that says where the robot is is not expected.",
+                "add odometry to expects, or leave fence out",
+            )
         mount = Mount(self.camera_height_m, self.camera_forward_m, math.radians(self.camera_hfov_deg))
         limits = Limits(*(getattr(self, name) for name in Limits._fields))
         return Robot(
             expects, self.radius_m, self.margin_m, self.max_linear_speed, self.max_angular_speed, self.max_age_s, mount,
-            self.top_m, self.cliff_m, fence, limits,
+            math.radians(self.scan_yaw_deg), self.scan_forward_m, self.top_m, self.cliff_m, fence, limits,
         )  # fmt: skip
 
     @property
@@ -144,9 +152,9 @@ class SafetyMonitor:
             Input("odometry", "/odom", Odometry, required=False),
             Input("battery", "/battery_state", BatteryState, required=False),
             Input("joints", "/joint_states", JointState, required=False),
-            Input("person", "/person_in_workspace", Bool, required=False),
-            Input("task", "/vln/status", String, depth=10, required=False, reliable=True),
-            Input("emergency_stop", "/emergency_stop", Bool, required=False, reliable=True),
+            Input("person", "/person_in_workspace", Bool, depth=WORDS, required=False),
+            Input("task", "/vln/status", String, depth=WORDS, required=False, reliable=True),
+            Input("emergency_stop", "/emergency_stop", Bool, depth=WORDS, required=False, reliable=True),
         )
 
     @property
@@ -160,8 +168,8 @@ class SafetyMonitor:
         return (Service("emergency", "/safety_monitor/emergency", SetBoolRequest, SetBoolResponse),)
 
     def start(self) -> _State:
-        """Return the state at NORMAL, before anything was measured."""
-        return _State()
+        """Return the state before anything was measured: at NORMAL, or at EMERGENCY where it holds at its start."""
+        return _State(Status(Level.EMERGENCY if self.hold_at_start else Level.NORMAL))
 
     def step(self, snapshot: Snapshot, state: _State) -> tuple[Command, _State]:
         """Return the velocity for the base at this step; zero, and an EMERGENCY, where the monitor fails."""
@@ -218,18 +226,3 @@ class SafetyMonitor:
         """Stand, and say so."""
         text = "EMERGENCY the monitor ended"
         return Command({"safe_cmd_vel": (twist(),), "level": (String(text),)}, status=text)
-
-
-def _read_fence(text: str) -> tuple[float, ...]:
-    """Return the sides of a fence; empty for none. Raises UsageError for what is not a rectangle."""
-    if not text:
-        return ()
-    try:
-        fence = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        fence = ()
-    if len(fence) != 4 or not (fence[0] < fence[2] and fence[1] < fence[3] and all(map(math.isfinite, fence))):
-        raise UsageError(
-            f"The fence is '{text}'; allowed: X_MIN,Y_MIN,X_MAX,Y_MAX in metres.", "write for example fence='-2,-2,2,2'"
-        )
-    return fence

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.controllers._discrete_policy import Observed, choose, observation, observed_by
-from vlatool.controllers._freshness import age_s, note_changes, stamp_of
+from vlatool.controllers._freshness import CLOCK_STEP_S, age_s, note_changes, stamp_of
 from vlatool.controllers._geometry import PlanarPose, pose_of, twist
 from vlatool.controllers._interface import Command, Input, Output, Service, Snapshot
 from vlatool.controllers._motions import BACKWARD, FORWARD, STOP, WAIT, Motion, Speeds, drive, motions_of, plan
@@ -32,6 +32,13 @@ from vlatool.messages.std_msgs import Bool, String
 
 ALLOWED_SPEED = {"linear": 0.306, "angular": 1.9}
 """Fastest of a Create 3 with its safety on, in m/s and rad/s (Create 3 documentation, "Safety")."""
+LARGEST = {
+    "position_m": 1.0, "angle_deg": 45.0, "clearance_m": 10.0, "way_share": 1.0, "max_age_s": CLOCK_STEP_S,
+    "motion_s": 600.0, "settle_s": 60.0,
+}  # fmt: skip
+"""Setting -> its largest value; the least is 0. With larger ones no motion would be checked."""
+ASTRAY_M = 0.5
+"""Distance that a step's end may be farther away than at its start, in metres: the odometry has jumped beyond it."""
 
 RESTING_SPEED = {"linear": 0.02, "angular": 0.05}
 """Speeds in odometry up to which a robot stands, in m/s and rad/s: what an encoder or a gyroscope may say at rest."""
@@ -49,8 +56,8 @@ class Vln:
 
     It ends with a ``stop`` label or when ``/vln/arrived`` says so; where that is said again and again, the policy is
     asked once it was said after the frame came. It never moves without an instruction; an empty one ends it. It stands
-    while the camera or the odometry is older than ``max_age_s``. The first word of ``/vln/status`` is ``idle``,
-    ``running``, ``paused``, ``arrived`` or ``failed``.
+    while the camera, the odometry or a depth camera that was there is older than ``max_age_s``. The first word of
+    ``/vln/status`` is ``idle``, ``running``, ``paused``, ``arrived`` or ``failed``.
 
     Args:
         rate: Steps in a second.
@@ -62,7 +69,7 @@ class Vln:
         angle_deg: Angle from its end at which a turn ends, in degrees.
         clearance_m: Depth beyond a step that must be free, in metres.
         way_share: Share of the width of the depth image, in its middle, that is the way ahead.
-        max_age_s: Age of the camera and of odometry above which the robot stands, in seconds.
+        max_age_s: Age of the camera, odometry and depth above which the robot stands, in seconds.
         motion_s: Time after which a motion that did not reach its end is over, in seconds.
         settle_s: Time after a motion or an instruction after which a frame that comes is used whatever its stamp and
             the speed of odometry, in seconds.
@@ -97,8 +104,8 @@ class Vln:
         check_range("forward_m", self.forward_m, 0.01, 10.0)
         check_range("max_linear_speed", self.max_linear_speed, 0.01, ALLOWED_SPEED["linear"])
         check_range("max_angular_speed", self.max_angular_speed, 0.01, ALLOWED_SPEED["angular"])
-        for name in ("position_m", "angle_deg", "clearance_m", "way_share", "max_age_s", "motion_s", "settle_s"):
-            check_range(name, getattr(self, name), 0.0)
+        for name, high in LARGEST.items():
+            check_range(name, getattr(self, name), 0.0, high)
         check_range("max_actions", self.max_actions, 0)
         if self.policy is not None:
             motions_of(self._observed.labels, self.motions)
@@ -154,7 +161,7 @@ class Vln:
     def step(self, snapshot: Snapshot, state: VlnState) -> tuple[Command, VlnState]:
         """Return the velocity and the status at this step."""
         state = self._listen(snapshot, state)
-        changes = note_changes(snapshot, ("image", "odometry"), state.changes)
+        changes = note_changes(snapshot, ("image", "odometry", "depth"), state.changes)
         state = state._replace(changes=changes)
         if state.phase in (IDLE_PHASE, ARRIVED_PHASE, FAILED_PHASE):
             return self._stand(state)
@@ -192,8 +199,10 @@ class Vln:
 
     def _trouble(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose | None) -> str:
         """Return why the robot cannot move now; empty when it can."""
-        for name, what in (("odometry", "odometry"), ("image", "camera")):
+        for name, what in (("odometry", "odometry"), ("image", "camera"), ("depth", "depth")):
             age = age_s(snapshot, name, state.changes)
+            if name == "depth" and name not in snapshot.newest:
+                continue
             if not age <= self.max_age_s:
                 return f"no {what} yet" if math.isinf(age) else f"{what} {age:.1f} s old"
         return "odometry is not a pose" if pose is None else ""
@@ -205,11 +214,14 @@ class Vln:
         waypoint = motion.goal
         late = snapshot.time_s - motion.began_s > self.motion_s
         hit = motion.kind == FORWARD and self._ahead(snapshot) < self.clearance_m
-        if not over and (late or hit):
+        left_m = math.hypot(motion.goal.x - pose.x, motion.goal.y - pose.y)
+        astray = motion.kind in (FORWARD, BACKWARD) and left_m > self.forward_m + ASTRAY_M
+        if not over and (late or hit or astray):
             over, waypoint, linear, angular = True, pose, 0.0, 0.0
         if over:
             state = self._ended(snapshot, state._replace(motion=None, waypoint=waypoint))
-            return self._stand(state._replace(detail="blocked on the way" if hit else "looking"))
+            detail = "blocked on the way" if hit else "odometry jumped" if astray else "looking"
+            return self._stand(state._replace(detail=detail))
         return self._command(state._replace(detail=motion.kind), linear, angular), state
 
     def _decide(self, snapshot: Snapshot, state: VlnState, pose: PlanarPose) -> tuple[Command, VlnState]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import BusError
+from vlatool.messages._names_text import names_text
 from vlatool.messages.sensor_msgs import PointCloud2, PointField
 from vlatool.messages.std_msgs import Header
 
@@ -30,8 +31,12 @@ def points(message: PointCloud2) -> Array:
     """
     if not message.height * message.width:
         return np.zeros((0, len(COORDINATES)), np.float32)
+    columns = {name: values(message, name) for name in COORDINATES}
+    if several := next((name for name, column in columns.items() if column.ndim > 1), ""):
+        count = columns[several].shape[1]
+        raise BusError(f"A point cloud whose field {several!r} has {count} elements, not one.", DRIVER)
     with np.errstate(over="ignore"):
-        found = np.stack([values(message, name).astype(np.float32) for name in COORDINATES], axis=1)
+        found = np.stack([column.astype(np.float32) for column in columns.values()], axis=1)
     return found[np.isfinite(found).all(axis=1)]
 
 
@@ -47,7 +52,7 @@ def values(message: PointCloud2, name: str) -> Array:
     """
     fields = [field for field in message.fields if field.name == name]
     if len(fields) != 1:
-        known = ", ".join(field.name for field in message.fields[:20]) or "none"
+        known = names_text(field.name for field in message.fields)
         raise BusError(f"A point cloud with {len(fields)} fields named {name!r}; its fields: {known}.", DRIVER)
     field, step = fields[0], message.point_step
     if field.datatype not in DTYPES:

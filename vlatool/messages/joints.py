@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import BusError
+from vlatool.messages._names_text import names_text
 from vlatool.messages.sensor_msgs import JointState
 
 Array = NDArray[Any]
@@ -38,7 +39,7 @@ def joint_values(message: JointState, names: Sequence[str], quantity: str = "pos
         if (count := reported.count(name)) != 1:
             problem = "without" if not count else f"{count} times with"
             raise BusError(
-                f"A JointState {problem} the joint {name!r}; its joints: {', '.join(reported[:40]) or 'none'}.",
+                f"A JointState {problem} the joint {name!r}; its joints: {names_text(reported)}.",
                 "check the joint names of the robot's driver, or map them",
             )
     return np.array([found[reported.index(name)] for name in names], np.float64)

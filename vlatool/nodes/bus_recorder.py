@@ -75,6 +75,8 @@ class BusRecorder:
                     break
         finally:
             self.summary.seconds = time.monotonic() - began
+        for topic in sorted(self._wanted - {*self.summary.messages} - {*self.summary.unknown}):
+            self.summary.unknown[topic] = "nobody published it"
         if self._failure is not None:
             raise self._failure
         return self.summary

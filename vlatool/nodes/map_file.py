@@ -9,6 +9,7 @@ from typing import Any
 from vlatool import registry
 from vlatool.errors import DataError, UsageError, require
 from vlatool.files.json import read_json
+from vlatool.files.yaml import read_mapping
 from vlatool.nodes.settings import MAX_BYTES
 
 FIX = "print a proposed one: vlatool run policy --bundle BUNDLE --print-map"
@@ -47,27 +48,22 @@ def read_map(path: Path) -> dict[str, Any]:
     """Return the content of a map in YAML or JSON.
 
     Raises:
-        DataError: when it cannot be read or is not a mapping.
+        DataError: when it cannot be read, has a key twice or is not a mapping.
         MissingExtra: for YAML where its library is absent, as on a robot; JSON is read everywhere.
     """
+    what = f"The map {path}"
+    if path.suffix != ".json":
+        return read_mapping(path, what, DataError)
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise DataError(f"The map {path} cannot be read: {error.strerror}.", "check the path") from None
+        raise DataError(f"{what} cannot be read: {error.strerror}.", "check the path") from None
     if len(content) > MAX_BYTES:
-        raise DataError(f"The map {path} has more than {MAX_BYTES:,} bytes.", FIX)
-    if path.suffix == ".json":
-        values = read_json(content, f"The map {path}", DataError, FIX, strict=True)
-    else:
-        yaml: Any = require("yaml", "build")
-        try:
-            values = yaml.safe_load(content)
-        except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise DataError(f"The map {path} is not valid YAML: {reason}.", FIX) from None
+        raise DataError(f"{what} has more than {MAX_BYTES:,} bytes.", FIX)
+    values = read_json(content, what, DataError, FIX, strict=True)
     if not isinstance(values, dict):
-        raise DataError(f"The map {path} is not a mapping of inputs and outputs.", FIX)
+        raise DataError(f"{what} is not a mapping of inputs and outputs.", FIX)
     return values
 
 

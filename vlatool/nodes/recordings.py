@@ -81,6 +81,9 @@ def open_recording(path: Path, controller: str, node: str = "") -> Recording:
 def _of_bag(path: Path, controller: str, node: str) -> Recording:
     found = _records(path)
     fitting = [about for about in found if _is(about, controller) and node.strip("/") in ("", about.node)]
+    if not fitting and (others := [about.node for about in found if _is(about, controller)]):
+        raise DataError(f"{path} has no run of the node '{node}'; nodes of '{controller}': {', '.join(others)}.",
+                        f"name one of them: --node {others[0]}")  # fmt: skip
     if not fitting:
         raise _other(path, found, controller)
     if len(fitting) > 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -9,10 +10,11 @@ from typing import Any
 
 from vlatool.controllers import Reading, Request, RobotController, Snapshot
 from vlatool.errors import DataError
+from vlatool.files.printable import amount
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
-from vlatool.nodes.content import digest_of, from_text
-from vlatool.nodes.run_log import Item, Received
+from vlatool.nodes.content import digest, digest_of, from_text
+from vlatool.nodes.run_log import Item, LogEnd, Received
 from vlatool.nodes.step_record import StepRecord, differences
 from vlatool.nodes.stepper import check_controller
 
@@ -26,7 +28,7 @@ class Difference:
 
     Args:
         step: Number of the step.
-        output: Output of the controller.
+        output: Output of the controller, ``response N`` to a call, or ``status of the step``.
         index: Which of its messages.
         recorded: The recorded message, as ``content.to_text`` writes it; empty for none.
         computed: The one that was computed again.
@@ -50,7 +52,8 @@ class ReplayReport:
         difference: The first difference; None where all commands are equal bit for bit.
         unused: Recorded messages that no step read.
         unheard: Commands in the records of the steps that are not among the recorded messages of their topics.
-        note: Why the replay ends before the recording does; empty where it does not.
+        note: Why the replay ends before the run did; empty where it does not.
+        altered: Recorded commands in place of unheard ones: messages on their topics that no step sent.
     """
 
     steps: int
@@ -60,11 +63,12 @@ class ReplayReport:
     unused: int
     note: str
     unheard: int = 0
+    altered: int = 0
 
     @property
     def equal(self) -> bool:
-        """Whether all commands are equal bit for bit."""
-        return self.difference is None
+        """Whether all commands are equal bit for bit, and none of them was recorded otherwise."""
+        return self.difference is None and not self.altered
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values for JSON."""
@@ -163,17 +167,20 @@ class _Replay:
         self._first: Difference | None = None
 
     def run(self, items: Iterable[Item]) -> ReplayReport:
+        end = ""
         for item in items:
             if isinstance(item, Received):
                 self._messages.add(item)
             elif isinstance(item, StepRecord):
                 self._expect(item)
                 self._waiting.append(item)
+            elif isinstance(item, LogEnd):
+                end = item.note
             note = self._work()
             if note:
                 break
         else:
-            note = self._missing() if self._waiting else ""
+            note = self._missing() if self._waiting else end
         if not self._steps and note:
             raise DataError(
                 f"No step can be computed again: {note}.", "record the topics that it reads from the start on"
@@ -182,8 +189,18 @@ class _Replay:
             raise DataError("The recording holds no step of a controller.",
                             "record the topics /NODE/steps and /NODE/controller, too, or all topics")  # fmt: skip
         unheard = sum((self._sent - self._messages.heard).values())
+        altered = 0 if note else min(unheard, self._foreign())
         return ReplayReport(self._steps, self._compared, self._differing, self._first, self._messages.unread(), note,
-                            unheard)  # fmt: skip
+                            unheard, altered)  # fmt: skip
+
+    def _foreign(self) -> int:
+        """Return how many messages on the topics of its outputs are neither of a step nor of its rest."""
+        rest = self._controller.rest().messages
+        last = Counter((topic, digest(message)) for name, topic in self._outputs.items()
+                       for message in rest.get(name, ()))  # fmt: skip
+        topics = {*self._outputs.values()}
+        strange = self._messages.heard - self._sent - last
+        return sum(count for (topic, _), count in strange.items() if topic in topics)
 
     def _expect(self, record: StepRecord) -> None:
         if not self._steps and not self._waiting and record.step:
@@ -217,7 +234,7 @@ class _Replay:
         self._compared += sum(map(len, record.messages.values()))
         for name, topic in self._outputs.items():
             self._sent.update((topic, digest_of(text)) for text in record.messages.get(name, ()))
-        found = differences(record.messages, command)
+        found = differences(record, command)
         self._differing += bool(found)
         if found and self._first is None:
             self._first = Difference(record.step, *found[0])
@@ -233,6 +250,8 @@ def lines(report: ReplayReport) -> Iterator[str]:
         yield f"{count}: {report.differing} steps differ, the first is {first.step}, '{first.output}'"
         yield f"  recorded  {_shown(first.recorded)}"
         yield f"  computed  {_shown(first.computed)}"
+    if report.altered:
+        yield f"{amount(report.altered, 'recorded command')} that no step sent: altered, or of another node"
     if report.unheard:
         yield f"{report.unheard} of them are not among the recorded messages of their topics"
     if report.note:
@@ -240,6 +259,7 @@ def lines(report: ReplayReport) -> Iterator[str]:
 
 
 def _shown(text: str) -> str:
-    if "=" not in text:
-        return text or "nothing"
-    return str(from_text(text))
+    """Return a recorded text as a person reads it: the message that it is, or itself."""
+    with contextlib.suppress(DataError):
+        return str(from_text(text))
+    return text or "nothing"

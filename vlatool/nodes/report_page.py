@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from vlatool.errors import OutputError
 from vlatool.files.printable import amount, printable
 from vlatool.files.user_files import write_own_file
 from vlatool.nodes.session import RunResult
@@ -25,8 +26,13 @@ MAX_LINES = 6
 
 
 def write_page(path: Path, result: RunResult, trace: Trace) -> None:
-    """Write the report; raises OutputError where the file exists already."""
-    write_own_file(path, page(result, trace), force=False, comment="<!-- {} -->")
+    """Write the report; raises OutputError where the file exists already or cannot be written."""
+    try:
+        write_own_file(path, page(result, trace), force=False, comment="<!-- {} -->")
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written: {error.strerror}.", "free some space, or check the path"
+        ) from error
 
 
 def page(result: RunResult, trace: Trace) -> str:

@@ -107,12 +107,15 @@ class RunLog:
     def __init__(self, path: str | os.PathLike[str], record: ControllerRecord, max_bytes: int = MAX_BYTES) -> None:
         self._writer = RunWriter(path)
         self._most = max_bytes
+        self._broken = False
         self.full = False
         """Whether the log ended before the run."""
         self._append(Frame(FrameKind.HEADER, {"controller": record.to_json()}, {}))
 
     def _append(self, frame: Frame) -> None:
+        self._broken = True  # behind a frame that was written in part, none can be read
         self.full = self.full or not self._writer.append(frame, self._most)
+        self._broken = False
 
     def __call__(self, report: StepReport) -> None:
         """Write a step and the messages that it was made from."""
@@ -126,14 +129,20 @@ class RunLog:
         self._append(Frame(FrameKind.TICK, {"record": StepRecord.of(report).to_json()}, {}))
 
     def close(self, lost: int = 0) -> None:
-        """Write the end and close the file.
+        """Write the end, unless a frame could not be written, and close the file.
 
         Args:
             lost: Reports that never reached this log.
+
+        Raises:
+            OSError: when the end cannot be written.
         """
         note = "the log was full" if self.full else f"{lost} steps were not written" if lost else ""
-        self._writer.append(Frame(FrameKind.END, {"note": note}, {}))
-        self._writer.close()
+        try:
+            if not self._broken:
+                self._writer.append(Frame(FrameKind.END, {"note": note}, {}))
+        finally:
+            self._writer.close()
 
 
 class Received(NamedTuple):
@@ -150,15 +159,23 @@ class Received(NamedTuple):
     digest: str
 
 
-Item = ControllerRecord | StepRecord | Received
+class LogEnd(NamedTuple):
+    """The end of a log, and why it is not whole; an empty note where it is."""
+
+    note: str
+
+
+Item = ControllerRecord | StepRecord | Received | LogEnd
+CUT = "the log has no end: its process was killed, or the file was cut"
 
 
 def read_log(path: Path) -> Iterator[Item]:
-    """Return what a log holds, in order.
+    """Return what a log holds, in order; last what its end says, or that it has none.
 
     Raises:
         DataError: when it is damaged, or the log of something else than a controller.
     """
+    end = LogEnd(CUT)
     for frame in read_run(path):
         try:
             if frame.kind is FrameKind.HEADER:
@@ -168,9 +185,12 @@ def read_log(path: Path) -> Iterator[Item]:
             elif frame.kind is FrameKind.CALL:
                 message = decode(find_type(frame.values["type"]), frame.arrays["cdr"].tobytes())
                 yield Received(str(frame.values["input"]), message, str(frame.values["digest"]))
+            else:
+                end = LogEnd(str(frame.values["note"]))
         except (KeyError, AttributeError, BusError, UsageError) as error:
             raise DataError(f"{path} is not the log of a controller: {error}.",
                             "name a file of vlatool run --record, or a bag") from None  # fmt: skip
+    yield end
 
 
 def is_log(path: Any) -> bool:

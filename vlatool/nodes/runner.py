@@ -1,6 +1,6 @@
 """A controller on a bus: a step at each tick of a clock that does not drift, a rest whenever it ends.
 
-Needs NumPy alone. Whatever ends the run (its time, ``stop``, Ctrl-C, SIGTERM, a step or a bus that fails), the
+Needs NumPy alone. Whatever ends the run (its time, ``stop``, Ctrl-C, SIGTERM, SIGHUP, a step or a bus that fails), the
 controller's ``rest`` is sent last, once, with the signals held back meanwhile.
 """
 
@@ -160,12 +160,12 @@ class Runner:
         Raises:
             BusError: when an output has another publisher by now; nothing was sent then.
             Exception: what a step, the bus or an observer raised, after the rest was sent.
-            SystemExit: with 143 at SIGTERM, where nobody else handles it; KeyboardInterrupt at Ctrl-C.
+            SystemExit: with 143 at SIGTERM, 129 at SIGHUP, where nobody handles it; KeyboardInterrupt at Ctrl-C.
         """
         self._refuse_others()
         began = time.monotonic()
         try:
-            with _ended_by_sigterm():
+            with _ended_by_signals():
                 self._loop(began, math.inf if seconds is None else seconds)
         finally:
             with _signals_held_back():
@@ -228,21 +228,24 @@ def _filling(inbox: Inbox) -> Callable[[Reception], None]:
 
 
 @contextlib.contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    """Make SIGTERM raise SystemExit with 143 where nobody handles it yet, so that the robot is brought to rest."""
+def _ended_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP, of a terminal that is gone, raise SystemExit where nobody handles them yet: the robot is
+    brought to rest.
+    """
 
     def end(number: int, _frame: object) -> None:
         raise SystemExit(128 + number)
 
     mine = threading.current_thread() is threading.main_thread()
-    if not mine or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, end)
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if mine and hasattr(signal, name)]
+    numbers = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    for number in numbers:
+        signal.signal(number, end)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
 
 
 @contextlib.contextmanager

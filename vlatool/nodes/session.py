@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -129,8 +130,7 @@ def run_on_bus(
         BusError: as ``Runner`` does, or when the bus cannot be reached.
         Exception: what a step raised, after the robot was brought to rest.
     """
-    for path in (plan.record, plan.report):
-        refuse_output(path)
+    refuse_outputs(plan)
     if not plan.bus:
         raise UsageError("No bus is named.", "pass --bus BUS, such as --bus zenoh, or --dry-run")
     controller = open_controller(plan.controller, plan.settings, plan.policy)
@@ -194,8 +194,7 @@ def dry_run(plan: RunPlan) -> dict[str, Any]:
     Raises:
         UsageError, InputError, MissingExtra: as ``run_on_bus`` does until it opens the bus.
     """
-    for path in (plan.record, plan.report):
-        refuse_output(path)
+    refuse_outputs(plan)
     controller = open_controller(plan.controller, plan.settings, plan.policy)
     topics = topics_of(controller, plan.topics)
     check_controller(controller)
@@ -233,18 +232,33 @@ def default_node(controller: str) -> str:
 
 def _closed(about: ControllerRecord, runner: Runner, background: Background, log: RunLog | None) -> RunResult:
     background.close()
+    failure = background.failure
     if log is not None:
-        log.close(background.lost)
-    failure = "" if background.failure is None else f"{type(background.failure).__name__}: {background.failure}"
+        try:
+            log.close(background.lost)
+        except OSError as error:
+            failure = failure or error
     full = log is not None and log.full
-    return RunResult(about, runner.summary, background.lost, full, failure, tuple(runner.bus.faults()))
+    return RunResult(about, runner.summary, background.lost, full, _reason(failure), tuple(runner.bus.faults()))
 
 
-def refuse_output(path: Path | None) -> None:
-    """Raise OutputError where a file exists already, or its directory does not."""
-    if path is None:
-        return
-    if path.exists() or path.is_symlink():
-        raise OutputError(f"{path} exists already.", "name a new file, or remove it")
-    if not path.absolute().parent.is_dir():
-        raise OutputError(f"{path} cannot be written: {path.absolute().parent} is not a directory.", "create it first")
+def _reason(failure: Exception | None) -> str:
+    """Return why records are not whole; empty without a failure."""
+    if isinstance(failure, OSError) and failure.filename:
+        return f"{failure.filename}: {failure.strerror}"
+    return "" if failure is None else f"{type(failure).__name__}: {failure}"
+
+
+def refuse_outputs(plan: RunPlan) -> None:
+    """Raise OutputError where a file of a run exists already, cannot be created, or is named twice."""
+    paths = [path for path in (plan.record, plan.report) if path is not None]
+    for path in paths:
+        folder = path.absolute().parent
+        if path.exists() or path.is_symlink():
+            raise OutputError(f"{path} exists already.", "name a new file, or remove it")
+        if not folder.is_dir():
+            raise OutputError(f"{path} cannot be written: {folder} is not a directory.", "create it first")
+        if not os.access(folder, os.W_OK):
+            raise OutputError(f"{path} cannot be written: {folder} is not writable.", "name a directory of yours")
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise OutputError(f"{paths[0]} is named twice: for the log and for the report.", "name two files")

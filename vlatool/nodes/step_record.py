@@ -15,6 +15,8 @@ from typing import Any
 from vlatool.controllers import Command
 from vlatool.errors import DataError, VlatoolError
 from vlatool.files.json import parse_json
+from vlatool.files.printable import one_line
+from vlatool.machine.version import VERSION
 from vlatool.messages import Message
 from vlatool.messages.std_msgs import String
 from vlatool.nodes.content import digest, to_text
@@ -88,9 +90,9 @@ class StepRecord:
         """Return what ``to_json`` wrote; raises DataError for anything else."""
         try:
             values = json.loads(text)
-            known = {each.name for each in dataclasses.fields(cls)}
-            if not isinstance(values, dict) or not set(values) <= known or type(values.get("step")) is not int:
+            if not isinstance(values, dict) or type(values.get("step")) is not int:
                 raise ValueError("another object")
+            _refuse_newer(cls, values)
             return cls(
                 values["step"], float(values["time_s"]), _pair(values.get("stamp", (0, 0))),
                 {str(name): tuple((float(at), int(number), str(content)) for at, number, content in each)
@@ -144,15 +146,28 @@ class ControllerRecord:
     @classmethod
     def from_json(cls, text: str) -> ControllerRecord:
         """Return what ``to_json`` wrote; raises DataError for anything else."""
+        unreadable = DataError(f"The record of a controller is '{text:.60}', which cannot be read.", "record again")
         try:
             values = parse_json(text.encode())
+        except (ValueError, VlatoolError):
+            raise unreadable from None
+        _refuse_newer(cls, values)
+        try:
             record = cls(**values)
             if not all(isinstance(getattr(record, name), str) for name in ("controller", "node", "policy", "robot")):
                 raise ValueError("a name that is none")
             return dataclasses.replace(record, settings=dict(record.settings), topics=dict(record.topics))
-        except (ValueError, TypeError, VlatoolError):
-            raise DataError(f"The record of a controller is '{text:.60}', which cannot be read.",
-                            "record again") from None  # fmt: skip
+        except (ValueError, TypeError):
+            raise unreadable from None
+
+
+def _refuse_newer(cls: type, values: Any) -> None:
+    """Raise DataError where an object has a field that its record does not have in this version."""
+    known = {each.name for each in dataclasses.fields(cls)}
+    if isinstance(values, dict) and (others := sorted(set(map(str, values)) - known)):
+        writer = one_line(str(values.get("version") or "a newer one"), 40)
+        raise DataError(f"A record of a run has '{one_line(others[0], 40)}', which vlatool {VERSION} does not know: "
+                           f"{writer} wrote it.", "replay it with that version")  # fmt: skip
 
 
 def topic_of(node: str, part: str) -> str:
@@ -160,14 +175,22 @@ def topic_of(node: str, part: str) -> str:
     return f"/{node.strip('/')}/{part}"
 
 
-def differences(recorded: Mapping[str, tuple[str, ...]], command: Command) -> list[tuple[str, int, str, str]]:
-    """Return where a computed command differs from a recorded one: output, index, recorded text, computed text."""
+def differences(record: StepRecord, command: Command) -> list[tuple[str, int, str, str]]:
+    """Return where a computed command differs from a recorded step: output, index, recorded text, computed text.
+
+    Answers of services and the status are compared behind the messages.
+    """
+    recorded = {**record.messages, **{f"response {number}": (text,) for number, text in record.responses.items()}}
+    computed = {name: tuple(map(to_text, messages)) for name, messages in command.messages.items()}
+    computed |= {f"response {number}": (to_text(response),) for number, response in command.responses.items()}
     found = []
-    for name in sorted({*recorded, *command.messages}):
-        old, new = recorded.get(name, ()), tuple(map(to_text, command.messages.get(name, ())))
+    for name in sorted({*recorded, *computed}, key=lambda name: (name not in command.messages, name)):
+        old, new = recorded.get(name, ()), computed.get(name, ())
         for index in range(max(len(old), len(new))):
             one = old[index] if index < len(old) else ""
             other = new[index] if index < len(new) else ""
             if one != other:
                 found.append((name, index, one, other))
+    if record.status != command.status:
+        found.append(("status of the step", 0, record.status, command.status))
     return found

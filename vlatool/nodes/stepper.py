@@ -106,7 +106,8 @@ def topics_of(controller: RobotController[Any], renamed: Mapping[str, str]) -> d
         renamed: Name of an input, output or service, or its topic, -> another topic.
 
     Raises:
-        UsageError: for an unknown name, or a topic that does not begin with a slash.
+        UsageError: for an unknown name, a topic that does not begin with a slash, an output that the controller would
+            hear itself, or one topic for two of them.
     """
     known = {entry.name: entry.topic for entry in controller.inputs}
     known |= {output.name: output.topic for output in controller.outputs}
@@ -121,6 +122,11 @@ def topics_of(controller: RobotController[Any], renamed: Mapping[str, str]) -> d
                              "write it from its slash on: --map scan=/front/scan")  # fmt: skip
         for each in by_topic.get(name, [name]):
             found[each] = topic
+    read = {found[entry.name]: entry.name for entry in controller.inputs}
+    for output in controller.outputs:
+        if (topic := found[output.name]) in read:
+            raise UsageError(f"'{output.name}' is mapped to {topic}, which its input '{read[topic]}' reads: the "
+                             "controller would hear itself.", "map it to a topic of its own")  # fmt: skip
     written = [found[output.name] for output in controller.outputs]
     if double := next((topic for topic in written if written.count(topic) > 1), ""):
         raise UsageError(f"Two outputs of the controller are mapped to {double}.", "map each to a topic of its own")

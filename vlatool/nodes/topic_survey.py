@@ -78,18 +78,21 @@ def survey(bus: Bus, node: str, seconds: float) -> list[TopicReport]:
     """
     watches: dict[str, _Watch] = {}
     refused: dict[str, str] = {}
+    recorded = {info.topic for info in bus.topics() if not info.publishers and not info.subscribers}
     end = time.monotonic() + seconds
     while True:
         for info in bus.topics():
             if info.topic not in watches and info.topic not in refused and info.types:
                 _watch(bus, info, watches, refused)
+        bus.wait_for_peers((), 0.0)  # a recording plays the topics that are watched by then
         left = end - time.monotonic()
         if left <= 0:
             break
         time.sleep(min(0.2, left))
     faults = {fault.topic: fault_text(fault) for fault in bus.faults()}
     return [_report(info, watches.get(info.topic), (refused.get(info.topic), faults.get(info.topic)), node)
-            for info in bus.topics() if set(info.publishers) - {node} or set(info.subscribers) - {node}]  # fmt: skip
+            for info in bus.topics()
+            if info.topic in recorded or {*info.publishers, *info.subscribers} - {node}]  # fmt: skip
 
 
 def _watch(bus: Bus, info: TopicInfo, watches: dict[str, _Watch], refused: dict[str, str]) -> None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from vlatool.buses import Bus, QoS, Reception
 from vlatool.controllers import Snapshot
+from vlatool.files.printable import truncate
 from vlatool.messages import Message
 from vlatool.messages.geometry_msgs import PoseStamped, Twist
 from vlatool.messages.nav_msgs import Odometry
@@ -16,6 +17,10 @@ from vlatool.nodes.stepper import StepReport
 
 MAX_POINTS = 20_000
 """Steps that are kept; of a longer run every second one, then every fourth, and so on."""
+MAX_CHANGES = 10_000
+"""Changes of a level that are kept; the oldest half gives way."""
+MAX_TEXT, MAX_WORD = 300, 80
+"""Characters of a status or a note, and of a level, that are kept: both may come from other nodes."""
 
 
 class TracePoint(NamedTuple):
@@ -76,8 +81,9 @@ def watch_levels(bus: Bus, trace: Trace) -> None:
 
         def hear(got: Reception) -> None:
             text: Any = got.message
-            word = (text.data.split() or [""])[0]
+            word = truncate((text.data[: 2 * MAX_WORD].split() or [""])[0], MAX_WORD)
             if not heard or heard[-1][1] != word:
+                del heard[: MAX_CHANGES // 2 if len(heard) == MAX_CHANGES else 0]
                 heard.append((got.received_s, word))
 
         return hear
@@ -91,8 +97,10 @@ def _point(report: StepReport, first_s: float) -> TracePoint:
     snapshot, command = report.snapshot, report.command
     sent = [message for messages in command.messages.values() for message in messages]
     ages = {name: (snapshot.time_s - got.received_s) * 1e3 for name, got in snapshot.newest.items()}
+    notes = {name: truncate(value, MAX_TEXT) if isinstance(value, str) else value
+             for name, value in command.notes.items()}  # fmt: skip
     return TracePoint(
-        snapshot.time_s - first_s, _position(snapshot), _speeds(sent), command.status, dict(command.notes),
+        snapshot.time_s - first_s, _position(snapshot), _speeds(sent), truncate(command.status, MAX_TEXT), notes,
         report.late_s * 1e3, report.compute_s * 1e3, report.total_s * 1e3, ages, report.skipped,
     )  # fmt: skip
 

@@ -12,6 +12,9 @@ from vlatool.errors import UsageError
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
 
+LARGEST = {"drop": 1.0, "freeze": 1.0}
+"""Knob that is a share -> its largest value."""
+
 
 def read_knob(name: str, text: str, sensors: Collection[str]) -> dict[str, float]:
     """Return a knob that each sensor has: sensor -> number.
@@ -22,9 +25,10 @@ def read_knob(name: str, text: str, sensors: Collection[str]) -> dict[str, float
         sensors: Known sensors.
 
     Raises:
-        UsageError: for an unknown sensor, or what is not a number of 0 or more.
+        UsageError: for an unknown sensor, or what is not a number from 0 to that of ``LARGEST``.
     """
     values: dict[str, float] = {}
+    most = LARGEST.get(name, 1e6)
     for part in filter(None, (piece.strip() for piece in str(text).split(","))):
         sensor, equals, number = part.partition("=")
         if equals and sensor not in sensors:
@@ -33,9 +37,9 @@ def read_knob(name: str, text: str, sensors: Collection[str]) -> dict[str, float
             value = float(number if equals else sensor)
         except ValueError:
             value = -1.0
-        if not 0.0 <= value < float("inf"):
+        if not 0.0 <= value <= most:
             raise UsageError(
-                f"{name} has '{part}'; allowed: a number of 0 or more, or SENSOR=NUMBER separated by commas.",
+                f"{name} has '{part}'; allowed: a number from 0 to {most:g}, or SENSOR=NUMBER separated by commas.",
                 f"write for example {name}='0.1' or {name}='{next(iter(sensors))}=0.1'",
             )
         values.update({sensor: value} if equals else dict.fromkeys(sensors, value))

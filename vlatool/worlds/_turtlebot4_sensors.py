@@ -55,6 +55,8 @@ FAR_M = 8.0
 """Distance from which the depth camera sees nothing."""
 LIDAR_HEIGHT_M, LIDAR_RAYS, LIDAR_NEAR_M, LIDAR_FAR_M = 0.19, 360, 0.15, 12.0
 """An RPLIDAR A1: one ray for a degree."""
+LIDAR_YAW, LIDAR_FORWARD_M = math.pi / 2.0, -0.04
+"""Where it is on the base, in radians and metres (turtlebot4_description): its 0 degrees are to the left."""
 TICKS = 100.0
 """Ticks of the simulation in a second."""
 IDLE_SHARE, DRIVE_SHARE = 5e-5, 5e-5
@@ -154,9 +156,10 @@ class Sensors:
 
     def _scan(self, stamp: Time, data: Any) -> LaserScan:
         x, y, yaw = data.qpos[:3]
-        angles = self._angles + yaw
+        angles = self._angles + LIDAR_YAW + yaw
         rays = np.stack([np.cos(angles), np.sin(angles), np.zeros(LIDAR_RAYS)], axis=1).reshape(-1)
-        origin = np.array([x, y, LIDAR_HEIGHT_M])
+        lidar = x + LIDAR_FORWARD_M * math.cos(yaw), y + LIDAR_FORWARD_M * math.sin(yaw)
+        origin = np.array([*lidar, LIDAR_HEIGHT_M])
         self._mujoco.mj_multiRay(
             self._model, data, origin, rays, None, 1, self._base, self._hits, self._distances, LIDAR_RAYS, LIDAR_FAR_M
         )

@@ -34,6 +34,13 @@ ROBOT = (
     f'<geom type="cylinder" pos="0 0 0.06" size="{RADIUS_M} 0.05" mass="3.9" group="3" contype="1" conaffinity="1"/>'
 )
 
+RANGES: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("pillars", "cliffs", "movers", "people"), (0, 999)), "intruder_s": (0.0, 1e6),
+    "yield_m": (0.0, 10.0), "gaps": (0.0, 1.0), "target_m": (0.0, 50.0), "target_speed": (0.0, 10.0),
+    "size_m": (2.0, 50.0), "width": (8, 640), "height": (8, 480), "battery": (0.0, 1.0),
+}  # fmt: skip
+"""Knob -> its least and largest value; MuJoCo's picture has 640 x 480 pixels at most."""
+
 
 @dataclass
 class TurtleBot4:
@@ -92,21 +99,10 @@ class TurtleBot4:
     def __post_init__(self) -> None:
         for name in ("delay", "drop", "freeze", "noise"):
             self._knobs[name] = read_knob(name, getattr(self, name), SENSORS)
-        for name in (
-            "pillars",
-            "cliffs",
-            "movers",
-            "people",
-            "intruder_s",
-            "yield_m",
-            "gaps",
-            "target_m",
-            "target_speed",
-        ):
-            if not 0 <= getattr(self, name) < 1000:
-                raise UsageError(f"{name} is {getattr(self, name)!r}; allowed: 0 or more.", f"change {name}")
-        if not 2.0 <= self.size_m <= 50.0:
-            raise UsageError(f"size_m is {self.size_m!r}; allowed: from 2 to 50 metres.", "change size_m")
+        for name, (low, high) in RANGES.items():
+            if not low <= getattr(self, name) <= high:
+                allowed = f"from {low:g} to {high:g}"
+                raise UsageError(f"{name} is {getattr(self, name)!r}; allowed: {allowed}.", f"change {name}")
         self._names = tuple(filter(None, (part.strip() for part in self.only.split(",")))) or tuple(SENSORS)
         if absent := [name for name in self._names if name not in SENSORS]:
             raise UsageError.unknown(f"Unknown sensor '{absent[0]}' in only", absent[0], SENSORS)

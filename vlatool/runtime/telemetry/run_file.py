@@ -103,7 +103,7 @@ class RunWriter:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        self._crc = 0
+        self._crc, self._path = 0, path
         self.size = 0
         """Bytes that were written."""
         try:
@@ -120,11 +120,18 @@ class RunWriter:
             ) from None
 
     def append(self, frame: Frame, most: float = math.inf) -> bool:
-        """Write a frame, unless the file would then be larger than ``most`` bytes; returns whether it was written."""
+        """Write a frame, unless the file would then be larger than ``most`` bytes; returns whether it was written.
+
+        Raises:
+            OSError: when the disk takes no more; names the file.
+        """
         content, crc = _encoded(frame, self._crc)
         if self.size + len(content) > most:
             return False
-        self._write(content)
+        try:
+            self._write(content)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, os.fspath(self._path)) from error
         self._crc = crc
         return True
 
@@ -161,8 +168,8 @@ def read_run(path: str | os.PathLike[str]) -> Iterator[Frame]:
     """Return the frames of a file, up to one that was not written to its end.
 
     Raises:
-        DataError: when the file cannot be read or is none of a recorded run, or at the first frame that is not as it
-            was written.
+        DataError: when the file cannot be read or is none of a recorded run, at the first frame that is not as it was
+            written, or where something follows its end.
     """
     try:
         with Path(path).open("rb") as file:
@@ -175,6 +182,8 @@ def read_run(path: str | os.PathLike[str]) -> Iterator[Frame]:
                 _check_place(frame, number, f"{path}: frame {number}")
                 yield frame
                 left, number = left - taken, number + 1
+                if frame.kind is FrameKind.END and left:
+                    raise DataError(f"{path}: {left:,} bytes follow its end.", "use the frames before its end")
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.", "check the path") from None
 
