@@ -171,8 +171,8 @@ class ArmWorld:
         if self._mirrors:
             wanted, speeds = self._wanted
             wanted[:count], speeds[:count] = positions, velocities
-            for place, (_, of, factor) in enumerate(self._mirrors, count):
-                wanted[place], speeds[place] = factor * positions[of], factor * velocities[of]
+            for index, (_, of, factor) in enumerate(self._mirrors, count):
+                wanted[index], speeds[index] = factor * positions[of], factor * velocities[of]
             positions, velocities = wanted, speeds
         self._servos.control(data, positions, velocities)
         advance_model(self._mujoco, self._model, data)
