@@ -106,7 +106,9 @@ class _Both(NamedTuple):
                       for side in ("begin", "end"))  # fmt: skip
         return cls(
             np.array([[*places, *[places[-1]] * (count - len(places))] for places in joints]),
-            *parts,
+            parts[0],
+            parts[1],
+            parts[2],
             np.array([chain.base.matrix() for chain in chains]),
             np.array([[0], [1]]),
             np.array([[count if one.link < 0 else one.link for one in each] for each in own]),
