@@ -67,7 +67,7 @@ def test_an_arm_goes_to_its_start_pose_within_its_limits_and_then_does_what_the_
     for joint, velocity, acceleration in zip(limits, fastest, hardest, strict=True):
         if joint.command != "range":
             assert 0.0 < velocity <= controller.speed * joint.velocity[1] + 1e-9
-            assert acceleration <= joint.acceleration + 1e-6
+            assert acceleration <= controller.acceleration * joint.acceleration + 1e-6
     assert all(not command.notes.get("checks") for command in arm.commands)  # the way is within the limits by itself
     assert controller.policy.resets == 2  # at start, and when it begins to act
 
@@ -446,6 +446,7 @@ def test_a_policy_sees_targets_cameras_and_an_instruction() -> None:
         ({"output": "torque"}, "Unknown output 'torque'"),
         ({"speed": 0.0}, "speed is 0.0"),
         ({"speed": 1.5}, "speed is 1.5"),
+        ({"acceleration": 0.0}, "acceleration is 0.0"),
         ({"rate": 0.0}, "rate is 0.0"),
         ({"margin_rad": -0.1}, "margin_rad is -0.1"),
         ({"max_age_s": 0.0}, "max_age_s is 0.0"),

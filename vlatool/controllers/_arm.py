@@ -42,6 +42,8 @@ SETTINGS = """Args:
     start_pose: Positions to which it returns, in the order above; those above when empty.
     return_at_start: Whether it goes to the start pose before the policy acts.
     speed: Share of the velocity limits that commands may use.
+    acceleration: Share of the limits of acceleration and jerk that commands may use; all joints at once at their
+        limits may ask for more than the motors can.
     margin_rad: By how much commands stay away from position limits, in rad.
     max_age_s: Age of the joint state above which the arm stops, in seconds.
     max_lag_rad: Distance of a joint from its command above which the arm stops, in rad.
@@ -66,6 +68,7 @@ class ArmController:
     start_pose: tuple[float, ...] = ()
     return_at_start: bool = True
     speed: float = 0.5
+    acceleration: float = 1.0
     margin_rad: float = 0.02
     max_age_s: float = 0.2
     max_lag_rad: float = 0.5
@@ -85,6 +88,7 @@ class ArmController:
         if self.output not in OUTPUTS:
             raise UsageError.unknown(f"Unknown output '{self.output}'", self.output, OUTPUTS)
         check_range("speed", self.speed, 0.01, 1.0)
+        check_range("acceleration", self.acceleration, 0.01, 1.0)
         check_range("margin_rad", self.margin_rad, 0.0, 0.5)
         check_range("lead_s", self.lead_s, 0.0, 1.0)
         check_range("clearance_m", self.clearance_m, 0.01, 1.0)
@@ -96,7 +100,7 @@ class ArmController:
 
     @cached_property
     def _limits(self) -> RobotLimits:
-        return self.ROBOT.limits(self.speed, self.margin_rad)
+        return self.ROBOT.limits(self.speed, self.margin_rad, self.acceleration)
 
     @cached_property
     def _fastest(self) -> Array:

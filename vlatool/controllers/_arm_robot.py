@@ -36,14 +36,15 @@ class ArmRobot:
     chains: Mapping[str, Chain]
     narrower: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
-    def limits(self, speed: float = 1.0, margin: float = 0.0) -> RobotLimits:
+    def limits(self, speed: float = 1.0, margin: float = 0.0, acceleration: float = 1.0) -> RobotLimits:
         """Return the limits of its joints, in their order.
 
         Args:
             speed: Share of the velocities, above 0, up to 1.
             margin: By how much positions stay away from their limits, in rad; grippers may go to the end.
+            acceleration: Share of the accelerations and jerks, above 0, up to 1.
         """
-        limits = RobotLimits.named(self.name).in_order(self.joints).slower(speed)
+        limits = RobotLimits.named(self.name).in_order(self.joints).slower(speed).gentler(acceleration)
         return replace(limits, joints=tuple(self._narrowed(joint, margin) for joint in limits.joints))
 
     def _narrowed(self, joint: JointLimits, margin: float) -> JointLimits:

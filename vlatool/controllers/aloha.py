@@ -34,6 +34,7 @@ class Aloha(ArmController):
     """
 
     speed: float = 0.25
+    margin_rad: float = 0.04
 
     ROBOT: ClassVar[ArmRobot] = ArmRobot("aloha", JOINTS, JOINTS, POSE * 2, CHAINS)
 

@@ -19,9 +19,11 @@ class Franka(ArmController):
 
     In messages they are ``panda_joint1`` to ``panda_joint7`` (franka_ros; an FR3 has other limits). 50 steps in a
     second, between which the driver interpolates. No gripper: Franka's is an action of its own. The start
-    pose is that of franka_ros: 0, -pi/4, 0, -3 pi/4, 0, pi/2, pi/4.
+    pose is that of franka_ros: 0, -pi/4, 0, -3 pi/4, 0, pi/2, pi/4. Commands use half of the limits of acceleration:
+    with all of them, hostile ones asked the arm, stretched out, for more torque than the motors of its shoulder have.
     """
 
+    acceleration: float = 0.5
     margin_rad: float = 0.05
 
     ROBOT: ClassVar[ArmRobot] = ArmRobot(

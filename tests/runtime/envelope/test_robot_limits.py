@@ -87,6 +87,10 @@ def test_a_workspace_bounds_the_axes_that_it_has():
 def test_limits_may_be_slower_in_degrees_in_another_order_and_longer():
     arm = RobotLimits.named("fr3")
     slow = arm.slower(0.25).joints[0]
+    gentle = arm.gentler(0.25)
+    assert [(joint.velocity, joint.acceleration, joint.jerk) for joint in gentle.joints] == [
+        (joint.velocity, 0.25 * joint.acceleration, 0.25 * joint.jerk) for joint in arm.joints
+    ]
     assert slow.velocity == (-0.655, 0.655)
     assert slow.high == arm.joints[0].high
     turned = arm.in_degrees().joints[0]
@@ -99,6 +103,8 @@ def test_limits_may_be_slower_in_degrees_in_another_order_and_longer():
     for wrong in (0.0, 1.1, math.nan):
         with pytest.raises(ProfileError):
             arm.slower(wrong)
+        with pytest.raises(ProfileError):
+            arm.gentler(wrong)
 
 
 def test_the_curve_of_the_fr3_is_that_of_libfranka():

@@ -20,9 +20,11 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import multiprocessing
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -333,10 +335,10 @@ def judge(name: str, options: argparse.Namespace) -> Outcome:
     print(f"{name}: trained: {record.read_text()}", flush=True)
     outcome, begin = Outcome(name, json.loads(record.read_text())["seconds"]), time.process_time()
     episodes(outcome, folder / "int8", options.episodes, models)
-    print(f"  {options.episodes} episodes: {time.process_time() - begin:.0f} s of a core", flush=True)
+    print(f"  {name}: {options.episodes} episodes: {time.process_time() - begin:.0f} s of a core", flush=True)
     begin = time.process_time()
     attack(outcome, options.ticks, models)
-    print(f"  {outcome.ticks} hostile ticks: {time.process_time() - begin:.0f} s of a core", flush=True)
+    print(f"  {name}: {outcome.ticks} hostile ticks: {time.process_time() - begin:.0f} s of a core", flush=True)
     return outcome
 
 
@@ -358,17 +360,19 @@ def main() -> int:
     parser.add_argument("--ticks", type=int, default=100_000)
     parser.add_argument("--seconds", type=float, default=TRAINING_S, help="processor time of a training")
     parser.add_argument("--only", nargs="*", choices=[*WORLDS], default=[*WORLDS])
+    parser.add_argument("--jobs", type=int, default=1, help="robots at a time, each on a core")
     parser.add_argument("--train", action="store_true", help="train again where a bundle is there already")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/reach"))
     parser.add_argument("--models", type=Path, help="folder of unpacked packages; OUT/models when left out")
     options = parser.parse_args()
     options.models = options.models or options.output / "models"
     install_models(options.models)
-    outcomes = []
-    for name in options.only:
-        outcomes.append(judge(name, options))
-        plain = [dataclasses.asdict(outcome) | {"tick_ms": None, "lines": outcome.lines()} for outcome in outcomes]
-        (options.output / "measured.json").write_text(json.dumps(plain, indent=1))
+    longest_first = sorted(options.only, key=lambda name: name != "aloha")
+    with ProcessPoolExecutor(options.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        running = {name: pool.submit(judge, name, options) for name in longest_first}
+        outcomes = [running[name].result() for name in options.only]
+    plain = [dataclasses.asdict(outcome) | {"tick_ms": None, "lines": outcome.lines()} for outcome in outcomes]
+    (options.output / "measured.json").write_text(json.dumps(plain, indent=1))
     show(outcomes)
     return int(any(outcome.wrong() for outcome in outcomes))
 

@@ -15,7 +15,7 @@ from vlatool.runtime.envelope.axis import PositionAxis, Sample
 from vlatool.runtime.envelope.stop import Phases, stop_phases, stop_positions
 
 Array = NDArray[Any]
-Place = tuple[float, ...]
+Pose = tuple[float, ...]
 MAX_POINTS = 24
 """Points of a stop that are looked at; a longer one is looked at less closely."""
 ROUNDING = 1e-9
@@ -40,8 +40,8 @@ class KeepApart:
     minimum_m: float
     reach_m: tuple[float, ...] | None = None
     step_s: float = 0.02
-    _measured: list[tuple[Place, float, bool]] = field(default_factory=list, init=False, repr=False, compare=False)
-    """The place whose distance was computed last, that distance, and whether the way had to be looked at.
+    _measured: list[tuple[Pose, float, bool]] = field(default_factory=list, init=False, repr=False, compare=False)
+    """The pose whose distance was computed last, that distance, and whether the way had to be looked at.
 
     It changes how fast answers are, never which.
     """
@@ -84,17 +84,17 @@ class KeepApart:
             for axis, sample, reach in zip(axes, samples, self.reach_m, strict=True)
         )
 
-    def _at_least(self, positions: Place) -> float:
-        """Return a distance that is not above that at some positions, by the one that was computed last."""
+    def _at_least(self, pose: Pose) -> float:
+        """Return a distance that is not above that of a pose, by the one that was computed last."""
         if self.reach_m is None or not self._measured:
             return -float("inf")
         ((before, distance, _),) = self._measured
         return distance - sum(
-            reach * abs(one - other) for reach, one, other in zip(self.reach_m, positions, before, strict=True)
+            reach * abs(one - other) for reach, one, other in zip(self.reach_m, pose, before, strict=True)
         )
 
 
-def _path(now: Place, axes: Sequence[PositionAxis], samples: Sequence[Sample], interval: float, step_s: float) -> Array:
+def _path(now: Pose, axes: Sequence[PositionAxis], samples: Sequence[Sample], interval: float, step_s: float) -> Array:
     """Return positions (K, A): where the axes are, the command, and the stop behind it at ``step_s`` or wider."""
     stops = [_stop_of(axis, sample, interval) for axis, sample in zip(axes, samples, strict=True)]
     longest = max(left for _, _, left in stops)

@@ -235,6 +235,16 @@ class RobotLimits:
         joints = [replace(joint, velocity=_scaled(joint.velocity, fraction)) for joint in self.joints]
         return replace(self, joints=tuple(joints))
 
+    def gentler(self, fraction: float) -> RobotLimits:
+        """Return these limits with accelerations and jerks of a fraction (above 0, up to 1); the rest stays."""
+        if not 0 < _number(fraction, "The fraction") <= 1:
+            raise _refusal(f"The fraction of the accelerations is {fraction}; allowed: above 0, up to 1.")
+        joints = [
+            replace(joint, acceleration=fraction * joint.acceleration, jerk=fraction * joint.jerk)
+            for joint in self.joints
+        ]
+        return replace(self, joints=tuple(joints))
+
     def plus(self, *joints: JointLimits) -> RobotLimits:
         """Return these limits with further joints at the end, such as a gripper."""
         return replace(self, joints=(*self.joints, *joints))

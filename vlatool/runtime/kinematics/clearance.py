@@ -104,12 +104,11 @@ class _Both(NamedTuple):
         own = [[*each, *[each[0]] * (width - len(each))] for each in capsules]
         begin, end = (np.array([[getattr(one, side) for one in each] for each in own])[..., None]
                       for side in ("begin", "end"))  # fmt: skip
-        constant, sine, cosine = parts
         return cls(
             np.array([[*places, *[places[-1]] * (count - len(places))] for places in joints]),
-            constant,
-            sine,
-            cosine,
+            parts[0],
+            parts[1],
+            parts[2],
             np.array([chain.base.matrix() for chain in chains]),
             np.array([[0], [1]]),
             np.array([[count if one.link < 0 else one.link for one in each] for each in own]),
