@@ -233,6 +233,8 @@ def process(arguments: list[str], meeting: Place, log: IO[str], stdout: Any) -> 
         except subprocess.TimeoutExpired:
             child.kill()
             child.wait()
+        if child.stdout is not None:
+            child.stdout.close()
 
 
 def play_bus(bus: str, seeds: list[int], options: argparse.Namespace) -> list[dict[str, Any]]:
