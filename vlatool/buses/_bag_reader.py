@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from vlatool.errors import BusError, InputError, UsageError, VlatoolError, require
+from vlatool.files.bag_repair import bag_repair
 from vlatool.messages import Message, cdr, find_type, ros1
 from vlatool.messages.type_hash import rihs01
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 UNFINISHED_SUFFIX = ".active"
 """Behind the name of a bag that ``rosbag record`` has not finished."""
-REPAIR = "record it again, or repair it: ros2 bag reindex (ROS 1: rosbag reindex)"
 
 
 class Recorded(NamedTuple):
@@ -117,7 +117,9 @@ class BagReader:
                     message = self._decode(kinds[connection.topic], content)
                 except BusError as error:
                     where = f"A message of {connection.topic} in {self.path}, {(time_ns - self.start_ns) / 1e9:.3f} s"
-                    raise BusError(f"{where} after its start, is malformed: {error.message}", REPAIR) from error
+                    raise BusError(
+                        f"{where} after its start, is malformed: {error.message}", bag_repair(self.path)
+                    ) from error
                 yield Recorded(connection.topic, time_ns, message)
 
     def close(self) -> None:
@@ -145,4 +147,4 @@ def _readable(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # rosbags, sqlite3, zstd, lz4 and yaml each have errors of their own
         reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
-        raise BusError(f"{path} cannot be read: {reason}.", REPAIR) from error
+        raise BusError(f"{path} cannot be read: {reason}.", bag_repair(path)) from error

@@ -19,6 +19,7 @@ from vlatool.data._recording import Values
 from vlatool.data._step_reader import StepReader
 from vlatool.data._steps import Steps
 from vlatool.errors import DataError, VlatoolError, require
+from vlatool.files.bag_repair import bag_repair
 from vlatool.files.limits import check_limit
 from vlatool.files.printable import amount
 from vlatool.registry import Claim
@@ -38,7 +39,7 @@ ACTIONS = ("action", "actions", "command", "cmd", "joint_command", "commands")
 MIN_MESSAGES = 2
 MAX_AGE_S = 0.2
 """Seconds that a message may be from the time of a row; the row is left out where it is further."""
-RECORD_AGAIN = "record it again, or repair it: ros2 bag reindex (ROS 1: rosbag reindex)"
+RECORD_AGAIN = "record it again"
 
 
 class Rosbag(StepReader):
@@ -152,7 +153,7 @@ def _bag_errors(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # rosbags, sqlite3, zstd, lz4 and yaml each have errors of their own
         reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
-        raise DataError(f"{path} cannot be read: {reason}.", RECORD_AGAIN) from error
+        raise DataError(f"{path} cannot be read: {reason}.", bag_repair(path)) from error
 
 
 @dataclass

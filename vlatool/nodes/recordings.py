@@ -67,7 +67,9 @@ def open_recording(path: Path, controller: str, node: str = "") -> Recording:
         BusError, MissingExtra: as the bus ``bag`` does.
     """
     if not path.exists():
-        raise DataError(f"There is no recording at {path}.", "check the path")
+        bag = path.with_suffix("")
+        fix = f"name the directory of the bag: {bag}" if path.suffix in SUFFIXES and bag.is_dir() else "check the path"
+        raise DataError(f"There is no recording at {path}.", fix)
     if not is_log(path):  # by its first bytes: a log may be called as a bag is
         if path.is_dir() or path.suffix in (*SUFFIXES, UNFINISHED_SUFFIX):
             return _of_bag(path, controller, node)
