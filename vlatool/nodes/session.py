@@ -114,6 +114,7 @@ def run_on_bus(
     on_end: Callable[[RunResult, Trace], None] = lambda result, trace: None,
     on_missing: Callable[[tuple[str, ...]], None] = lambda topics: warnings.warn(waiting(topics), stacklevel=3),
     on_fault: Callable[[Fault], None] = lambda fault: None,
+    on_unheard: Callable[[tuple[str, ...]], None] = lambda topics: None,
 ) -> RunResult:
     """Run a controller on a bus until its time is over, or a signal or a failure ends it.
 
@@ -122,6 +123,7 @@ def run_on_bus(
         on_missing: Called with topics of required inputs that nobody publishes yet; it warns when not given.
         on_end: Called with what it was and with its trace, however it ended, once the robot is at rest.
         on_fault: Called, from another thread, with the first fault of the bus on each topic.
+        on_unheard: Called with topics of commands that nobody subscribes to when the run begins.
 
     Raises:
         UsageError: when something is not allowed or missing, a file exists already.
@@ -157,6 +159,8 @@ def run_on_bus(
             say(String(plan.instruction))
         if missing := runner.missing(plan.wait_s):
             on_missing(missing)
+        if unheard := runner.unheard_topics():
+            on_unheard(unheard)
         try:
             runner.run(plan.seconds)
         finally:
@@ -168,6 +172,11 @@ def run_on_bus(
 def waiting(topics: tuple[str, ...]) -> str:
     """Return a sentence on topics that nobody publishes."""
     return f"nobody publishes {', '.join(topics)} yet; the controller waits for it"
+
+
+def unheard_text(topics: tuple[str, ...]) -> str:
+    """Return a sentence on topics of commands that nobody subscribes to."""
+    return f"nobody hears {', '.join(topics)} yet: no robot obeys it"
 
 
 def _instruction_input(controller: Any, required: bool) -> str:

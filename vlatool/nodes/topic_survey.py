@@ -13,9 +13,8 @@ from vlatool.errors import BusError, UsageError
 from vlatool.files.printable import truncate
 from vlatool.messages import find_type
 from vlatool.nodes.fault_watch import fault_text
+from vlatool.nodes.runner import COMMANDS
 
-COMMANDS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped", "trajectory_msgs/msg/JointTrajectory")
-"""Types that command a robot: two publishers of one topic fight each other."""
 MAX_NAME = 80
 """Characters of a name that a line shows: other nodes choose theirs."""
 
