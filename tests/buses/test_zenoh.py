@@ -10,7 +10,8 @@ from buses._nodes import NetworkBus, Open, opened
 from buses._trials import QUALITY, WAIT_S, Heard, forward, free_port, wait_until
 
 from vlatool.buses import Bus, open_bus
-from vlatool.buses._zenoh_keys import ATTACHMENT, data_key
+from vlatool.buses._graph import SUBSCRIBER, Entity
+from vlatool.buses._zenoh_keys import ATTACHMENT, data_key, entity_token
 from vlatool.errors import BusError, MissingExtra, UsageError
 from vlatool.messages.cdr import encode
 from vlatool.messages.geometry_msgs import Twist
@@ -69,11 +70,31 @@ class TestZenoh(NetworkBus):
                 gids.add((length, gid))
             assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
             assert len(gids) == 1
-            tokens = [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/0/**", timeout=WAIT_S)]
+            tokens: list[str] = []
+
+            def robot_is_listed() -> bool:
+                replies = session.liveliness().get("@ros2_lv/0/**", timeout=WAIT_S)
+                tokens[:] = [str(reply.ok.key_expr) for reply in replies]
+                return any("/robot/%cmd_vel/" in token for token in tokens)
+
+            assert wait_until(robot_is_listed)
             own = str(robot._session.info.zid())  # type: ignore[attr-defined]
             assert f"@ros2_lv/0/{own}/0/0/NN/%/%/robot" in tokens
             name = f"MP/%/%/robot/%cmd_vel/geometry_msgs::msg::dds_::Twist_/{rihs01(Twist)}/1:2:1,10:,:,:,,"
             assert any(token.endswith(name) for token in tokens)
+
+    def test_peer_without_a_way_to_it_is_none_yet(self, open_node: Open) -> None:
+        with opened(open_node, "robot", "other") as (robot, other):
+            entity = Entity("1" * 30, SUBSCRIBER, "late", "/cmd_vel", Twist.TYPE, rihs01(Twist))
+            token = other._session.liveliness().declare_token(  # type: ignore[attr-defined]
+                entity_token(0, 1, entity, QUALITY)
+            )
+            robot.publisher("/cmd_vel", Twist, QUALITY)
+            assert wait_until(lambda: any("late" in info.subscribers for info in robot.topics()))
+            assert robot.wait_for_peers(("/cmd_vel",), 0.1) == ("/cmd_vel",)
+            Heard(other, "/cmd_vel")
+            assert robot.wait_for_peers(("/cmd_vel",), WAIT_S) == ()
+            token.undeclare()
 
     def test_a_new_node_knows_the_others_at_once(self, open_node: Open) -> None:
         """It meets them beside the router, after it is there: nobody may take a topic for free meanwhile."""

@@ -24,7 +24,7 @@ from vlatool.controllers._safety_table import (
 )
 from vlatool.controllers.safety_monitor import SafetyMonitor
 from vlatool.errors import UsageError
-from vlatool.messages.sensor_msgs import Image, JointState, LaserScan
+from vlatool.messages.sensor_msgs import BatteryState, Image, JointState, LaserScan
 from vlatool.messages.std_msgs import Bool, String
 from vlatool.messages.std_srvs import SetBoolRequest
 
@@ -233,6 +233,15 @@ def test_a_scan_of_too_few_rays_is_out():
     thin = dataclasses.replace(scan, angle_min=-math.pi / 2, ranges=np.full(1, 3.0, np.float32))
     (*_, status), _ = passed_on(feed, monitor, monitor.start(), 0.0, scan=thin)
     assert status == "CRITICAL sensor out"
+
+
+@pytest.mark.parametrize(
+    ("charge", "level"), [(1.0, "NORMAL"), (80.0, "WARNING battery low"), (4.0, "WARNING battery low")]
+)
+def test_a_charge_in_percent_is_seen_at_once(charge: float, level: str):
+    feed, monitor = Feed(), SafetyMonitor()
+    (*_, status), _ = passed_on(feed, monitor, monitor.start(), 0.0, battery=BatteryState(percentage=charge))
+    assert status == level
 
 
 @pytest.mark.parametrize("efforts", [[math.nan, 9.0], [9.0, math.nan]])

@@ -41,9 +41,19 @@ class Walker:
 
 
 @pytest.fixture
-def client(request):
+def slow_s():
+    """How long an instruction is on its way, in seconds, under the key ``s``; empty for a bus that is fast."""
+    return {}
+
+
+@pytest.fixture
+def client(request, slow_s):
     buses = [open_bus(f"sim:{request.node.name}", name) for name in ("vlatool_walker", "client")]
-    say = buses[0].publisher("/instruction", String, QoS(latched=True))
+    send_on = buses[0].publisher("/instruction", String, QoS(latched=True))
+
+    def say(text):
+        threading.Timer(slow_s.get("s", 0.0), send_on, (text,)).start() if slow_s else send_on(text)
+
     action = InstructionAction(buses[0], "vlatool_walker", say)
     runner = Runner(Walker(), buses[0], observers=[action])
     thread = threading.Thread(target=runner.run)
@@ -68,6 +78,22 @@ def test_goals_end_by_the_status(client):
     outcome = send(client, "fall").result(5)  # the status before it was arrived: that of the last goal does not count
     assert (outcome.status, outcome.result.message) == (GOAL_ABORTED, "failed it fell")
     assert send(client, "go").result(5).status == GOAL_SUCCEEDED
+
+
+def test_a_goal_that_is_long_on_its_way_does_not_end_by_the_status_of_the_last_one(client, slow_s):
+    assert send(client, "go").result(5).status == GOAL_SUCCEEDED
+    slow_s["s"] = 0.3
+    outcome = send(client, "fall").result(5)
+    assert (outcome.status, outcome.result.message) == (GOAL_ABORTED, "failed it fell")
+
+
+def test_a_goal_ends_when_another_instruction_replaces_its_own(client):
+    other = client.publisher("/instruction", String, QoS(latched=True))
+    goal = send(client, "walk on")
+    time.sleep(0.2)
+    other(String("go"))
+    outcome = goal.result(5)
+    assert (outcome.status, outcome.result.message) == (GOAL_ABORTED, "another instruction came")
 
 
 def test_cancel_and_time_out_end_the_motion(client):

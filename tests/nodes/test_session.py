@@ -79,6 +79,17 @@ def test_without_a_robot_it_waits_and_says_so(plan):
     assert result.summary.status == "waiting for /odom"
 
 
+def test_a_command_that_nobody_hears_is_said(plan):
+    unheard = []
+    lonely = replace(plan, seconds=0.1, wait_s=0.0)
+    run_on_bus(lonely, on_missing=lambda _: None, on_unheard=unheard.append)
+    bus = open_bus(plan.bus, "base")
+    bus.subscribe("/cmd_vel", Twist, lambda _: None, QoS())
+    run_on_bus(lonely, on_missing=lambda _: None, on_unheard=unheard.append)
+    bus.close()
+    assert unheard == [("/cmd_vel",)]
+
+
 def test_refusals_come_before_the_bus(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(session, "open_bus", lambda *_: pytest.fail("the bus was opened"))
     (tmp_path / "there").touch()

@@ -8,7 +8,7 @@ import pytest
 
 from tests._point_robot import Exchange, MemoryBus
 from vlatool.buses import QoS, open_bus
-from vlatool.errors import BusError
+from vlatool.errors import BusError, UsageError
 from vlatool.messages.builtin_interfaces import Time
 from vlatool.messages.geometry_msgs import Twist
 from vlatool.messages.nav_msgs import Odometry
@@ -88,3 +88,21 @@ def test_topics_of_a_recording_are_listed_though_nobody_publishes_them(tmp_path)
     bus.close()
     assert (found.topic, found.types, found.publishers, found.subscribers) == ("/words", (String.TYPE,), (), ())
     assert found.messages == 5
+
+
+def test_a_name_that_no_node_can_subscribe_to_is_said_and_makes_no_line_wide():
+    exchange = Exchange()
+    name = "/" + "n" * 5000
+    exchange.publishers[name] = [("rogue", String.TYPE)]
+    exchange.publishers["/words"] = [("rogue", String.TYPE)]
+
+    class Strict(MemoryBus):
+        def subscribe(self, topic, *arguments):
+            if topic == name:
+                raise UsageError("It cannot be the name of a topic.", "rename it")
+            super().subscribe(topic, *arguments)
+
+    found = {report.topic: report for report in survey(Strict(exchange, "survey"), "survey", 0.0)}
+    assert found[name].problems == ("It cannot be the name of a topic.",)
+    text = list(lines([*found.values()]))
+    assert max(map(len, text)) < 300

@@ -27,6 +27,8 @@ SERVICE_QOS = QoS(reliable=True, depth=10)
 DISCOVERY_S = 0.25
 """How long the nodes that the router names may take to be connected, and with them what they publish; then it is
 known who is on a topic."""
+LOOK_S = 0.005
+"""Time between two looks at whether a publisher has a way to its subscribers, in seconds."""
 HEARTBEAT_S = 0.5
 """Period at which a latched publisher repeats the number of its last message, so that a lost one is asked for."""
 
@@ -56,6 +58,7 @@ class Zenoh(GraphBus):
         self._numbers = count(1)
         self._declared: list[Any] = []
         self._inboxes: list[Inbox] = []
+        self._publishers: dict[str, list[Any]] = {}
         self._clients: dict[str, bytes] = {}
         self._graph: ZenohGraph = ZenohGraph(self._zenoh, self._session, self._domain, self._faults)
         self._keep(self._session.liveliness().declare_token(node_token(self._domain, self._id, node)))
@@ -91,6 +94,7 @@ class Zenoh(GraphBus):
         """
         name = self._check(topic, message)
         publisher = self._keep(self._declare_publisher(self._key(name, message), qos))
+        self._publishers.setdefault(name, []).append(publisher)
         gid = self._announce(PUBLISHER, name, message.TYPE, rihs01(message), qos)
         sequence = count(1)
 
@@ -153,6 +157,21 @@ class Zenoh(GraphBus):
         if refusal and refusal != "Timeout":
             raise BusError(f"The service {name} refused: {refusal}.", "see the node that serves it")
         raise BusError(f"{name} did not answer within {timeout_s:g} s.", "see the node that serves it")
+
+    def wait_for_peers(self, topics: tuple[str, ...], timeout_s: float) -> tuple[str, ...]:
+        """Wait until each topic has a peer that hears this node; return those without."""
+        deadline = time.monotonic() + timeout_s
+        missing = super().wait_for_peers(topics, timeout_s)
+        while (unreached := tuple(each for each in topics if each in missing or not self._reaches(each))) != missing:
+            if time.monotonic() >= deadline:
+                return unreached
+            time.sleep(LOOK_S)
+        return missing
+
+    def _reaches(self, topic: str) -> bool:
+        """Return whether what this node publishes on a topic has a way to a subscriber: a peer is known before it."""
+        publishers = self._publishers.get(full_name(topic, self._node), ())
+        return all(each.matching_status.matching for each in publishers if hasattr(each, "matching_status"))
 
     def _discover(self) -> None:
         time.sleep(max(0.0, self._opened_s + DISCOVERY_S - time.monotonic()))

@@ -187,7 +187,7 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any], words: R
     from vlatool.nodes.fault_watch import fault_text
     from vlatool.nodes.launch import PolicyOptions
     from vlatool.nodes.map_file import split_maps
-    from vlatool.nodes.session import RunPlan, default_node, dry_run, run_on_bus, waiting
+    from vlatool.nodes.session import RunPlan, default_node, dry_run, run_on_bus, unheard_text, waiting
     from vlatool.nodes.settings import read_settings
 
     names = ("bundle", "robot", "deadline_ms", "neutral", "engine", "threads", "seed")
@@ -215,6 +215,7 @@ def _run(name: str, typed: Mapping[str, Any], flags: Mapping[str, Any], words: R
         lambda *ended: _end(plan, as_json, *ended),
         lambda topics: typer.echo(f"... {printable(waiting(topics))}", err=True),
         lambda fault: typer.echo(f"... {printable(fault_text(fault))}", err=True),
+        lambda topics: typer.echo(f"... {printable(unheard_text(topics))}", err=True),
     )
     if result.failure:
         raise OutputError(

@@ -23,6 +23,8 @@ class Level(IntEnum):
 
 SCALES = {Level.NORMAL: 1.0, Level.WARNING: 0.5, Level.CRITICAL: 0.2, Level.EMERGENCY: 0.0}
 """Level -> factor of the speed."""
+FULL = 1.05
+"""Charge above which it is none from 0 to 1, such as one in percent, of which the limits say nothing."""
 FALL_S = 1.0
 """Time without a condition of its own after which a level falls by one step, in seconds."""
 
@@ -98,7 +100,7 @@ TABLE: tuple[Rule, ...] = (
     Rule("no sensor sees the way", E, lambda facts, _: facts.blind),
     Rule("cliff ahead", E, lambda facts, _: facts.cliff),
     Rule("localisation jumped", C, lambda facts, _: facts.jump),
-    Rule("battery low", W, lambda facts, limits: facts.battery < limits.battery_warning),
+    Rule("battery low", W, lambda facts, limits: facts.battery < limits.battery_warning or facts.battery > FULL),
     Rule("battery very low", C, lambda facts, limits: facts.battery < limits.battery_critical),
     Rule("battery empty", E, lambda facts, limits: facts.battery < limits.battery_emergency),
     Rule("motor current high", C, lambda facts, limits: facts.current_a > limits.current_critical_a),

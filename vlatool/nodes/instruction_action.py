@@ -36,22 +36,27 @@ class InstructionAction:
         bus: A bus that has actions.
         node: Name of the node; the action is ``/NODE/run_instruction``.
         say: Publishes an instruction to the controller.
+        name: The controller's input that takes it.
     """
 
-    def __init__(self, bus: ActionBus, node: str, say: Callable[[String], None]) -> None:
-        self._say, self._lock = say, threading.Lock()
-        self._status, self._steps = "", 0
+    def __init__(self, bus: ActionBus, node: str, say: Callable[[String], None], name: str = "instruction") -> None:
+        self._say, self._name, self._lock = say, name, threading.Lock()
+        self._status = ""
+        self._heard = (-1, "")
         self.name = f"/{node}/run_instruction"
         bus.serve_action(self.name, KIND, self._run)
 
     def __call__(self, report: StepReport) -> None:
-        """Take the status of a step."""
+        """Take the status of a step, and which text it knew: how many came before it, and the text."""
+        newest = report.snapshot.newest.get(self._name)
         with self._lock:
-            self._status, self._steps = report.command.status, report.number + 1
+            self._status = report.command.status
+            if newest is not None and isinstance(newest.message, String):
+                self._heard = (newest.sequence, newest.message.data)
 
-    def _now(self) -> tuple[str, int]:
+    def _now(self) -> tuple[str, int, str]:
         with self._lock:
-            return self._status, self._steps
+            return (self._status, *self._heard)
 
     def _run(self, goal: Goal) -> Outcome:
         message: Any = goal.message
@@ -59,13 +64,17 @@ class InstructionAction:
         if not text:
             return Outcome(GOAL_ABORTED, RunInstructionResult(False, "The goal has no instruction."))
         began, told_s = time.monotonic(), -FEEDBACK_S
+        before, own = self._now()[1], -1
         self._say(String(text))
-        first = self._now()[1] + 2  # the step that is at work now may not have read it
         while not goal.canceled.wait(LOOK_S):
             elapsed = time.monotonic() - began
-            status, steps = self._now()
+            status, count, heard = self._now()
             word = (status.split() or [""])[0]
-            if steps >= first and word in ENDS:
+            if heard.strip() == text and count > before:
+                own = count
+            elif count > max(own, before + 1):  # its own came before this one, whether or not a step saw it
+                return Outcome(GOAL_ABORTED, RunInstructionResult(False, "another instruction came"))
+            if own >= 0 and word in ENDS:
                 return Outcome(ENDS[word], RunInstructionResult(ENDS[word] == GOAL_SUCCEEDED, status))
             if message.timeout_s > 0 and elapsed > message.timeout_s:
                 self._say(String(""))

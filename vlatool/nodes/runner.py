@@ -23,6 +23,8 @@ from vlatool.nodes.inbox import Inbox
 from vlatool.nodes.stepper import Stepper, StepReport, check_command, ends_of, topics_of
 
 Observer = Callable[[StepReport], None]
+COMMANDS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped", "trajectory_msgs/msg/JointTrajectory")
+"""Types that command a robot: two publishers of one topic fight each other."""
 MAX_SAMPLES = 100_000
 """Times of steps that a summary is made of: the last ones."""
 
@@ -149,6 +151,12 @@ class Runner:
                   if entry.required}  # fmt: skip
         alone = self.bus.wait_for_peers(tuple(wanted), timeout_s) if wanted else ()
         return tuple(wanted[topic] for topic in alone)
+
+    def unheard_topics(self) -> tuple[str, ...]:
+        """Return the topics of commands for a robot that nobody subscribes to now."""
+        wanted = [self.topics[each.name] for each in self.controller.outputs if each.message.TYPE in COMMANDS]
+        heard = {info.topic for info in self.bus.topics() if info.subscribers}
+        return tuple(topic for topic in wanted if topic not in heard)
 
     def stop(self) -> None:
         """Let the run end after its current step; may be called from any thread."""

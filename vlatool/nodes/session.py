@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.buses import ActionBus, Bus, Fault, NamingBus, QoS, RosWords, open_bus
+from vlatool.buses import ActionBus, Fault, NamingBus, QoS, RosWords, open_bus
 from vlatool.errors import OutputError, UsageError
 from vlatool.messages import Message
 from vlatool.messages.std_msgs import String
@@ -116,6 +116,7 @@ def run_on_bus(
     on_end: Callable[[RunResult, Trace], None] = lambda result, trace: None,
     on_missing: Callable[[tuple[str, ...]], None] = lambda topics: warnings.warn(waiting(topics), stacklevel=3),
     on_fault: Callable[[Fault], None] = lambda fault: None,
+    on_unheard: Callable[[tuple[str, ...]], None] = lambda topics: None,
 ) -> RunResult:
     """Run a controller on a bus until its time is over, or a signal or a failure ends it.
 
@@ -124,6 +125,7 @@ def run_on_bus(
         on_missing: Called with topics of required inputs that nobody publishes yet; it warns when not given.
         on_end: Called with what it was and with its trace, however it ended, once the robot is at rest.
         on_fault: Called, from another thread, with the first fault of the bus on each topic.
+        on_unheard: Called with topics of commands that nobody subscribes to when the run begins.
 
     Raises:
         UsageError: when something is not allowed or missing, a file exists already.
@@ -144,7 +146,8 @@ def run_on_bus(
         stack.callback(background.close)
         runner = Runner(controller, bus, topics=plan.topics, observers=[background], alone=not plan.shared)
         about = record_of(plan.controller, controller, node, runner.topics, plan.policy)
-        say = _instructor(bus, controller, runner.written_topics, required=bool(plan.instruction))
+        name = _instruction_input(controller, required=bool(plan.instruction))
+        say = bus.publisher(runner.written_topics[name], String, QoS(reliable=True, latched=True)) if name else None
         publish_step = StepPublisher(bus, about)
         log = None if plan.record is None else RunLog(plan.record, about)  # a run that is refused leaves none
         if plan.report is not None:
@@ -152,12 +155,14 @@ def run_on_bus(
         background.observe(publish_step, trace, FaultWatch(bus, on_fault), *([] if log is None else [log]))
         on_start(about)
         if say is not None and isinstance(bus, ActionBus):
-            background.observe(InstructionAction(bus, node, say))
+            background.observe(InstructionAction(bus, node, say, name))
         time.sleep(getattr(bus, "settle_s", SETTLE_S) if plan.settle_s is None else plan.settle_s)
         if say is not None and plan.instruction:
             say(String(plan.instruction))
         if missing := runner.missing(plan.wait_s):
             on_missing(missing)
+        if unheard := runner.unheard_topics():
+            on_unheard(unheard)
         try:
             runner.run(plan.seconds)
         finally:
@@ -171,21 +176,23 @@ def waiting(topics: tuple[str, ...]) -> str:
     return f"nobody publishes {', '.join(topics)} yet; the controller waits for it"
 
 
-def _instructor(
-    bus: Bus, controller: Any, topics: Mapping[str, str], required: bool
-) -> Callable[[String], None] | None:
-    """Return what publishes to the controller's instruction, None where it has none and none is required.
+def unheard_text(topics: tuple[str, ...]) -> str:
+    """Return a sentence on topics of commands that nobody subscribes to."""
+    return f"nobody hears {', '.join(topics)} yet: no robot obeys it"
+
+
+def _instruction_input(controller: Any, required: bool) -> str:
+    """Return the controller's input of instructions; empty where it has none and none is required.
 
     Raises:
         UsageError: where it has none, and one is required.
     """
     texts = [entry.name for entry in controller.inputs if entry.message is String]
-    if "instruction" not in texts and not required:
-        return None
-    if "instruction" not in texts and len(texts) != 1:
+    if "instruction" in texts:
+        return "instruction"
+    if required and len(texts) != 1:
         raise UsageError("The controller takes no instruction.", "leave --instruction out")
-    name = "instruction" if "instruction" in texts else texts[0]
-    return bus.publisher(topics[name], String, QoS(reliable=True, latched=True))
+    return texts[0] if required else ""
 
 
 def dry_run(plan: RunPlan) -> dict[str, Any]:

@@ -10,11 +10,13 @@ from typing import Any
 
 from vlatool.buses import Bus, QoS, Reception, TopicInfo
 from vlatool.errors import BusError, UsageError
+from vlatool.files.printable import truncate
 from vlatool.messages import find_type
 from vlatool.nodes.fault_watch import fault_text
+from vlatool.nodes.runner import COMMANDS
 
-COMMANDS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped", "trajectory_msgs/msg/JointTrajectory")
-"""Types that command a robot: two publishers of one topic fight each other."""
+MAX_NAME = 80
+"""Characters of a name that a line shows: other nodes choose theirs."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +101,13 @@ def _watch(bus: Bus, info: TopicInfo, watches: dict[str, _Watch], refused: dict[
     """Subscribe to a topic, or note why that is impossible."""
     watch = _Watch(bus)
     try:
-        bus.subscribe(info.topic, find_type(info.types[0]), watch, QoS(depth=10))
+        kind = find_type(info.types[0])
     except UsageError:
-        refused[info.topic] = f"vlatool has no message {info.types[0]}: it is listed, not read"
-    except BusError as error:
+        refused[info.topic] = f"vlatool has no message {truncate(info.types[0], MAX_NAME)}: it is listed, not read"
+        return
+    try:
+        bus.subscribe(info.topic, kind, watch, QoS(depth=10))
+    except (BusError, UsageError) as error:
         refused[info.topic] = error.message
     else:
         watches[info.topic] = watch
@@ -129,11 +134,17 @@ def lines(reports: Sequence[TopicReport]) -> Iterator[str]:
     if not reports:
         yield "no topic"
         return
-    width = max(len(report.topic) for report in reports)
+    width = min(max(len(report.topic) for report in reports), MAX_NAME)
     for report in reports:
         rate = "-" if report.hz is None else f"{report.hz:.1f} Hz"
         age = "-" if report.age_ms is None else f"{report.age_ms:.1f} ms"
-        ends = f"{', '.join(report.publishers) or '-'} -> {', '.join(report.subscribers) or '-'}"
-        yield f"{report.topic:{width}}  {', '.join(report.types) or '?':32}  {rate:>9}  {age:>10}  {ends}"
+        ends = f"{_names(report.publishers) or '-'} -> {_names(report.subscribers) or '-'}"
+        topic = truncate(report.topic, MAX_NAME)
+        yield f"{topic:{width}}  {_names(report.types) or '?':32}  {rate:>9}  {age:>10}  {ends}"
         for problem in report.problems:
             yield f"  ! {problem}"
+
+
+def _names(names: Sequence[str]) -> str:
+    """Return names with commas between them, long ones in part."""
+    return ", ".join(truncate(name, MAX_NAME) for name in names)
