@@ -15,7 +15,7 @@ import pytest
 from buses._nodes import NetworkBus, Open, opened
 from buses._trials import QUALITY, WAIT_S, Heard, forward, speeds, wait_until
 
-from vlatool.buses import Bus, QoS, open_bus
+from vlatool.buses import Bus, QoS, TopicInfo, open_bus
 from vlatool.buses._dds_types import describe, describe_service_part
 from vlatool.errors import BusError, MissingExtra, UsageError
 from vlatool.messages import Message
@@ -126,6 +126,27 @@ class TestDds(NetworkBus):
             robot.close()
             assert wait_until(lambda: not any(info.subscribers for info in controller.topics()))
             assert expected in str(controller.faults()[0].error)
+
+    def test_endpoint_that_cyclonedds_fails_to_build_hides_no_other(
+        self, open_node: Open, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        from cyclonedds import builtin
+
+        build, failures = builtin.endpoint_constructor, []
+
+        def fail_at_first(*arguments: object) -> object:
+            if len(failures) < 3:
+                failures.append(arguments)
+                raise ValueError("no endpoint")
+            return build(*arguments)
+
+        with opened(open_node, "robot") as (robot,):
+            robot.publisher("/say", Twist, QUALITY)
+            monkeypatch.setattr(builtin, "endpoint_constructor", fail_at_first)
+            with opened(open_node, "controller") as (controller,):
+                listed = TopicInfo("/say", (Twist.TYPE,), ("robot",), ())
+                assert wait_until(lambda: listed in controller.topics()), controller.topics()
+                assert len(failures) == 3
 
     def test_names_of_all_nodes_are_heard_however_late_this_node_listens(self, open_node: Open) -> None:
         with opened(open_node, "robot") as (robot,), robot._graph._changed:  # whoever hears a name waits for this
