@@ -76,7 +76,9 @@ def test_files_of_parameters_as_ros2_launch_writes_them(tmp_path) -> None:
 @pytest.mark.parametrize("content", ["a: [", "rate: 5", "- 1", "a: {ros__parameters: 3}", "a: {}"])
 def test_files_of_parameters_that_are_none(tmp_path, content: str) -> None:
     (tmp_path / "a.yaml").write_text(content)
-    with pytest.raises(DataError, match=r"The parameters .*a\.yaml (are not YAML|have no 'ros__parameters')"):
+    with pytest.raises(
+        DataError, match=r"The file of parameters .*a\.yaml (is not valid YAML|has no 'ros__parameters')"
+    ):
         words_of("--ros-args", "--params-file", str(tmp_path / "a.yaml")).parameters_for("n")
     with pytest.raises(DataError, match="cannot be read"):
         words_of("--ros-args", "--params-file", str(tmp_path / "absent")).parameters_for("n")

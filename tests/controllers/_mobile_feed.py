@@ -9,19 +9,12 @@ import numpy as np
 from vlatool.controllers import Reading, Snapshot
 from vlatool.messages import Message
 from vlatool.messages.builtin_interfaces import Time
-from vlatool.messages.geometry_msgs import (
-    Point,
-    Pose,
-    PoseWithCovariance,
-    Quaternion,
-    Twist,
-    TwistWithCovariance,
-    Vector3,
-)
+from vlatool.messages.geometry_msgs import Twist, Vector3
 from vlatool.messages.nav_msgs import Odometry
 from vlatool.messages.pixels import image_message
 from vlatool.messages.sensor_msgs import CameraInfo, Image
 from vlatool.messages.std_msgs import Header
+from vlatool.worlds import _mobile_messages as mobile_messages
 
 
 class Feed:
@@ -56,9 +49,7 @@ def depth_image(metres: np.ndarray, stamp_s: float = 0.0) -> Image:
 def odometry(
     x: float, y: float, yaw: float, stamp_s: float = 0.0, linear: float = 0.0, angular: float = 0.0
 ) -> Odometry:
-    turn = Quaternion(0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
-    pose = PoseWithCovariance(Pose(Point(x, y, 0.0), turn))
-    return Odometry(header(stamp_s), "base_link", pose, TwistWithCovariance(velocity(linear, angular)))
+    return mobile_messages.odometry((x, y, yaw), linear, angular, Time.from_seconds(stamp_s))
 
 
 def velocity(linear: float, angular: float = 0.0) -> Twist:

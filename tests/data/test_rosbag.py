@@ -88,3 +88,11 @@ def test_the_nearest_stamp_is_found_in_any_order():
     wanted = np.abs(stamps[None] - times[:, None]).min(axis=1)
     np.testing.assert_allclose(np.abs(stamps[_nearest(stamps, times)] - times), wanted)
     assert _nearest(stamps[:1], times).tolist() == [0] * 200
+
+
+def test_bag_that_its_recorder_has_not_finished_is_named(tmp_path: Path):
+    path = tmp_path / "run.bag.active"
+    path.write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(DataError, match="has no index yet") as refusal:
+        read(path)
+    assert f"rosbag reindex {path}, then mv {path} {tmp_path / 'run.bag'}" in refusal.value.fix

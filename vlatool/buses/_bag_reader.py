@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from vlatool.errors import BusError, InputError, UsageError, VlatoolError, require
-from vlatool.files.bag_repair import bag_repair
+from vlatool.errors import BusError, InputError, UsageError, require
+from vlatool.files.bag_files import SUFFIXES, bag_errors, bag_repair, refuse_unfinished
 from vlatool.messages import Message, cdr, find_type, ros1
 from vlatool.messages.type_hash import rihs01
-
-SUFFIXES = (".bag", ".mcap", ".db3")
-UNFINISHED_SUFFIX = ".active"
-"""Behind the name of a bag that ``rosbag record`` has not finished."""
 
 
 class Recorded(NamedTuple):
@@ -50,11 +45,10 @@ class BagReader:
             raise BusError(
                 f"There is no bag {path}.", "name a .bag, .mcap or .db3 file, or the directory of a ROS 2 bag"
             )
-        if path.suffix == UNFINISHED_SUFFIX:
-            raise _unfinished(path)
+        refuse_unfinished(path, BusError)
         if not path.is_dir() and path.suffix not in SUFFIXES:
             raise BusError(f"{path} is not a bag: its name ends in none of {', '.join(SUFFIXES)}.", "name a bag")
-        with _readable(path):
+        with bag_errors(path, BusError):
             self._reader = library.Reader(path)
             self._reader.open()
         self._decode: Callable[[Any, Any], Message] = ros1.decode if first else cdr.decode
@@ -111,7 +105,7 @@ class BagReader:
         chosen = [each for each in self._reader.connections if each.topic in kinds]
         if not chosen:
             return
-        with _readable(self.path):
+        with bag_errors(self.path, BusError):
             for connection, time_ns, content in self._reader.messages(connections=chosen):
                 try:
                     message = self._decode(kinds[connection.topic], content)
@@ -127,24 +121,3 @@ class BagReader:
         if self._reader is not None:
             self._reader.close()
             self._reader = None
-
-
-def _unfinished(path: Path) -> BusError:
-    """Say what to do with a bag that ``rosbag record`` still writes, or left when it was killed."""
-    finished = path.with_suffix("")
-    return BusError(
-        f"{path} has no index yet: rosbag record still writes it, or was killed.",
-        f"end rosbag record with Ctrl-C; if it was killed: rosbag reindex {path}, then mv {path} {finished}",
-    )
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Turn what rosbags raises on a damaged bag into an error of one sentence."""
-    try:
-        yield
-    except VlatoolError:
-        raise
-    except Exception as error:  # rosbags, sqlite3, zstd, lz4 and yaml each have errors of their own
-        reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
-        raise BusError(f"{path} cannot be read: {reason}.", bag_repair(path)) from error

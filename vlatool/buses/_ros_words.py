@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import DataError, UsageError, require
+from vlatool.files.yaml import read_yaml
 
 SPECIAL = ("name", "ns", "log", "master", "ip", "hostname")
 """What ROS 1 takes with two underscores before it."""
@@ -28,7 +29,6 @@ WORD = re.compile(r"((?:__?|~/?|/)?[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_]+)*):=(.
 QUALIFIED_RULE = re.compile(r"(/?[A-Za-z]\w*(?:/\w+)*):(?!=)(.*)", re.ASCII | re.DOTALL)
 """A rule of ROS 2 for the node before the colon alone."""
 NAMESPACE = re.compile(r"/?(?:[A-Za-z]\w*(?:/[A-Za-z]\w*)*)?/?", re.ASCII)
-MAX_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -226,17 +226,9 @@ def _value(rule: Rule) -> Any:
 
 def _parameters_in(path: str, full: str) -> dict[str, Any]:
     """Return the parameters of a node in a file of ROS 2: those for all nodes, and those below its name."""
-    yaml: Any = require("yaml", "build")
-    fix = "write it as NODE: {ros__parameters: {NAME: VALUE}}"
-    try:
-        with Path(path).open("rb") as file:
-            values = yaml.safe_load(file.read(MAX_BYTES))
-    except OSError as error:
-        raise DataError(f"The parameters {path} cannot be read: {error.strerror}.", "check the path") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise DataError(f"The parameters {path} are not YAML: {' '.join(str(error).split())[:160]}.", fix) from None
+    values = read_yaml(Path(path), f"The file of parameters {path}", DataError)
     values_of_node: dict[str, Any] = {}
-    for node, parameters in _nodes_in(values, path, fix):
+    for node, parameters in _nodes_in(values, path, "write it as NODE: {ros__parameters: {NAME: VALUE}}"):
         if _is_for(node, full):
             values_of_node |= parameters
     return values_of_node
@@ -252,7 +244,7 @@ def _nodes_in(values: Any, path: str, fix: str, above: str = "") -> Iterator[tup
         elif isinstance(entry, Mapping) and entry and parameters is None:
             yield from _nodes_in(entry, path, fix, node)
         else:
-            raise DataError(f"The parameters {path} have no 'ros__parameters' below '{node}'.", fix)
+            raise DataError(f"The file of parameters {path} has no 'ros__parameters' below '{node}'.", fix)
 
 
 def _is_for(pattern: str, full: str) -> bool:

@@ -63,7 +63,7 @@ class Ros2:
     def subscribe(self, topic: str, message: type[M], handler: Callable[[Reception], None], qos: QoS) -> None:
         """See ``Bus.subscribe``; other nodes are known half a second after this one has been opened."""
         name = self._agreed(topic, message)
-        name_as_written = self._as_written(topic)
+        written = self._as_written(topic)
 
         def receive(theirs: Any) -> None:
             received_s = time.monotonic()
@@ -72,14 +72,14 @@ class Ros2:
             except Exception as error:  # it would end the executor, and with it every other subscription
                 self._faults.add_raised(name, error)
 
-        self._node.create_subscription(generated_class(message.TYPE), name_as_written, receive, self._profile(qos))
+        self._node.create_subscription(generated_class(message.TYPE), written, receive, self._profile(qos))
         self._subscriptions[name] = self._subscriptions.get(name, 0) + 1
 
     def publisher(self, topic: str, message: type[M], qos: QoS) -> Callable[[M], None]:
         """See ``Bus.publisher``."""
         name = self._agreed(topic, message)
-        name_as_written = self._as_written(topic)
-        publisher = self._node.create_publisher(generated_class(message.TYPE), name_as_written, self._profile(qos))
+        written = self._as_written(topic)
+        publisher = self._node.create_publisher(generated_class(message.TYPE), written, self._profile(qos))
         self._publishers[name] = publisher
 
         def send(content: M) -> None:
@@ -199,15 +199,9 @@ class Ros2:
     def _agreed(self, topic: str, message: type[Message]) -> str:
         """Return the full name of a topic; raises BusError when a node uses it with another type."""
         self._refuse_closed()
-        name, name_as_written = (
-            self.resolve(topic),
-            self._as_written(topic),
-        )  # rclpy applies remappings to the latter itself
-        ends = (
-            *self._node.get_publishers_info_by_topic(name_as_written),
-            *self._node.get_subscriptions_info_by_topic(name_as_written),
-        )
-        for end in ends:
+        name, written = self.resolve(topic), self._as_written(topic)  # rclpy applies remappings to the latter itself
+        publishers = self._node.get_publishers_info_by_topic(written)
+        for end in (*publishers, *self._node.get_subscriptions_info_by_topic(written)):
             if end.topic_type != message.TYPE:
                 raise BusError(
                     f"The topic {name} carries {end.topic_type}, not {message.TYPE}; it is used by {_full_name(end)}.",

@@ -17,6 +17,7 @@ from vlatool.cli import _complete
 from vlatool.cli._default import DefaultGroup
 from vlatool.cli._document import answer
 from vlatool.cli._launch_words import parameters, ros_words, unused_remappings
+from vlatool.cli._options import BusName
 from vlatool.cli._stages import build_command, failing_command
 from vlatool.errors import OutputError, PluginError, UsageError, fix_for, suggest
 from vlatool.files.printable import one_line, printable
@@ -64,10 +65,6 @@ class ControllerGroup(DefaultGroup):
         return super().parse_args(ctx, args)
 
 
-BusName = Annotated[
-    str, typer.Option("--bus", metavar="BUS[:ADDRESS]", help="bus, with an address where it needs one",
-                      autocompletion=_complete.buses)
-]  # fmt: skip
 COMMON: dict[str, tuple[Any, Any]] = {
     "bus": (BusName, ""),
     "bundle": (Annotated[Optional[Path], typer.Option("--bundle", help="bundle of the policy",  # noqa: UP045

@@ -44,4 +44,14 @@ StepDeadline = Annotated[
     typer.Option("--deadline-ms", help="ms in which a control step is answered; the control period when not given"),
 ]
 Neutral = Annotated[str, typer.Option("--neutral", help="label of the discrete action without motion")]
+BusName = Annotated[
+    str,
+    typer.Option(
+        "--bus",
+        metavar="BUS[:ADDRESS]",
+        help="bus, with an address where it needs one",
+        show_default=False,
+        autocompletion=_complete.buses,
+    ),
+]
 Controllers = Annotated[str, typer.Option("--controller", help="controller and wrappers, by name, with commas between")]

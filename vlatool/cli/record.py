@@ -14,6 +14,7 @@ from vlatool.cli._launch_words import ros_words
 from vlatool.cli._options import (
     AsJson,
     BundleEngine,
+    BusName,
     Controllers,
     Neutral,
     RobotName,
@@ -46,15 +47,7 @@ def record(
             autocompletion=_complete.bundles,
         ),
     ] = None,
-    bus: Annotated[
-        str,
-        typer.Option(
-            "--bus",
-            metavar="BUS[:ADDRESS]",
-            help="bus whose topics are recorded, to a bag",
-            autocompletion=_complete.buses,
-        ),
-    ] = "",
+    bus: BusName = "",
     seconds: Annotated[
         float | None, typer.Option(min=0, help="with --bus: end after so many seconds; at Ctrl-C when not given")
     ] = None,

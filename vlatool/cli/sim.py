@@ -11,10 +11,10 @@ import typer
 from typer.core import TyperGroup
 
 from vlatool import registry
-from vlatool.cli import _complete
 from vlatool.cli._controllers import flags_of, summary_of, values_of
 from vlatool.cli._document import answer
 from vlatool.cli._launch_words import parameters, ros_words
+from vlatool.cli._options import BusName
 from vlatool.cli._signals import stopped_by_signals
 from vlatool.cli._stages import build_command, failing_command
 from vlatool.errors import PluginError, UsageError
@@ -57,8 +57,7 @@ def _group() -> None:
 
 
 COMMON: dict[str, tuple[Any, Any]] = {
-    "bus": (Annotated[str, typer.Option("--bus", metavar="BUS[:ADDRESS]", help="bus, with an address where it needs "
-                                        "one", show_default=False, autocompletion=_complete.buses)], ...),
+    "bus": (BusName, ...),
     "seconds": (Annotated[Optional[float], typer.Option("--seconds", min=0, help="end after so many seconds; at "  # noqa: UP045
                                                         "Ctrl-C or SIGTERM when not given")], None),
     "seed": (Annotated[int, typer.Option("--seed", min=0, help="seed of the scene and of all noise")], 0),

@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from vlatool.cli import _complete
 from vlatool.cli._document import answer
-from vlatool.cli._options import AsJson
+from vlatool.cli._options import AsJson, BusName
 from vlatool.files.printable import printable
 
 NODE = f"vlatool_topics_{os.getpid()}"
@@ -17,16 +16,7 @@ NODE = f"vlatool_topics_{os.getpid()}"
 
 
 def topics(
-    bus: Annotated[
-        str,
-        typer.Option(
-            "--bus",
-            metavar="BUS[:ADDRESS]",
-            help="bus, with an address where it needs one",
-            show_default=False,
-            autocompletion=_complete.buses,
-        ),
-    ],
+    bus: BusName,
     seconds: Annotated[float, typer.Option(min=0, max=3600, help="how long to listen")] = 2.0,
     as_json: AsJson = False,
 ) -> None:

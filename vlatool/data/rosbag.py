@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import weakref
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,14 +17,13 @@ from vlatool.data._pictures import LIBRARY_ERRORS, decode_picture, stack_picture
 from vlatool.data._recording import Values
 from vlatool.data._step_reader import StepReader
 from vlatool.data._steps import Steps
-from vlatool.errors import DataError, VlatoolError, require
-from vlatool.files.bag_repair import bag_repair
+from vlatool.errors import DataError, require
+from vlatool.files.bag_files import SUFFIXES, UNFINISHED_SUFFIX, bag_errors, refuse_unfinished
 from vlatool.files.limits import check_limit
 from vlatool.files.printable import amount
 from vlatool.registry import Claim
 
 Array = NDArray[Any]
-SUFFIXES = (".bag", ".mcap", ".db3")
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 ENCODINGS: dict[str, tuple[str, int]] = {
     "rgb8": ("u1", 3), "bgr8": ("u1", 3), "rgba8": ("u1", 4), "bgra8": ("u1", 4), "mono8": ("u1", 1),
@@ -52,7 +50,7 @@ class Rosbag(StepReader):
         """Claim a file by its suffix, and a directory that is a bag or holds bags."""
         if path.is_dir():
             return Claim.CERTAIN if _bags(path) else Claim.NONE
-        return Claim.CERTAIN if path.name.endswith(SUFFIXES) else Claim.NONE
+        return Claim.CERTAIN if path.name.endswith((*SUFFIXES, UNFINISHED_SUFFIX)) else Claim.NONE
 
     def steps(self, path: Path) -> Steps:
         """Return the topics, resampled at the times of the slowest camera: the nearest message of each.
@@ -98,10 +96,11 @@ class _Bag:
     """
 
     def __init__(self, path: Path) -> None:
+        refuse_unfinished(path, DataError)
         self.path = path
         self._first = path.suffix == ".bag"
         reader: Any = require("rosbags.rosbag1" if self._first else "rosbags.rosbag2", "data")
-        with _bag_errors(path):
+        with bag_errors(path, DataError):
             self._reader = reader.Reader(path)
             self._reader.open()
             self.close = weakref.finalize(self, self._reader.close)
@@ -133,7 +132,7 @@ class _Bag:
     def messages(self, topic: str = "", start: int | None = None) -> Iterator[tuple[Any, int, Any]]:
         """Yield connection, time of reception in ns, and message, in order; those of one topic, or all."""
         chosen = [each for each in self.connections if not topic or each.topic == topic]
-        with _bag_errors(self.path):
+        with bag_errors(self.path, DataError):
             for connection, time, content in self._reader.messages(connections=chosen, start=start):
                 read = self._types.deserialize_ros1 if self._first else self._types.deserialize_cdr
                 try:
@@ -142,18 +141,6 @@ class _Bag:
                     where = f"A message of {connection.topic} in {self.path} at {time} ns"
                     raise DataError(f"{where} cannot be read: {str(error)[:100]}.", RECORD_AGAIN) from error
                 yield connection, time, message
-
-
-@contextmanager
-def _bag_errors(path: Path) -> Iterator[None]:
-    """Turn what rosbags raises on a damaged bag into an error of one sentence."""
-    try:
-        yield
-    except VlatoolError:
-        raise
-    except Exception as error:  # rosbags, sqlite3, zstd, lz4 and yaml each have errors of their own
-        reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
-        raise DataError(f"{path} cannot be read: {reason}.", bag_repair(path)) from error
 
 
 @dataclass

@@ -8,14 +8,12 @@ from pathlib import Path
 
 from vlatool.buses.bag import Bag
 from vlatool.errors import DataError
+from vlatool.files.bag_files import SUFFIXES, UNFINISHED_SUFFIX
 from vlatool.messages.std_msgs import String
 from vlatool.nodes.content import digest
 from vlatool.nodes.run_log import Item, Received, is_log, read_log
 from vlatool.nodes.step_record import CONTROLLER, STEPS, ControllerRecord, StepRecord, topic_of
 
-SUFFIXES = (".bag", ".mcap", ".db3")
-UNFINISHED_SUFFIX = ".active"
-"""Behind the name of a bag that ``rosbag record`` has not finished: the bus ``bag`` says what to do."""
 NODE = "vlatool_replay"
 
 

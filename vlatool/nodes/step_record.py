@@ -166,8 +166,10 @@ def _refuse_newer(cls: type, values: Any) -> None:
     known = {each.name for each in dataclasses.fields(cls)}
     if isinstance(values, dict) and (others := sorted(set(map(str, values)) - known)):
         writer = one_line(str(values.get("version") or "a newer one"), 40)
-        raise DataError(f"A record of a run has '{one_line(others[0], 40)}', which vlatool {VERSION} does not know: "
-                           f"{writer} wrote it.", "replay it with that version")  # fmt: skip
+        raise DataError(
+            f"A record of a run has '{one_line(others[0], 40)}', which vlatool {VERSION} does not know: {writer} wrote "
+            "it.", "replay it with that version",
+        )  # fmt: skip
 
 
 def topic_of(node: str, part: str) -> str:

@@ -10,7 +10,7 @@ import pytest
 from vlatool.buses import QoS
 from vlatool.buses.bag import Bag
 from vlatool.errors import BusError, DataError
-from vlatool.files.bag_repair import bag_repair
+from vlatool.files.bag_files import bag_repair
 from vlatool.messages.std_msgs import String
 from vlatool.nodes.recordings import open_recording
 
