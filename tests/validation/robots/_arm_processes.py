@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from _reach_training import chain_of
+from _ros1 import hear_interrupts
 
 from vlatool.buses import QoS, Reception, open_bus
 from vlatool.errors import BusError
@@ -44,7 +45,9 @@ class Process:
     def __init__(self, command: list[str], log: Path) -> None:
         self._out, self._err = log, log.with_suffix(".err")
         with self._out.open("wb") as out, self._err.open("wb") as err:
-            self._process = subprocess.Popen([sys.executable, "-m", "vlatool", *command], stdout=out, stderr=err)
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "vlatool", *command], stdout=out, stderr=err, preexec_fn=hear_interrupts
+            )
 
     @property
     def said(self) -> str:

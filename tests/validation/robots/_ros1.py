@@ -89,6 +89,11 @@ def free_port() -> int:
     return port
 
 
+def hear_interrupts() -> None:
+    """Let a child end at SIGINT, which a script in the background of a shell ignores, and its children with it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Master:
     """A ROS 1 master in a process of its own."""
 

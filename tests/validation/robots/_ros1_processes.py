@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from _ros1 import Master
+from _ros1 import Master, hear_interrupts
 
 END_S = 20.0
 
@@ -68,8 +68,9 @@ class Program:
     def __init__(self, command: list[str], environment: dict[str, str], path: Path) -> None:
         self.path, self._file = path, path.open("wb")
         self.process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=self._file, text=True, start_new_session=True
-        )
+            command, env=environment, stdout=subprocess.PIPE, stderr=self._file, text=True, start_new_session=True,
+            preexec_fn=hear_interrupts,
+        )  # fmt: skip
 
     def errors(self) -> str:
         """Return what it has written to standard error so far."""
