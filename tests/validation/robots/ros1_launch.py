@@ -86,6 +86,7 @@ def try_launch(programs: Programs, end: str, rows: Rows) -> None:
         await_true(code.exists, 10, "the end of the follower")
         time.sleep(0.5)
         recorder.end()
+        await_true((Path(folder) / "run.bag").exists, 10, "the bag, which the recorder below rosbag renames at its end")
         rows.append((f"{end}: exit codes of roslaunch and of the run", f"{ended}, {code.read_text()}",
                      not ended and code.read_text() == CODES[end]))  # fmt: skip
         about = open_recording(Path(folder) / "run.bag", "roi-follower").about
