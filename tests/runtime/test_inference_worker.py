@@ -215,11 +215,11 @@ def test_a_signal_of_a_call_that_nobody_waited_for_ends_no_later_one():
     worker, late = Worker("w"), Steps("late")
     assert worker.call(Steps(0), soon()) == 0
     for _ in range(3):
-        worker._desk.ended.send()
+        worker._desk.call_end.send()
     late.done.clear()
     threading.Timer(0.05, late.done.set).start()
     assert worker.call(late, soon()) == "late"
-    worker._desk.ended.send()
+    worker._desk.call_end.send()
     with pytest.raises(TimeoutError, match="stopped"):
         worker.call(Steps(ends=False), soon(0.02))
     assert free(worker)

@@ -144,7 +144,7 @@ class _Desk:
         return _signal(endless=True)
 
     @functools.cached_property
-    def ended(self) -> _EventSignal | _LockSignal:
+    def call_end(self) -> _EventSignal | _LockSignal:
         """Sent when a call has ended, perhaps one before that which is waited for."""
         return _signal()
 
@@ -183,7 +183,7 @@ class _Desk:
                 call.task.undo()
                 call.result = None
             self.call, call.ended = None, True
-        self.ended.send()
+        self.call_end.send()
 
     @property
     def busy(self) -> bool:
@@ -214,7 +214,7 @@ class _Desk:
     def wait(self, call: Call, seconds: float) -> bool:
         """Return whether a call ends within a time."""
         end = time.monotonic() + seconds
-        while not call.ended and self.ended.wait(max(0.0, seconds)):
+        while not call.ended and self.call_end.wait(max(0.0, seconds)):
             seconds = end - time.monotonic()
         return call.ended
 
