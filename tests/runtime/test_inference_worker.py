@@ -215,11 +215,11 @@ def test_a_signal_of_a_call_that_nobody_waited_for_ends_no_later_one():
     worker, late = Worker("w"), Steps("late")
     assert worker.call(Steps(0), soon()) == 0
     for _ in range(3):
-        worker._desk.call_end.send()
+        worker._desk.end_signal.send()
     late.done.clear()
     threading.Timer(0.05, late.done.set).start()
     assert worker.call(late, soon()) == "late"
-    worker._desk.call_end.send()
+    worker._desk.end_signal.send()
     with pytest.raises(TimeoutError, match="stopped"):
         worker.call(Steps(ends=False), soon(0.02))
     assert free(worker)
@@ -233,7 +233,7 @@ def test_neither_a_needless_wake_up_nor_a_signal_ends_the_thread():
     before = signal.signal(signal.SIGUSR1, lambda *_: None)
     try:
         for _ in range(3):
-            worker._desk.wake.send()
+            worker._desk.wake_signal.send()
             signal.pthread_kill(thread.ident or 0, signal.SIGUSR1)
             time.sleep(0.02)
     finally:

@@ -139,19 +139,19 @@ class _Desk:
         self._turn: object = None
 
     @functools.cached_property  # with the first thread: a process that was forked before shares them with nobody
-    def wake(self) -> _EventSignal | _LockSignal:
+    def wake_signal(self) -> _EventSignal | _LockSignal:
         """Sent when there is a call, or the thread is to end; also without either."""
         return _signal(endless=True)
 
     @functools.cached_property
-    def call_end(self) -> _EventSignal | _LockSignal:
+    def end_signal(self) -> _EventSignal | _LockSignal:
         """Sent when a call has ended, perhaps one before that which is waited for."""
         return _signal()
 
     def begin_serving(self) -> Callable[[], None]:
         """Return what a thread is to do from now on; an earlier one ends after the call in progress."""
         self._turn = turn = object()
-        wake = self.wake
+        wake = self.wake_signal
 
         def serve() -> None:
             while self._turn is turn:
@@ -165,7 +165,7 @@ class _Desk:
         """End the thread, after the call in progress."""
         if self._turn is not None:
             self._turn = None
-            self.wake.send()
+            self.wake_signal.send()
 
     def _perform(self, call: Call) -> None:
         with self.lock:
@@ -183,7 +183,7 @@ class _Desk:
                 call.task.undo()
                 call.result = None
             self.call, call.ended = None, True
-        self.call_end.send()
+        self.end_signal.send()
 
     @property
     def busy(self) -> bool:
@@ -214,7 +214,7 @@ class _Desk:
     def wait(self, call: Call, seconds: float) -> bool:
         """Return whether a call ends within a time."""
         end = time.monotonic() + seconds
-        while not call.ended and self.call_end.wait(max(0.0, seconds)):
+        while not call.ended and self.end_signal.wait(max(0.0, seconds)):
             seconds = end - time.monotonic()
         return call.ended
 
@@ -277,7 +277,7 @@ class Worker:
             call = self._desk.call = Call(task, due, left)
         if self._thread is None:
             self._start()
-        self._desk.wake.send()
+        self._desk.wake_signal.send()
         return call
 
     def wait(self, call: Call, seconds: float) -> bool:
