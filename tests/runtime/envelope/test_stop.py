@@ -8,7 +8,8 @@ import random
 import numpy as np
 import pytest
 
-from vlatool.runtime.envelope import Envelope, RobotLimits
+from vlatool.runtime.envelope import Envelope, JointLimits, RobotLimits
+from vlatool.runtime.envelope.axis import PositionAxis
 from vlatool.runtime.envelope.stop import stop_phases, stop_positions, stop_range, stop_state
 
 LIMITS = ((2.0, 8.0), (15.0, 7500.0), (1.0, 100.0), (5.0, 3.0))
@@ -58,6 +59,19 @@ def test_time_is_counted_from_the_start_of_the_stop():
     positions = [stop_state(0.0, 1.0, 0.0, phases, time)[0] for time in (0.0, 0.25, 0.5, 0.75, 9.0)]
     assert positions == pytest.approx([0, 0.25 - 8 * 0.25**3 / 6, 0.354166667, 0.375, 0.375])
     assert all(before <= after for before, after in itertools.pairwise(positions))
+
+
+def test_a_stop_is_proven_just_when_its_whole_range_is_within_the_limits():
+    """The velocity at which the acceleration is 0 is looked at first: it must turn away no stop that is legal."""
+    draw, answers = random.Random(5), set()
+    for velocity, acceleration, most, jerk in starts(2000):
+        axis = PositionAxis(JointLimits("x", "rad", -1.0, 1.0, (-1.2, 0.9), most, jerk), 3.0)
+        value = draw.uniform(-1.0, 1.0)
+        low, high, slow, fast = stop_range(velocity, acceleration, axis.max_acceleration, axis.max_jerk)
+        legal = value + low >= -1.0 and value + high <= 1.0 and slow >= -1.2 and fast <= 0.9
+        assert (axis._proof(value, velocity, acceleration) is not None) == legal
+        answers.add((legal, velocity > 0, acceleration > 0))
+    assert len(answers) == 8
 
 
 def test_no_stop_of_a_robot_takes_longer_than_ruckigs_by_more_than_a_tenth_and_a_step():

@@ -213,14 +213,20 @@ class PositionAxis:
     def _braking_jerk(self, velocity: float, acceleration: float, tick: Tick) -> float:
         """Return the largest jerk against a velocity with which the accelerations since the last sample are legal."""
         sign = -1.0 if velocity > 0 else 1.0
-        jerk = min(self.max_jerk, (self.max_acceleration - sign * acceleration) / tick.lever)
-        if tick.interval > tick.lever:
-            before = (self.max_acceleration + sign * acceleration) / (tick.interval - tick.lever)
-            jerk = min(jerk, before)
-        return sign * max(0.0, jerk)
+        toward = sign * acceleration
+        jerk = (self.max_acceleration - toward) / tick[5]
+        if tick[0] > tick[5]:
+            before = (self.max_acceleration + toward) / (tick[0] - tick[5])
+            jerk = before if before < jerk else jerk
+        jerk = self.max_jerk if self.max_jerk < jerk else jerk
+        return sign * jerk if jerk > 0.0 else sign * 0.0
 
     def _proof(self, value: float, velocity: float, acceleration: float) -> tuple[float, float] | None:
         """Return the least and greatest position of a stop, or None if it leaves the limits."""
+        change = acceleration * acceleration / 2 / self.max_jerk
+        extreme = velocity + change if acceleration > 0 else velocity - change  # when the acceleration is 0
+        if not self._slow <= extreme <= self._fast:  # most of what fails does so here, at a third of the time
+            return None
         back, ahead, slowest, fastest = stop_range(velocity, acceleration, self.max_acceleration, self.max_jerk)
         low, high = value + back, value + ahead
         if low < self._low or high > self._high or slowest < self._slow or fastest > self._fast:

@@ -96,33 +96,32 @@ class KeepApart:
 
 def _path(now: Pose, axes: Sequence[PositionAxis], samples: Sequence[Sample], interval: float, step_s: float) -> Array:
     """Return positions (K, A): where the axes are, the command, and the stop behind it at ``step_s`` or wider."""
-    stops = [_stop_of(axis, sample, interval) for axis, sample in zip(axes, samples, strict=True)]
-    longest = max(left for _, _, left in stops)
+    longest, moving, stops = 0.0, [], []
+    for index, (axis, sample) in enumerate(zip(axes, samples, strict=True)):
+        if axis.max_jerk > 0.0:  # others have no stop
+            start, phases, begun_s, left_s = _stop_of(axis, sample, interval)
+            if left_s > 0.0:
+                longest = max(longest, left_s)
+                moving.append(index)
+                stops.append((*start, *phases, begun_s))
     count = min(ceil(longest / step_s), MAX_POINTS - 2)
-    times = np.linspace(0.0, longest, count + 1)[1:] if count else np.empty(0)
-    positions = np.empty((len(times) + 2, len(axes)))
+    positions = np.empty((count + 2, len(axes)))
     positions[0] = now
     positions[1:] = [sample.value for sample in samples]
-    moving = [index for index, (_, phases, left) in enumerate(stops) if phases is not None and left > 0.0]
-    if moving and count:
-        offsets = [0.0 if samples[index].start is not None else axes[index].elapsed + interval for index in moving]
-        (position, velocity, acceleration), phases = (
-            np.array([stops[index][part] for index in moving]).T for part in (0, 1)
-        )
-        positions[2:, moving] = stop_positions(
-            position, velocity, acceleration, phases, np.array(offsets) + times[:, None]
-        )
+    if count:
+        times = np.arange(1, count + 1) * (longest / count)
+        times[-1] = longest
+        columns = np.array(stops).T
+        positions[2:, moving] = stop_positions(*columns[:3], columns[3:7], columns[7] + times[:, None])
     return positions
 
 
 def _stop_of(
     axis: PositionAxis, sample: Sample, interval: float
-) -> tuple[tuple[float, float, float], Phases | None, float]:
-    """Return start, phases (None for an axis that has no stop) and remaining time of the stop behind a sample."""
-    if axis.max_jerk <= 0.0:
-        return (sample.value, 0.0, 0.0), None, 0.0
+) -> tuple[tuple[float, float, float], Phases, float, float]:
+    """Return start and phases of the stop behind a sample, and its times before and after the sample, in seconds."""
     if sample.start is None:
         phases = axis.stop_phases()
-        return axis.start, phases, max(0.0, sum(phases[:3]) - axis.elapsed - interval)
-    made: Phases = stop_phases(sample.start[1], sample.start[2], axis.max_acceleration, axis.max_jerk)
-    return sample.start, made, sum(made[:3])
+        return axis.start, phases, axis.elapsed + interval, sum(phases[:3]) - axis.elapsed - interval
+    made = stop_phases(sample.start[1], sample.start[2], axis.max_acceleration, axis.max_jerk)
+    return sample.start, made, 0.0, sum(made[:3])

@@ -53,15 +53,23 @@ def stop_state(
         time: in s, from 0; infinity gives the end.
     """
     first, constant, last, jerk = phases
-    for duration, rate in ((first, jerk), (constant, 0.0), (last, -jerk)):
-        step = duration if duration < time else time
-        position += step * (velocity + step * (acceleration / 2 + step * rate / 6))
-        velocity += step * (acceleration + step * rate / 2)
-        acceleration += step * rate
-        time -= step
-        if time <= 0:
-            return position, velocity
-    return position, 0.0
+    step = first if first < time else time
+    position += step * (velocity + step * (acceleration / 2 + step * jerk / 6))
+    velocity += step * (acceleration + step * jerk / 2)
+    if time <= first:
+        return position, velocity
+    acceleration += step * jerk
+    time -= step
+    step = constant if constant < time else time
+    position += step * (velocity + step * (acceleration / 2))
+    velocity += step * acceleration
+    if time <= constant:
+        return position, velocity
+    time -= step
+    step = last if last < time else time
+    position += step * (velocity + step * (acceleration / 2 - step * jerk / 6))
+    velocity += step * (acceleration - step * jerk / 2)
+    return position, velocity if time <= last else 0.0
 
 
 def stop_positions(position: Array, velocity: Array, acceleration: Array, phases: Array, times: Array) -> Array:
@@ -76,12 +84,15 @@ def stop_positions(position: Array, velocity: Array, acceleration: Array, phases
         (K, A) float64.
     """
     first, constant, last, jerk = phases
-    for duration, rate in ((first, jerk), (constant, np.zeros_like(jerk)), (last, -jerk)):
-        step = np.minimum(duration, times)
-        position = position + step * (velocity + step * (acceleration / 2 + step * rate / 6))
-        velocity = velocity + step * (acceleration + step * rate / 2)
-        acceleration = acceleration + step * rate
-        times = times - step
+    step = np.minimum(first, times)
+    position = position + step * (velocity + step * (acceleration / 2 + step * jerk / 6))
+    velocity = velocity + step * (acceleration + step * jerk / 2)
+    acceleration, times = acceleration + step * jerk, times - step
+    step = np.minimum(constant, times)
+    position += step * (velocity + step * (acceleration / 2))
+    velocity += step * acceleration
+    step = np.minimum(last, times - step)
+    position += step * (velocity + step * (acceleration / 2 - step * jerk / 6))
     return position
 
 
@@ -95,23 +106,24 @@ def stop_range(velocity: float, acceleration: float, max_acceleration: float, ma
         (0.0, 0.375, 0.0, 1.0)
     """
     square = acceleration * acceleration / 2
-    if velocity * max_jerk < (square if acceleration < 0 else -square):
-        low, high, slow, fast = stop_range(-velocity, -acceleration, max_acceleration, max_jerk)
-        return -high, -low, -fast, -slow
+    backward = velocity * max_jerk < (square if acceleration < 0 else -square)
+    if backward:
+        velocity, acceleration = -velocity, -acceleration
     radicand = max_jerk * velocity + square
     peak, constant = sqrt(radicand) if radicand > 0 else 0.0, 0.0
     if peak > max_acceleration:
         peak = max_acceleration if max_acceleration > -acceleration else -acceleration
         constant = (velocity + (square - peak * peak) / max_jerk) / peak
     first = (acceleration + peak) / max_jerk
-    end = (
+    high = (
         first * (velocity + first * (acceleration / 2 - first * max_jerk / 6))
         + constant * peak * (peak / max_jerk + constant) / 2
         + peak * peak * peak / (6 * max_jerk * max_jerk)
     )
     fastest = velocity + square / max_jerk if acceleration > 0 else velocity
-    if velocity >= 0:
-        return 0.0, end, 0.0, fastest
-    turn = (acceleration - sqrt(max(0.0, 2 * radicand))) / max_jerk
-    back = turn * (velocity + turn * (acceleration / 2 - turn * max_jerk / 6))
-    return back, max(0.0, end), velocity, fastest
+    low = slowest = 0.0
+    if velocity < 0:
+        turn = (acceleration - sqrt(max(0.0, 2 * radicand))) / max_jerk
+        low = turn * (velocity + turn * (acceleration / 2 - turn * max_jerk / 6))
+        high, slowest = max(0.0, high), velocity
+    return (-high, -low, -fastest, -slowest) if backward else (low, high, slowest, fastest)
