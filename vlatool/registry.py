@@ -231,9 +231,10 @@ def _entry_points() -> Any:
 
 def _is_builtin(kind: str, name: str) -> bool:
     """Return whether one name is among ``_builtin_names``, which takes longer."""
-    if not name.isidentifier() or name.startswith("_"):
-        return False
-    spec = importlib.util.find_spec(f"{package_of(kind)}.{name}")
+    package = package_of(kind)
+    if not name.isidentifier() or name.startswith("_") or importlib.util.find_spec(package) is None:
+        return False  # a kind of which other packages alone have entries has no package here
+    spec = importlib.util.find_spec(f"{package}.{name}")
     return spec is not None and spec.submodule_search_locations is None
 
 
