@@ -33,6 +33,9 @@ endif
 endif
 BIN := $(VENV)/bin
 
+# venv INTERPRETER,FOLDER: makes an environment unless it is there; one without pip, such as one that was interrupted, is completed.
+venv = @$(2)/bin/python -m pip --version > /dev/null 2>&1 || $(1) -m venv $(2)
+
 RUNTIME_WHEEL := $(OUT)/wheels/vlatool_runtime-*.whl
 
 .PHONY: able confined sets wheels foreign lerobot gate peers python310 arm64 ladder help install demo test soak coverage check robot docs format clean metaworld
@@ -44,7 +47,7 @@ able:
 	@$(PYTHON) tests/validation/processors/confine.py --able $(SET)
 
 $(BIN)/vlatool: pyproject.toml | $(ABLE)
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(call venv,$(PYTHON),$(VENV))
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,sim,text]' $(CONFINING)
 	@touch $@
 
@@ -90,7 +93,7 @@ wheels: $(BIN)/vlatool  ## build both distributions: vlatool, and vlatool-runtim
 
 robot: wheels  ## run an int8 bundle as a robot would: Python 3.10, vlatool-runtime, onnxruntime 1.23, nothing else
 	$(BIN)/vlatool quantize sample_models/vln-babyai -o $(OUT)/robot/bundle --force
-	@test -x $(OUT)/robot/venv/bin/python || $(PYTHON310) -m venv $(OUT)/robot/venv
+	$(call venv,$(PYTHON310),$(OUT)/robot/venv)
 	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check onnxruntime==1.23.2 $(RUNTIME_WHEEL)
 	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(RUNTIME_WHEEL)
 	$(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
@@ -98,7 +101,7 @@ robot: wheels  ## run an int8 bundle as a robot would: Python 3.10, vlatool-runt
 
 python310: $(BIN)/vlatool  ## run the build side's commands on an exported bundle under Python 3.10, without torch
 	for sample in $(SAMPLES); do $(BIN)/vlatool export sample_models/$$sample -o $(OUT)/python310/$$sample --force || exit 1; done
-	@test -x $(OUT)/python310/venv/bin/python || $(PYTHON310) -m venv $(OUT)/python310/venv
+	$(call venv,$(PYTHON310),$(OUT)/python310/venv)
 	$(OUT)/python310/venv/bin/python -m pip install --quiet --disable-pip-version-check -e '.[ort]' onnx onnxscript onnx-ir safetensors
 	$(OUT)/python310/venv/bin/python tests/robot/build_side.py $(SAMPLES:%=$(OUT)/python310/%) -o $(OUT)/python310/made
 
@@ -119,23 +122,23 @@ gate: $(BIN)/vlatool  ## hold the sample policies against those that the commit 
 	$(BIN)/python tests/validation/own_gate/gate_samples.py --base "$(BASE)" -o $(OUT)/gate
 
 peers: $(ABLE)  ## measure other tools and our bundles on six workloads, interleaved (about an hour; SET=avx2: on an older processor)
-	@test -x $(MADE)/peers/venv/bin/python || $(PYTHON) -m venv $(MADE)/peers/venv
+	$(call venv,$(PYTHON),$(MADE)/peers/venv)
 	$(MADE)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH) -r tests/validation/peers/requirements.txt -e '.[ort,build]' $(CONFINING)
 	$(call confine,$(MADE)/peers/venv)
 	PYTHONPATH=. $(MADE)/peers/venv/bin/python tests/validation/peers/table.py
 
 $(OUT)/foreign/common/.made: tests/validation/foreign/common.txt pyproject.toml
-	@test -x $(OUT)/foreign/common/bin/python || $(PYTHON) -m venv $(OUT)/foreign/common
+	$(call venv,$(PYTHON),$(OUT)/foreign/common)
 	$(OUT)/foreign/common/bin/python -m pip install --quiet --disable-pip-version-check -r tests/validation/foreign/common.txt -e '.[ort,openvino,build,text]'
 	@touch $@
 
 $(OUT)/foreign/lerobot/.made: tests/validation/foreign/lerobot.txt pyproject.toml
-	@test -x $(OUT)/foreign/lerobot/bin/python || $(PYTHON) -m venv $(OUT)/foreign/lerobot
+	$(call venv,$(PYTHON),$(OUT)/foreign/lerobot)
 	$(OUT)/foreign/lerobot/bin/python -m pip install --quiet --disable-pip-version-check -r tests/validation/foreign/lerobot.txt -e '.[ort,openvino,build,text]'
 	@touch $@
 
 $(OUT)/foreign/lerobot06/.made:
-	@test -x $(OUT)/foreign/lerobot06/bin/python || $(PYTHON312) -m venv $(OUT)/foreign/lerobot06
+	$(call venv,$(PYTHON312),$(OUT)/foreign/lerobot06)
 	$(OUT)/foreign/lerobot06/bin/python -m pip install --quiet --disable-pip-version-check 'lerobot[dataset,diffusion,smolvla]==0.6.1'
 	@touch $@
 

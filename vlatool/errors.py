@@ -28,7 +28,6 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 import sys
@@ -223,6 +222,8 @@ def fix_for(name: str, known: Iterable[str]) -> str:
 
 def _closest(name: str, names: list[str]) -> str:
     """Return the most similar name; empty if none is similar."""
+    import difflib  # a robot that makes no mistake does without
+
     return next(iter(difflib.get_close_matches(name, names, n=1)), "")
 
 

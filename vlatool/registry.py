@@ -13,8 +13,6 @@ import functools
 import importlib
 import importlib.util
 import inspect
-import pkgutil
-import traceback
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
 from types import ModuleType
@@ -90,7 +88,7 @@ def module(kind: str, name: str) -> ModuleType:
         PluginError: when it is another package's and cannot be imported.
     """
     own_name = name.replace("-", "_")
-    if own_name in _builtin_names(kind):
+    if _is_builtin(kind, own_name):
         return importlib.import_module(f"{package_of(kind)}.{own_name}")
     if own_name not in plugins(kind):
         raise UsageError.unknown(f"Unknown {noun_of(kind)} '{name}'", own_name, names(kind))
@@ -211,6 +209,8 @@ def plugin_of(module_name: str) -> str:
 
 def package_at_fault(error: BaseException) -> str:
     """Return the other package that caused an exception: the owner of the innermost frame that is not a library's."""
+    import traceback  # a robot without a fault does without
+
     frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
     owners = [(name.partition(".")[0] == "vlatool", plugin_of(name)) for name in frames]
     return next((other for own, other in reversed(owners) if own or other), "")
@@ -229,7 +229,18 @@ def _entry_points() -> Any:
     return metadata.entry_points()
 
 
+def _is_builtin(kind: str, name: str) -> bool:
+    """Return whether one name is among ``_builtin_names``, which takes longer."""
+    package = package_of(kind)
+    if not name.isidentifier() or name.startswith("_") or importlib.util.find_spec(package) is None:
+        return False  # a kind of which other packages alone have entries has no package here
+    spec = importlib.util.find_spec(f"{package}.{name}")
+    return spec is not None and spec.submodule_search_locations is None
+
+
 def _builtin_names(kind: str) -> list[str]:
+    import pkgutil  # a robot names what it wants
+
     spec = importlib.util.find_spec(package_of(kind))
     if spec is None or spec.submodule_search_locations is None:
         return []

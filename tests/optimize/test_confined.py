@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from _full import small_or_full
+from _processes import environment_at_start
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
@@ -178,15 +179,12 @@ def test_the_result_is_a_bundle_that_loads(runs, tmp_path_factory):
 def test_a_child_has_the_variable_from_its_start_and_its_server_too(monkeypatch: pytest.MonkeyPatch):
     """Its server as well: a library that was loaded before the fork has read the variable."""
     monkeypatch.delenv(MAX_CPU_ISA, raising=False)
-    for environment, told in (({MAX_CPU_ISA: "AVX2"}, b"AVX2"), (None, None)):
+    for environment, isa in (({MAX_CPU_ISA: "AVX2"}, "AVX2"), (None, None)):
         before = dict(children._servers)
         with children.Child("policy.py", environment=environment):
-            key = next(
-                kind for kind in children._servers if kind[0] == str(os.getpid()) and kind[-1] == (told or b"").decode()
-            )
-            started = Path(f"/proc/{children._servers[key].process.pid}/environ").read_bytes().split(b"\0")
-        variables = dict(each.partition(b"=")[::2] for each in started if each)
-        assert variables.get(MAX_CPU_ISA.encode()) == told
+            key = next(kind for kind in children._servers if kind[0] == str(os.getpid()) and kind[-1] == (isa or ""))
+            variables = environment_at_start(children._servers[key].process.pid)
+        assert variables.get(MAX_CPU_ISA) == isa
         assert set(before) <= set(children._servers), "servers of other sets stay"
     assert MAX_CPU_ISA not in os.environ, "the parent computes as before"
 

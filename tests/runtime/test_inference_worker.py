@@ -6,6 +6,8 @@ import gc
 import os
 import resource
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -52,7 +54,9 @@ def way_to_wake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
     """Every test with both ways in which a thread is woken."""
     if request.param == "lock":
         monkeypatch.delattr(os, "eventfd")
-    assert type(workers._signal()).__name__ == {"eventfd": "_EventSignal", "lock": "_LockSignal"}[request.param]
+    for endless in (False, True):
+        signal_type = type(workers._signal(endless=endless)).__name__
+        assert signal_type == {"eventfd": "_EventSignal", "lock": "_LockSignal"}[request.param]
     return str(request.param)
 
 
@@ -211,15 +215,60 @@ def test_a_signal_of_a_call_that_nobody_waited_for_ends_no_later_one():
     worker, late = Worker("w"), Steps("late")
     assert worker.call(Steps(0), soon()) == 0
     for _ in range(3):
-        worker._desk.ended.send()
+        worker._desk.end_signal.send()
     late.done.clear()
     threading.Timer(0.05, late.done.set).start()
     assert worker.call(late, soon()) == "late"
-    worker._desk.ended.send()
+    worker._desk.end_signal.send()
     with pytest.raises(TimeoutError, match="stopped"):
         worker.call(Steps(ends=False), soon(0.02))
     assert free(worker)
     assert worker.call(Steps(5), soon()) == 5
+
+
+def test_neither_a_needless_wake_up_nor_a_signal_ends_the_thread():
+    worker, first, last = Worker("w"), Steps(1), Steps(2)
+    assert worker.call(first, soon()) == 1
+    (thread,) = [each for each in threading.enumerate() if each.name == "w"]
+    before = signal.signal(signal.SIGUSR1, lambda *_: None)
+    try:
+        for _ in range(3):
+            worker._desk.wake_signal.send()
+            signal.pthread_kill(thread.ident or 0, signal.SIGUSR1)
+            time.sleep(0.02)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert thread.is_alive()
+    assert worker.call(last, soon()) == 2
+    assert [each for each in threading.enumerate() if each.name == "w"] == [thread]
+    worker.close()
+    assert not thread.is_alive()
+
+
+FORKED = """
+import os, sys, time
+if sys.argv[1] == "lock":
+    del os.eventfd
+from vlatool.runtime.worker import Worker
+
+class Nothing:
+    begin = stop = undo = lambda self: None
+    run = lambda self: os.getpid()
+
+worker = Worker()
+child = os.fork()
+same = all(worker.call(Nothing(), time.monotonic() + 20) == os.getpid() for _ in range(2000))
+worker.close()
+if not child:
+    os._exit(0 if same else 3)
+sys.exit(0 if same and os.waitpid(child, 0)[1] == 0 else 4)
+"""
+
+
+def test_a_process_that_was_forked_before_the_first_call_wakes_its_own_thread(way_to_wake: str):
+    """Processes that shared the signals would wake each other's threads instead: calls would end too late."""
+    done = subprocess.run([sys.executable, "-c", FORKED, way_to_wake], timeout=100, check=False)
+    assert done.returncode == 0
 
 
 def test_descriptors_are_given_back_and_a_process_without_low_ones_has_workers_too(way_to_wake: str):

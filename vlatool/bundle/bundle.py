@@ -16,8 +16,7 @@ from vlatool.errors import BundleError
 from vlatool.files import verified_read
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit, limit
-from vlatool.files.ownership import LEDGER, cached_hash
-from vlatool.files.verified_read import COPY_AGAIN, DESKTOP_FILES
+from vlatool.files.verified_read import COPY_AGAIN, DESKTOP_FILES, LEDGER
 
 MANIFEST = "manifest.json"
 DIGEST = "manifest.sha256"
@@ -186,6 +185,8 @@ class Bundle:
 
 def seal(directory: Path, manifest: Manifest) -> Bundle:
     """Hash every file below ``directory``, write ``manifest.json`` and its digest last, and return the bundle."""
+    from vlatool.files.ownership import cached_hash  # a robot seals nothing
+
     files = {}
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()

@@ -198,6 +198,11 @@ class Conversion:
             return 0
         return ROTATIONS[str(self.network)] - ROTATIONS[str(self.robot)]
 
+    @property
+    def of_outputs_alone(self) -> bool:
+        """Whether no input may have it."""
+        return self.op in OUTPUTS_ALONE
+
     def check_spans(self, spans: Iterable[Span]) -> None:
         """Check the places of the parts on the side of the robot.
 

@@ -6,24 +6,18 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from vlatool.bundle.conversion import (
-    OUTPUTS_ALONE,
-    Conversion,
-    Layout,
-    Span,
-    conversions_from,
-    layouts_of,
-    parts_from,
-)
-from vlatool.bundle.image import Image
-from vlatool.bundle.prompt import Prompt
 from vlatool.errors import SpecError, suggest
 from vlatool.files.limits import check_limit
 from vlatool.files.messages import field_values, to_json
 from vlatool.files.printable import amount
 from vlatool.files.validate import finite_number, integer, path_problem, short_repr, text
+
+if TYPE_CHECKING:  # a robot imports them where its policy has one
+    from vlatool.bundle.conversion import Conversion, Layout, Span
+    from vlatool.bundle.image import Image
+    from vlatool.bundle.prompt import Prompt
 
 DTYPES = (
     "float32", "float16", "int64", "int32", "uint8", "bool", "float64", "int8", "int16", "uint16", "uint32", "uint64",
@@ -99,8 +93,8 @@ class TensorSpec:
 
     def __post_init__(self) -> None:
         self._check_words()
-        object.__setattr__(self, "parts", parts_from(self.parts, f"'{self.name}'"))
-        object.__setattr__(self, "convert", conversions_from(self.convert))
+        object.__setattr__(self, "parts", _parts(self.parts, f"'{self.name}'"))
+        object.__setattr__(self, "convert", _conversions(self.convert))
         self._check_shape()
         self._check_conversions()
         self._check_history()
@@ -220,12 +214,20 @@ class TensorSpec:
             )
         if self.image is not None:
             self._check_image(self.image)
-        if self.prompt is not None and (not isinstance(self.prompt, Prompt) or self.kind != "text"):
+        if self.prompt is not None:
+            self._check_prompt(self.prompt)
+
+    def _check_prompt(self, prompt: Prompt) -> None:
+        from vlatool.bundle.prompt import Prompt
+
+        if not isinstance(prompt, Prompt) or self.kind != "text":
             raise SpecError(
                 f"'{self.name}' has a prompt and is {self.kind}; what is written around a text belongs to kind: text."
             )
 
     def _check_image(self, image: Image) -> None:
+        from vlatool.bundle.image import Image
+
         if not isinstance(image, Image):
             raise SpecError(f"'{self.name}' has image {short_repr(image)}; it must be a mapping.")
         if self.kind != "tensor" or self.normalisation != "none" or not self.finite:
@@ -274,6 +276,8 @@ class TensorSpec:
         Raises:
             SpecError: for parts that are not there, or overlap.
         """
+        from vlatool.bundle.conversion import Layout, layouts_of
+
         counts = Counter(self.labels)  # a label of two elements names neither
         places = {label: (index, index + 1) for index, label in enumerate(self.labels) if counts[label] == 1}
         return layouts_of(Layout(self.robot_width, {**places, **self.parts}), self.convert)
@@ -341,10 +345,14 @@ class TensorSpec:
         if "name" not in values or not isinstance(values.get("shape"), tuple):
             raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {short_repr(values.get('shape'))}.")
         if values.get("image") is not None:
+            from vlatool.bundle.image import Image
+
             values["image"] = Image.from_dict(values["image"])
         if values.get("prompt") is not None:
+            from vlatool.bundle.prompt import Prompt
+
             values["prompt"] = Prompt.from_dict(values["prompt"])
-        values["convert"] = conversions_from(values.get("convert", ()))
+        values["convert"] = _conversions(values.get("convert", ()))
         if values.get("kind") == "discrete":
             values.setdefault("labels", _indices(values["shape"]))
         return cls(**values)
@@ -359,6 +367,24 @@ def _indices(shape: tuple[Any, ...]) -> tuple[str, ...]:
     """Return labels for unnamed actions, such as 256 action tokens: the last axis' indices, none if it is dynamic."""
     width = shape[-1] if shape else 0
     return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MAX_INDICES else ()
+
+
+def _parts(data: Any, where: str) -> dict[str, Span]:
+    """Return the named parts of a vector; see ``parts_from``."""
+    if isinstance(data, dict) and not data:
+        return {}
+    from vlatool.bundle.conversion import parts_from
+
+    return parts_from(data, where)
+
+
+def _conversions(data: Any) -> tuple[Conversion, ...]:
+    """Return the steps of ``convert``; see ``conversions_from``."""
+    if isinstance(data, list | tuple) and not data:
+        return ()
+    from vlatool.bundle.conversion import conversions_from
+
+    return conversions_from(data)
 
 
 @dataclass(frozen=True)
@@ -419,7 +445,7 @@ class PolicySpec:
         """Refuse steps that stand where they are not done, and states that are not there."""
         for tensor in (*self.inputs, *self.outputs[1:]):
             for step in tensor.convert:
-                if step.op in OUTPUTS_ALONE or tensor in self.outputs:
+                if step.of_outputs_alone or tensor in self.outputs:
                     raise SpecError(
                         f"'{tensor.name}' has the step '{step.op}' in convert; that is for the action "
                         f"'{self.action.name}' alone."

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import OutputError
+from vlatool.files.verified_read import LEDGER as LEDGER
 from vlatool.files.verified_read import hash_handle
 
-LEDGER = ".written-by-vlatool.json"
 MANIFEST = "manifest.json"
 SCHEMA = 1
 MAX_LEDGER_BYTES = 1 << 28

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import tempfile
 import weakref
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -134,6 +133,8 @@ class CompressedSource:
             self._plain = self._unpack()
 
     def _unpack(self) -> PlainSource:
+        import tempfile  # a robot keeps no recordings
+
         handle, name = tempfile.mkstemp(prefix="vlatool-rows-")
         os.unlink(name)
         kept = OpenFile(handle, self._file.where)

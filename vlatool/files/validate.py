@@ -9,7 +9,7 @@ from typing import Any
 
 from vlatool.errors import BundleError, SpecError, suggest
 
-FORBIDDEN_CHARACTERS = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|\ud800-\udfff]')
+FORBIDDEN_CHARACTERS = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|]')
 """Characters that names of files in a bundle must not have: some system or engine gives them another meaning."""
 MAX_INTEGER = 2**63
 Kind = type[BundleError] | type[SpecError]
@@ -27,6 +27,16 @@ def short_repr(value: Any) -> str:
         text = repr(list(value[:9])) if simple and len(value) < 10 else text
     text = text.encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= MAX_CHARACTERS else f"{text[:MAX_CHARACTERS]}..."
+
+
+def has_half_character(text: str) -> bool:
+    r"""Return whether a text has a surrogate, which cannot be encoded as UTF-8.
+
+    Example:
+        >>> has_half_character("\ud83d.onnx")
+        True
+    """
+    return not text.isascii() and any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def mapping(value: Any, where: str, error: Kind) -> dict[str, Any]:
@@ -51,7 +61,7 @@ def text(value: Any, where: str, error: Kind, *, empty: bool = True) -> str:
     """Return a string that can be encoded as UTF-8."""
     if not isinstance(value, str) or not (value or empty):
         raise error(f"{where} must be text{'' if empty else ' that is not empty'}; got {short_repr(value)}.")
-    if not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
+    if has_half_character(value):
         raise error(f"{where} must be text; got half of a character: {short_repr(value)}.")
     return value
 
@@ -123,7 +133,7 @@ def path_problem(path: Any) -> str:
         return "it leaves the directory"
     if "" in parts or "." in parts:
         return "it has a part that is empty or a dot"
-    if FORBIDDEN_CHARACTERS.search(path):
+    if FORBIDDEN_CHARACTERS.search(path) or has_half_character(path):
         return "it has characters that no file of a bundle has"
     if len(path) > 1024 or any(len(part.encode()) > 255 for part in parts):
         return "it is too long"

@@ -16,6 +16,8 @@ from vlatool.files.limits import limit
 
 DESKTOP_FILES = (".DS_Store", "Thumbs.db", "desktop.ini")
 """Files that desktop environments leave in directories."""
+LEDGER = ".written-by-vlatool.json"
+"""The record of what vlatool wrote into a directory (``vlatool.files.ownership``)."""
 COPY_AGAIN = "copy or export the bundle again"
 BLOCK = 1 << 20
 TICK_NS = 20_000_000
@@ -72,7 +74,8 @@ def read_all(handle: int, size: int) -> bytes:
 def hash_handle(handle: int) -> str:
     """Return the SHA-256 of an open file from its start, as hex."""
     digest = hashlib.sha256()
-    buffer, at = bytearray(BLOCK), 0  # one for all blocks: allocating takes longer than filling
+    size = min(BLOCK, os.fstat(handle).st_size + 1)
+    buffer, at = bytearray(size), 0  # one for all blocks: allocating takes longer than filling
     while count := os.preadv(handle, [buffer], at):
         digest.update(memoryview(buffer)[:count])
         at += count

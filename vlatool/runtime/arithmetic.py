@@ -8,7 +8,7 @@ of the graph (of its weights to uint8), so that a session that rewrites nothing 
 
 from __future__ import annotations
 
-import base64
+import binascii
 import functools
 import math
 import zlib
@@ -56,7 +56,7 @@ SATURATING = "saturating: they are added in pairs of 16 bits"
 
 def model(written: bool = False) -> bytes:
     """Return the product, or the one that is written as an integer operator, as a serialized ``ModelProto``."""
-    return zlib.decompress(base64.b64decode(INTEGER_MODEL if written else MODEL))
+    return zlib.decompress(binascii.a2b_base64(INTEGER_MODEL if written else MODEL))
 
 
 def operand() -> Any:

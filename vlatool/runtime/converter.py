@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.bundle.conversion import Conversion, Layout, Span
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SpecError
 from vlatool.runtime.assets import Assets
-from vlatool.runtime.pose import absolute_poses, relative_poses
-from vlatool.runtime.rotation import convert_rotation
 from vlatool.runtime.statistics import Normaliser, load_normaliser
+
+if TYPE_CHECKING:  # a robot imports what its policy converts
+    from vlatool.bundle.conversion import Conversion, Layout, Span
 
 Array = NDArray[Any]
 Change = Callable[[Array, "Array | None"], Array]
@@ -52,7 +52,8 @@ class Converter:
         self.normaliser = load_normaliser(tensor, assets)
         self._steps: list[_Step] = []
         remaining, marked = iter(states), False
-        for conversion, layout in zip(tensor.convert, tensor.layouts(), strict=False):
+        layouts = tensor.layouts() if tensor.convert else ()
+        for conversion, layout in zip(tensor.convert, layouts, strict=False):
             if conversion.op == "normalisation":
                 self._steps, marked = [*self._steps, *_normalisation(self.normaliser)], True
             elif conversion.op == "relative":
@@ -197,6 +198,8 @@ def _linkage(conversion: Conversion) -> tuple[Elements, Elements]:
 
 
 def _rotation(conversion: Conversion, spans: Sequence[Span]) -> _Step:
+    from vlatool.runtime.rotation import convert_rotation
+
     there = [(start + index * conversion.growth, stop + (index + 1) * conversion.growth)
              for index, (start, stop) in enumerate(spans)]  # fmt: skip
 
@@ -244,6 +247,8 @@ def _relative(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) -> _St
 
 
 def _relative_poses(conversion: Conversion, spans: Sequence[tuple[Span, Span]]) -> _Step:
+    from vlatool.runtime.pose import absolute_poses, relative_poses
+
     def compose(values: Array, state: Array | None, change: Callable[..., Array]) -> Array:
         if state is None:
             raise ValueError("an action that is relative to a state is converted without one")

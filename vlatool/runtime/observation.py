@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,11 @@ from vlatool.files.printable import amount
 from vlatool.runtime.assets import Assets, asset_path
 from vlatool.runtime.converter import Converter, newest_moment
 from vlatool.runtime.history import History
-from vlatool.runtime.image import FrameEncoder
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer, tokenizer_content
+
+if TYPE_CHECKING:
+    from vlatool.runtime.image import FrameEncoder
 
 MAX_SMALL_VALUES = 256
 NOT_FINITE = (
@@ -154,6 +156,8 @@ def _encoder(tensor: TensorSpec, assets: Assets, history: History | None = None,
     if tensor.history and history is not None:
         return _moment_encoder(tensor, assets, history)
     if tensor.image is not None:
+        from vlatool.runtime.image import FrameEncoder  # for a robot whose policy takes frames
+
         return _frame_encoder(tensor, FrameEncoder(tensor.moment, tensor.image))
     if tensor.convert:
         return _converting_encoder(tensor, assets)

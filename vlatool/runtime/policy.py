@@ -14,7 +14,6 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
-from vlatool.bundle.module_bundle import no_graph_error
 from vlatool.bundle.program import SlowPart, slow_part
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import BundleError, GraphError, UsageError, VlatoolError
@@ -116,6 +115,8 @@ class BundlePolicy:
         """
         manifest = bundle.manifest
         if not manifest.graphs:
+            from vlatool.bundle.module_bundle import no_graph_error
+
             raise no_graph_error(bundle, "run")
         check_chunk(manifest.spec)
         limit_mb = allowed_mb(manifest, memory_mb)

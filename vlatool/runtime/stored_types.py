@@ -90,7 +90,7 @@ def _holds(codes: tuple[int, ...], model: bytes | OpenFile) -> bool:
     marks = [bytes([DATA_TYPE << 3 | VARINT, code]) for code in codes]  # how such a field begins
 
     def may_hold(content: bytes | OpenFile, start: int, end: int) -> bool:
-        return end - start > SEARCH_BYTES or any(mark in content[start:end] for mark in marks)
+        return end - start > SEARCH_BYTES or any(map(content[start:end].__contains__, marks))
 
     tensors = (span for message, *span in messages(model, may_hold) if message == "TensorProto")
     return any(_data_type(model, start, end) in codes for start, end in tensors)

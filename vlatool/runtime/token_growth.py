@@ -6,7 +6,6 @@ memory runs out. Lengths are counted in characters, and in tokens from the model
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -109,6 +108,8 @@ def _replaced(pattern: Any, length: int) -> float:
 def _precompiled(charsmap: Any) -> int:
     """The longest text in a table of SentencePiece: its size, a trie of that size, and texts that end in a zero."""
     try:
+        import base64  # for the few tokenizers that have one
+
         table = base64.b64decode(charsmap or "")
         texts = table[4 + int.from_bytes(table[:4], "little") :]
     except (ValueError, TypeError):

@@ -6,18 +6,20 @@ import contextlib
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.bundle.prompt import Prompt
 from vlatool.errors import DataError, SpecError, VlatoolError, require
 from vlatool.files.json import read_json
 from vlatool.files.limits import check_limit
 from vlatool.files.printable import amount
 from vlatool.runtime.assets import Assets, asset_path, read_asset
 from vlatool.runtime.token_growth import growth
+
+if TYPE_CHECKING:
+    from vlatool.bundle.prompt import Prompt
 
 SAVE = "save it with tokenizer.save(FILE) of the tokenizers library, or write a vocabulary: kind: words"
 VOCABULARY = "write the id of each word under 'words', and the ids 'pad' and 'unknown'"

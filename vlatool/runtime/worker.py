@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import contextlib
+import functools
 import os
 import select
 import threading
@@ -40,12 +41,15 @@ class _EventSignal:
 
     A thread that is woken by the release of a ``Lock`` needs Python's lock at once, which the one that woke it still
     holds: on one core that is two more changes of the thread, 20 to 30 us. Writing to an eventfd gives it up before.
+
+    Args:
+        endless: Whether it is waited for without an end.
     """
 
-    def __init__(self) -> None:
-        self._handle = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+    def __init__(self, *, endless: bool) -> None:
+        self._handle = os.eventfd(0, os.EFD_CLOEXEC | (0 if endless else os.EFD_NONBLOCK))
         weakref.finalize(self, os.close, self._handle).atexit = False
-        if self._handle >= MOST_HANDLES:
+        if self._handle >= MOST_HANDLES and not endless:
             raise OSError("select() takes no such descriptor")
 
     def send(self) -> None:
@@ -58,6 +62,10 @@ class _EventSignal:
             return False
         os.eventfd_read(self._handle)
         return True
+
+    def wait_endlessly(self) -> None:
+        """Return when it was sent, now or earlier; all that was sent counts as once."""
+        os.read(self._handle, 8)  # goes on after a signal, which eventfd_read() does not
 
 
 class _LockSignal:
@@ -76,11 +84,19 @@ class _LockSignal:
         """Return whether it was sent within a time, now or earlier."""
         return self._lock.acquire(True, seconds)
 
+    def wait_endlessly(self) -> None:
+        """Return when it was sent, now or earlier."""
+        self._lock.acquire()
 
-def _signal() -> _EventSignal | _LockSignal:
-    """Return the faster signal that this process can have: OSError where it has no descriptor left for it."""
+
+def _signal(*, endless: bool = False) -> _EventSignal | _LockSignal:
+    """Return the faster signal that this process can have: it may have no eventfd, or no descriptor left for one.
+
+    Args:
+        endless: Whether it is waited for without an end.
+    """
     try:
-        return _EventSignal()
+        return _EventSignal(endless=endless)
     except (AttributeError, OSError):
         return _LockSignal()
 
@@ -118,29 +134,40 @@ class _Desk:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self.lock = _thread.allocate_lock()
-        self.wake = _thread.allocate_lock()
-        self.wake.acquire()
-        self.ended = _signal()
-        """Sent when a call has ended, perhaps one before that which is waited for."""
         self.call: Call | None = None
         self._clock = clock
-        self._left = False
+        self._turn: object = None
 
-    def serve(self) -> None:
-        """Perform one call after the other; return when there is none after ``wake``, or nobody is left to call."""
-        while not self._left and self._perform_next():
-            pass
+    @functools.cached_property  # with the first thread: a process that was forked before shares them with nobody
+    def wake_signal(self) -> _EventSignal | _LockSignal:
+        """Sent when there is a call, or the thread is to end; also without either."""
+        return _signal(endless=True)
+
+    @functools.cached_property
+    def end_signal(self) -> _EventSignal | _LockSignal:
+        """Sent when a call has ended, perhaps one before that which is waited for."""
+        return _signal()
+
+    def begin_serving(self) -> Callable[[], None]:
+        """Return what a thread is to do from now on; an earlier one ends after the call in progress."""
+        self._turn = turn = object()
+        wake = self.wake_signal
+
+        def serve() -> None:
+            while self._turn is turn:
+                wake.wait_endlessly()
+                if (call := self.call) is not None:
+                    self._perform(call)
+
+        return serve
 
     def leave(self) -> None:
         """End the thread, after the call in progress."""
-        self._left = True
-        with contextlib.suppress(RuntimeError):  # a call is there that the thread has not begun: it looks afterwards
-            self.wake.release()
+        if self._turn is not None:
+            self._turn = None
+            self.wake_signal.send()
 
-    def _perform_next(self) -> bool:
-        self.wake.acquire()
-        if (call := self.call) is None:
-            return False
+    def _perform(self, call: Call) -> None:
         with self.lock:
             if not call.abandoned:
                 call.task.begin()
@@ -156,8 +183,7 @@ class _Desk:
                 call.task.undo()
                 call.result = None
             self.call, call.ended = None, True
-        self.ended.send()
-        return True
+        self.end_signal.send()
 
     @property
     def busy(self) -> bool:
@@ -188,7 +214,7 @@ class _Desk:
     def wait(self, call: Call, seconds: float) -> bool:
         """Return whether a call ends within a time."""
         end = time.monotonic() + seconds
-        while not call.ended and self.ended.wait(max(0.0, seconds)):
+        while not call.ended and self.end_signal.wait(max(0.0, seconds)):
             seconds = end - time.monotonic()
         return call.ended
 
@@ -251,7 +277,7 @@ class Worker:
             call = self._desk.call = Call(task, due, left)
         if self._thread is None:
             self._start()
-        self._desk.wake.release()
+        self._desk.wake_signal.send()
         return call
 
     def wait(self, call: Call, seconds: float) -> bool:
@@ -272,7 +298,7 @@ class Worker:
 
     def _start(self) -> None:
         close_at_exit(self._desk)
-        self._thread = threading.Thread(target=self._desk.serve, name=self._name, daemon=True)
+        self._thread = threading.Thread(target=self._desk.begin_serving(), name=self._name, daemon=True)
         self._thread.start()
 
     def close(self, seconds: float = EXIT_S) -> None:
@@ -281,5 +307,5 @@ class Worker:
         self._desk.end_call(seconds)
         if not self.busy and thread is not None:
             self._thread = None
-            self._desk.wake.release()
+            self._desk.leave()
             thread.join()

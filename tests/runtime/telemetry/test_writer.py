@@ -13,6 +13,7 @@ from _numbered import NumberedPolicy, spec_of
 from vlatool.errors import UsageError
 from vlatool.runtime.stack import build_stack
 from vlatool.runtime.telemetry import Delivery, Telemetry
+from vlatool.runtime.telemetry.writer import Turn
 
 
 def test_every_sink_gets_every_record_in_order():
@@ -43,6 +44,40 @@ def test_a_sink_that_blocks_delays_no_control_step_and_drops_are_counted():
     slow = telemetry.outlets[0].reader
     assert slow.taken + slow.dropped == 200
     assert slow.dropped >= 149, "one is in the sink, the ring holds 50"
+
+
+def test_a_thread_that_blocks_in_its_turn_is_waited_for_once():
+    turn, waits = Turn(0.3), []
+    assert turn.take()
+    for _ in range(3):
+        begin = time.monotonic()
+        assert not turn.take()
+        waits.append(time.monotonic() - begin)
+    assert waits[0] >= 0.29
+    assert min(waits[1:]) < 0.2
+    turn.end()
+    assert turn.take()
+    turn.end()
+
+
+def test_a_sink_that_blocks_in_its_turn_holds_no_other_one_up():
+    free, seen, blocks = threading.Event(), [], threading.Event()  # type: ignore[var-annotated]
+
+    def blocked(record: Any) -> None:
+        blocks.set()
+        free.wait(20)
+
+    telemetry = Telemetry(blocked, seen.append, period_s=0.01)
+    telemetry.put(0)
+    assert blocks.wait(10)
+    for number in range(1, 100):
+        telemetry.put(number)
+    end = time.monotonic() + 10
+    while len(seen) < 100 and time.monotonic() < end:
+        time.sleep(0.005)
+    assert seen == list(range(100))
+    free.set()
+    assert telemetry.close(10)
 
 
 def test_a_blocked_sink_is_left_alone_at_the_end():

@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from numpy.typing import NDArray
 
@@ -21,8 +21,10 @@ from vlatool.runtime.engine import Engine, Node, NodeRun, Profiled, computing
 from vlatool.runtime.engines._bound_buffers import HOST, BoundBuffers, port_of
 from vlatool.runtime.engines._deadlines import WATCHDOG
 from vlatool.runtime.engines._device_tensors import on_host, run_bound
-from vlatool.runtime.engines._ort_profile import OrtProfiled, Trace, precision
 from vlatool.runtime.stored_types import has_float8
+
+if TYPE_CHECKING:
+    from vlatool.runtime.engines._ort_profile import OrtProfiled, Trace
 
 CPU = "CPUExecutionProvider"
 NO_CPU_FALLBACK = ("session.disable_cpu_ep_fallback", "1")
@@ -75,7 +77,7 @@ class OnnxRuntimeSession(Engine):
     ) -> None:
         ort = self.onnxruntime()
         model = path if opened is None else opened
-        self._trace = Trace(model) if traced else None
+        self._trace = trace_of(model) if traced else None
         self._node_runs: list[NodeRun] = []
         if compute not in ("", *self.computes):
             raise GraphError(
@@ -173,6 +175,8 @@ class OnnxRuntimeSession(Engine):
     @classmethod
     def node_precision(cls, node: Node) -> str:
         """Return what a node computes in, by its kind and the dtype of its first input."""
+        from vlatool.runtime.engines._ort_profile import precision
+
         return precision(node)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -400,6 +404,13 @@ def traced_into(folder: str | None, options: Any) -> Any:
     return options
 
 
+def trace_of(model: Path | bytes) -> Trace:
+    """Return a trace of a graph; a robot without a record does without what that needs."""
+    from vlatool.runtime.engines._ort_profile import Trace
+
+    return Trace(model)
+
+
 def quiet_run_options() -> Any:
     """Return options of a run that logs nothing but fatal errors: being stopped is none."""
     options = require("onnxruntime", "ort").RunOptions()
@@ -446,6 +457,8 @@ def profiling_session(ort: Any, path: Path, options: Any, scratch: Path, provide
     """
     options.enable_profiling, options.profile_file_prefix = True, str(scratch)
     try:
+        from vlatool.runtime.engines._ort_profile import OrtProfiled
+
         return OrtProfiled(open_session(ort, path, options, providers))
     except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
         raise GraphError(

@@ -12,7 +12,6 @@ from vlatool.machine.host import VNNI
 from vlatool.runtime import arithmetic
 from vlatool.runtime.engine import Int8Layout, Node, Stages
 from vlatool.runtime.engines._onnx_runtime import ON_CPU, OnnxRuntimeSession, is_true_of, session_options
-from vlatool.runtime.weight_pairs import weights_fit
 
 if TYPE_CHECKING:
     from vlatool.machine.target import Target
@@ -25,6 +24,13 @@ INT8_VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "": {}, "_mse": {"method": "mse"}, "_attention": {"attention": True}, "_elementwise": {"elementwise": True},
 }  # fmt: skip
 """Ending of a plan's name -> options of static int8 that a search begins with, and combines."""
+
+
+def _fit(model: Path | bytes) -> bool:
+    """Return whether the weights of a graph cannot saturate; asked where integer products may."""
+    from vlatool.runtime.weight_pairs import weights_fit
+
+    return is_true_of(weights_fit, model)
 
 
 class OrtCpuSession(OnnxRuntimeSession):
@@ -48,7 +54,7 @@ class OrtCpuSession(OnnxRuntimeSession):
         products would end the process, pairs are computed in float, which is exact, too.
         """
         entries: list[tuple[str, str] | None] = [None]
-        if arithmetic.ort_product(ort) < arithmetic.EXACT_SUM and not is_true_of(weights_fit, model):
+        if arithmetic.ort_product(ort) < arithmetic.EXACT_SUM and not _fit(model):
             breaks = is_true_of(arithmetic.breaks_precise, ort, model)
             entries = [] if breaks else [arithmetic.PRECISE_OPTION, arithmetic.SIGNED_OPTION]
         option_sets = []

@@ -112,7 +112,9 @@ def _path(now: Pose, axes: Sequence[PositionAxis], samples: Sequence[Sample], in
         times = np.arange(1, count + 1) * (longest / count)
         times[-1] = longest
         columns = np.array(stops).T
-        positions[2:, moving] = stop_positions(*columns[:3], columns[3:7], columns[7] + times[:, None])
+        position, velocity, acceleration = columns[:3]
+        times_of_stops = columns[7] + times[:, None]
+        positions[2:, moving] = stop_positions(position, velocity, acceleration, columns[3:7], times_of_stops)
     return positions
 
 

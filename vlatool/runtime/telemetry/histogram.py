@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from math import ceil, log2
 
 LOWEST_MS, PER_OCTAVE, OCTAVES = 0.001, 8, 27
 """From 1 us to 134 s; a quantile is within 2^(1/16), 4.5 %."""
@@ -23,13 +24,18 @@ class Histogram:
 
     def add(self, time_ms: float) -> None:
         """Count a time; what is not a number is left out, below 0 counts as 0."""
-        if math.isnan(time_ms):
+        if time_ms != time_ms:
             return
         self.count += 1
-        self.sum_ms += max(0.0, time_ms)
-        self.max_ms = max(self.max_ms, time_ms)
-        octaves = math.log2(time_ms / LOWEST_MS) if time_ms > LOWEST_MS else 0.0
-        self._bins[min(len(self._bins) - 1, math.ceil(min(octaves, OCTAVES) * PER_OCTAVE))] += 1
+        if time_ms > 0:
+            self.sum_ms += time_ms
+        if time_ms > self.max_ms:
+            self.max_ms = time_ms
+        if time_ms <= LOWEST_MS:
+            self._bins[0] += 1
+            return
+        octaves = log2(time_ms / LOWEST_MS)
+        self._bins[ceil(octaves * PER_OCTAVE) if octaves < OCTAVES else -1] += 1
 
     def quantile_ms(self, share: float) -> float:
         """Return the time below which a share of the times lies, from 0 to 1; NaN without times."""

@@ -20,6 +20,8 @@ from vlatool.runtime.telemetry.record import PARTS, Delivery, TickRecord
 
 MAX_BYTES, FILES, LONGEST = 10_000_000, 5, 1_000_000
 MARK = ',"crc":"'
+_encode = json.JSONEncoder(separators=(",", ":"), default=str, allow_nan=False).encode
+"""What ``json.dumps`` would build again for each record."""
 
 
 class JsonLines:
@@ -157,9 +159,9 @@ def _finite(values: Any) -> Any:
 
 def _line(values: dict[str, Any], crc: int) -> tuple[bytes, int]:
     """Return the line of some values, and the checksum of all lines so far."""
-    body = json.dumps(values, separators=(",", ":"), default=str, allow_nan=False)[:-1]
-    crc = zlib.crc32(body.encode(), crc)
-    return f'{body}{MARK}{crc:08x}"}}\n'.encode(), crc
+    body = _encode(values)[:-1].encode()
+    crc = zlib.crc32(body, crc)
+    return body + f'{MARK}{crc:08x}"}}\n'.encode(), crc
 
 
 def read_lines(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:

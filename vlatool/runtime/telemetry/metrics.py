@@ -30,6 +30,7 @@ class Metrics:
         self.steps = self.misses = self.level = 0
         self.times = {name: Histogram() for name in TIMES}
         """What was timed -> its times."""
+        self._in_order = tuple(self.times.values())
         self.counts: dict[str, Counter[str]] = {kind: Counter() for kind in ("source", "check", "error", "alarm")}
         """Kind -> reason -> number of control steps."""
         self._early, self._recent = Histogram(), Histogram()
@@ -47,17 +48,17 @@ class Metrics:
         self.steps += 1
         self.misses += record.missed
         self.level = record.level
-        named = {"answer": record.answer_ms, "wait": record.waited_ms, "sensor age": record.sensed_ms,
-                 "age": record.origin.age_ms, "latent age": record.origin.latent_age_ms,
-                 **dict(zip(PARTS, record.parts_ms, strict=True))}  # fmt: skip
-        for name, time_ms in named.items():
+        origin = record.origin
+        named = (record.answer_ms, record.waited_ms, record.sensed_ms, origin.age_ms, origin.latent_age_ms,
+                 None, *record.parts_ms)  # fmt: skip
+        for times, time_ms in zip(self._in_order, named, strict=True):
             if time_ms is not None:
-                self.times[name].add(time_ms)
-        self._note("source", [record.origin.source])
-        self._note("check", record.origin.checks)
+                times.add(time_ms)
+        self._note("source", (origin.source,))
+        self._note("check", origin.checks)
         self._note("alarm", record.alarms)
-        self._note("error", [record.error.partition(":")[0][:80]] if record.error else [])
-        if record.origin.source == POLICY and record.action is not None:
+        self._note("error", (record.error.partition(":")[0][:80],) if record.error else ())
+        if origin.source == POLICY and record.action is not None:
             self._actions.add(record.action)
         self._compare(record.answer_ms)
 

@@ -16,6 +16,8 @@ from vlatool.runtime.telemetry.ring import Reader, Ring
 SIZE, PERIOD_S, END_S = 4096, 0.1, 2.0
 BURST, REST, MOST_REST_S = 8, 9.0, 0.01
 """Records after which a thread rests; for how long, by the time that they took; and at most, in s: a sink may block."""
+TURN_S = 0.05
+"""Longest wait for another sink's turn: one that takes longer blocks, and the others go on beside it."""
 _OPEN: weakref.WeakSet[Telemetry] = weakref.WeakSet()
 
 
@@ -25,7 +27,7 @@ class Telemetry:
     ``put`` stores a record in a ring and returns. A sink that blocks loses the oldest records, and they are counted;
     what it raises is counted, too, and neither reaches the robot or another sink. After a few records a thread rests
     nine times as long as those took: it takes a tenth of a core at most, and where a control step wants the same core,
-    it waits for those few, not for all.
+    it waits for those few, not for all. The threads take turns, so that it does not wait for several of them.
 
     Args:
         sinks: Functions of a record, such as ``JsonLines`` and ``Prometheus``.
@@ -45,9 +47,9 @@ class Telemetry:
                     f"telemetry is {sink!r:.80}; allowed: a function of a record, or Telemetry(...).",
                     'pass records.append, or Telemetry(JsonLines("log.jsonl"))',
                 )
-        ring = Ring(size)
+        ring, turn = Ring(size), Turn(min(TURN_S, period_s / 2))
         self.put = ring.put
-        self.outlets = tuple(Outlet(sink, Reader(ring), period_s) for sink in sinks)
+        self.outlets = tuple(Outlet(sink, Reader(ring), period_s, turn) for sink in sinks)
         """What takes the records of each sink."""
         _OPEN.add(self)
         weakref.finalize(self, _finish, self.outlets).atexit = False
@@ -76,6 +78,29 @@ class Telemetry:
         return all(ended)
 
 
+class Turn:
+    """Lets one thread work at a time, unless it blocks: then the others do not wait for it.
+
+    Args:
+        wait_s: Time after which a thread that has the turn counts as blocked, in seconds.
+    """
+
+    def __init__(self, wait_s: float) -> None:
+        self._lock, self._wait_s, self._blocked = threading.Lock(), wait_s, False
+
+    def take(self) -> bool:
+        """Wait until no other thread has the turn; returns whether this one has it, and is to ``end`` it."""
+        taken = self._lock.acquire(timeout=0 if self._blocked else self._wait_s)
+        if not taken:
+            self._blocked = True  # until that thread ends its turn
+        return taken
+
+    def end(self) -> None:
+        """Let another thread have it."""
+        self._blocked = False
+        self._lock.release()
+
+
 class Outlet:
     """The thread of one sink.
 
@@ -84,9 +109,9 @@ class Outlet:
         error: The last reason; empty without one.
     """
 
-    def __init__(self, sink: Sink, reader: Reader, period_s: float) -> None:
+    def __init__(self, sink: Sink, reader: Reader, period_s: float, turn: Turn) -> None:
         self.sink, self.reader, self.failed, self.error = sink, reader, 0, ""
-        self._period_s = period_s
+        self._period_s, self._turn = period_s, turn
         self._wake, self._idle = threading.Event(), threading.Event()
         self._ends = self._hurries = False
         self._thread = threading.Thread(target=self._work, name="vlatool-telemetry", daemon=True)
@@ -103,19 +128,32 @@ class Outlet:
 
     def _write(self) -> None:
         """Pass on all records that are there."""
-        begin, count = time.perf_counter(), 0
-        while (record := self.reader.take()) is not None:
+        more = True
+        while more:
+            has_turn = not self._hurries and self._turn.take()
+            begin = time.perf_counter()
+            try:
+                more = self._pass_on()
+                if not more:
+                    self._call("flush")
+            finally:
+                if has_turn:
+                    self._turn.end()
+            if more and not self._hurries:
+                time.sleep(min(MOST_REST_S, REST * (time.perf_counter() - begin)))
+
+    def _pass_on(self) -> bool:
+        """Pass a few records on; returns whether there may be more."""
+        for _ in range(BURST):
+            if (record := self.reader.take()) is None:
+                return False
             try:
                 self.sink(record)
             except Exception as error:  # the seam: a full disk is no reason to stop the robot
                 self._note(error)
-            count += 1
-            if self._hurries:
-                continue
-            rests = count % BURST == 0
-            time.sleep(min(MOST_REST_S, REST * (time.perf_counter() - begin)) if rests else 0)  # 0: lets others go on
-            begin = time.perf_counter() if rests else begin
-        self._call("flush")
+            if not self._hurries:
+                time.sleep(0)  # lets others go on
+        return True
 
     def _call(self, method: str) -> None:
         try:
