@@ -33,6 +33,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 
 from _killed_nodes import BUSES, DRIVING, LEADS, PATIENCE_S, Robot, elapsed_s, last_rest
+from _ros1 import prepare
 
 LIMIT_S, STANDING_S = 1.2, 1.0
 DRIVES_ON_S = 4.0
@@ -201,6 +202,8 @@ def run(options: argparse.Namespace) -> list[Kill]:
     for what in np.random.default_rng(options.seed).permutation(whats):
         waiting.put(str(what))
     kills: list[Kill] = []
+    if options.bus == "ros1":  # once, before the robots, which would unpack it over each other
+        prepare(options.ros1.resolve())
     with ThreadPoolExecutor(options.robots) as pool:
         robots = [pool.submit(run_robot, number, options, waiting, kills) for number in range(options.robots)]
         try:
