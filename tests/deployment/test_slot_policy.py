@@ -1,5 +1,6 @@
 """The active bundle as a policy: trial, rollback and exchange while it runs; no action is computed by two bundles."""
 
+import mmap
 import shutil
 import threading
 from pathlib import Path
@@ -246,13 +247,20 @@ def test_a_new_bundle_that_fails_before_a_standby_without_time_is_left(store, bu
 
 def test_growth_rolls_back(store, bundles):
     grown = []
-    robot = Robot(store, bundles, lambda number: grown.append(np.ones(350_000)))  # 2.8 MB each; 64 are allowed
+
+    def grow(_number: int) -> None:
+        grown.append(mmap.mmap(-1, 2_800_000))  # 64 MB are allowed; what the process has freed before is not used again
+        grown[-1].write(bytes(2_800_000))
+
+    robot = Robot(store, bundles, grow)
     robot.clock.now = -1e9  # no commit
     robot.policy._running.start = 0.0
     assert [robot.value() for _ in range(2 * MEMORY_PERIOD)][-1] == 2.0
     assert [robot.value() for _ in range(2 * MEMORY_PERIOD)][-1] == 1.0
     robot.policy.close()
     assert "the process grew" in store.read().rollback
+    for each in grown:
+        each.close()
 
 
 def test_what_is_outside_may_let_the_trial_fail(store, bundles):

@@ -200,6 +200,11 @@ class _Desk:
                 call.task.stop()
             return True
 
+    def give_up(self, call: Call) -> None:
+        """Abandon a call whose caller was interrupted, perhaps before its thread was woken."""
+        if self.abandon(call):
+            self.wake_signal.send()
+
     def end_call(self, seconds: float) -> None:
         """Stop the task that runs, and wait until it has ended, but no longer than this."""
         if (call := self.call) is not None:
@@ -249,11 +254,12 @@ class Worker:
             TimeoutError: when it does not, or an abandoned task still runs; the task has no effect then.
             UsageError: when another caller is waiting.
         """
-        call = self.start(task, due)
+        call = Call(task, due, due - self._clock())
         try:
+            self._hand_over(call)
             in_time = self._desk.wait(call, call.left)
         except BaseException:  # Ctrl-C: nobody waits for it any more
-            self.abandon(call)
+            self._desk.give_up(call)
             raise
         if not in_time and self.abandon(call):
             raise TimeoutError("it was stopped")
@@ -268,17 +274,25 @@ class Worker:
         Raises:
             TimeoutError, UsageError: as ``call`` does.
         """
-        left = due - self._clock()
+        call = Call(task, due, due - self._clock())
+        try:
+            self._hand_over(call)
+        except BaseException:
+            self._desk.give_up(call)
+            raise
+        return call
+
+    def _hand_over(self, call: Call) -> None:
+        """Give the thread a call, or refuse it; where this is interrupted, the call is to be given up."""
+        if self._thread is None and call.left > 0:
+            self._start()
         with self._desk.lock:
             if self._desk.call is not None:
                 self._refuse(self._desk.call)
-            if left <= 0:
+            if call.left <= 0:
                 raise TimeoutError("no time is left for it")
-            call = self._desk.call = Call(task, due, left)
-        if self._thread is None:
-            self._start()
+            self._desk.call = call
         self._desk.wake_signal.send()
-        return call
 
     def wait(self, call: Call, seconds: float) -> bool:
         """Return whether a call ends within a time of the process's clock."""
@@ -298,8 +312,9 @@ class Worker:
 
     def _start(self) -> None:
         close_at_exit(self._desk)
-        self._thread = threading.Thread(target=self._desk.begin_serving(), name=self._name, daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self._desk.begin_serving(), name=self._name, daemon=True)
+        thread.start()
+        self._thread = thread  # after the start: one that an interruption kept from starting serves nobody
 
     def close(self, seconds: float = EXIT_S) -> None:
         """End the thread; the next call starts another. A task that runs is stopped, and waited for so many seconds."""
