@@ -16,6 +16,7 @@ import tarfile
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from itertools import chain
 from pathlib import Path
 
@@ -132,12 +133,27 @@ class Emulators:
             whole(target, lambda draft: self._fetch_wheels(onnxruntime, draft))
         return target
 
+    def serving(self) -> Path:
+        """Return a folder with all that ``vlatool serve`` needs beside an ONNX Runtime, fetched where it is not there.
+
+        Raises:
+            Unreachable: when the package registry does not answer.
+            EmulationError: when something else fails.
+        """
+        target = self.folder / "serving"
+        if not target.exists():
+            whole(target, self._fetch_serving)
+        return target
+
+    def _fetch_serving(self, draft: Path) -> None:
+        lines = [line.partition(";") for line in metadata.requires("vlatool") or ()]
+        wanted = [name for name, _, marker in lines if "extra ==" not in marker or "serve" in marker]
+        install_for_board(draft, wanted)
+        code = "import grpc, msgpack, pydantic, websockets, zmq; print(zmq.__version__)"
+        said([*self.emulated("aarch64", "max"), str(self.python()), "-c", code], {"PYTHONPATH": str(draft)})
+
     def _fetch_wheels(self, onnxruntime: str, draft: Path) -> None:
-        tags = [word for tag in (*TAGS, "manylinux2014_aarch64") for word in ("--platform", tag)]
-        kind = ["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311", "--only-binary", ":all:"]
-        options = ["--quiet", "--disable-pip-version-check", "--no-deps", "--target", str(draft)]
-        wanted = [f"onnxruntime=={onnxruntime}", "numpy"]
-        told([sys.executable, "-m", "pip", "install", *options, *kind, *tags, *wanted], "The package registry")
+        install_for_board(draft, ["--no-deps", f"onnxruntime=={onnxruntime}", "numpy"])
         for library in chain.from_iterable(map(draft.glob, LIBRARIES)):
             check_elf(library, "aarch64")
         code = "import numpy, onnxruntime; print(onnxruntime.__version__)"
@@ -166,6 +182,23 @@ class Emulators:
         """Return the words before a command that let it run on a core of another kind."""
         place = root or (self.board() if arch == "aarch64" else Path("/"))
         return [str(self.qemu(arch)), "-cpu", cpu, *(["-L", str(place)] if arch == "aarch64" else [])]
+
+
+def install_for_board(folder: Path, wanted: Sequence[str]) -> None:
+    """Install wheels for the board's Python.
+
+    Args:
+        folder: Where to.
+        wanted: Requirements, and further options of pip.
+
+    Raises:
+        Unreachable: when the package registry does not answer.
+        EmulationError: when something else fails.
+    """
+    tags = [word for tag in (*TAGS, "manylinux2014_aarch64") for word in ("--platform", tag)]
+    kind = ["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311", "--only-binary", ":all:"]
+    options = ["--quiet", "--disable-pip-version-check", "--target", str(folder)]
+    told([sys.executable, "-m", "pip", "install", *options, *kind, *tags, *wanted], "The package registry")
 
 
 def whole(target: Path, make: Callable[[Path], None]) -> None:

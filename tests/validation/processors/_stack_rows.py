@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from _asked import CRASHED, ROOT
 from _emulation import Emulators
+from _stack_serving import serving_rows
 from _verdicts import Difference, Row
 
 from vlatool.deployment.deploy import Conditions
@@ -54,7 +55,12 @@ def stack_rows(
         with np.load(file) as arrays:
             found.append({key: arrays[key] for key in arrays.files})
     rows = compared_stacks(where, *found)
-    return rows if parts != "all" else [*rows, through_ssh(where, emulated, cache.folder / "bundles" / "stack")]
+    if parts != "all":
+        return rows
+    stored = cache.folder / "bundles" / "stack"
+    packages = {"PYTHONPATH": f"{ROOT}:{cache.serving()}:{path['PYTHONPATH']}"}
+    serves = board_python(folder / "serves", python, packages)
+    return [*rows, through_ssh(where, emulated, stored), *serving_rows(where, serves, stored / "arm")]
 
 
 def compared_stacks(where: tuple[str, ...], here: dict[str, Any], there: dict[str, Any]) -> list[Row]:

@@ -1,6 +1,6 @@
 """The runtime on emulated 64-bit ARM: does every bundle load there, and answer what it answers here?
 
-And the layers around a policy (controllers, envelope, deadline, updates, deployment through ssh): the same as here?
+And the layers around a policy (controllers, envelope, deadline, updates, deployment through ssh, serving): the same?
 
 Usage: python tests/validation/processors/arm64.py [--sources SOURCE ...] [--cores CORE ...] [--onnxruntime VERSION ...]
            [--newest] [--observations COUNT] [--stack PARTS] [--jobs COUNT] [-o out/processors]
