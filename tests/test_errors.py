@@ -121,3 +121,22 @@ def test_require_tells_a_missing_dependency_from_a_missing_package(tmp_path: Pat
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(MissingExtra, match="'half_installed_thing' is installed, but 'its_absent_dependency'"):
         require("half_installed_thing", "text")
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [("raise ImportError('lib.so: failed to map segment from shared object')", "lib.so: failed to map segment"),
+     ("raise ImportError('libc.so.6: version GLIBC_2.34 not found')", "GLIBC_2.34"),
+     ("from json import nothing", "cannot import name 'nothing' from 'json'"),
+     ("raise RuntimeError('compiled against another ABI')", "compiled against another ABI"),
+     ("raise ImportError", "ImportError"),
+     ("raise ImportError('IMPORTANT: read\\n\\nOriginal error was: no')", "error was: no")],
+)  # fmt: skip
+def test_require_says_why_an_installed_package_cannot_be_imported(line: str, why: str, tmp_path: Path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "damaged_thing", raising=False)
+    (tmp_path / "damaged_thing.py").write_text(f"{line}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(MissingExtra, match="'damaged_thing' is installed, but cannot be imported: ") as caught:
+        require("damaged_thing", "text")
+    assert why in str(caught.value)
+    assert "damaged" in str(caught.value.fix)

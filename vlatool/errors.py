@@ -264,16 +264,30 @@ def require_present(module: str, extra: str) -> None:
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import a module; raises MissingExtra, which names the extra that provides it, when it is not installed."""
+    """Import a module.
+
+    Raises:
+        MissingExtra: when its package is not installed, which names the extra that provides it, or cannot be imported
+            although it is installed, which says why.
+    """
     try:
         return importlib.import_module(module)
-    except ImportError as error:
-        top = module.partition(".")[0]
-        if error.name is not None and error.name.partition(".")[0] != top:
+    except (MemoryError, VlatoolError):
+        raise
+    except Exception as error:  # besides ImportError, what a library of another version raises when it is imported
+        top, absent = module.partition(".")[0], error.name if isinstance(error, ModuleNotFoundError) else None
+        if absent is not None and absent.partition(".")[0] == top:
+            raise _missing(top, extra) from error
+        if absent is not None:
             raise MissingExtra(
-                f"'{module}' is installed, but '{error.name}', which it needs, is not.", pip_install(extra)
+                f"'{module}' is installed, but '{absent}', which it needs, is not.", pip_install(extra)
             ) from error
-        raise _missing(top, extra) from error
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        why = lines[0] if len(lines) == 1 else f"{lines[0]} ... {lines[-1]}"
+        raise MissingExtra(
+            f"'{top}' is installed, but cannot be imported: {why}",
+            f"read what it says; where its files are damaged: pip install --force-reinstall {top}",
+        ) from error
 
 
 def _missing(package: str, extra: str) -> MissingExtra:

@@ -25,9 +25,9 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 NO_MEMORY = (
     "MemoryError", "bad_alloc", "bad allocation", "ailed to allocate", "ut of memory", "annot allocate",
-    "Memory allocation",
+    "Memory allocation", "failed to map segment", "cannot change memory protections", "static TLS block",
 )  # fmt: skip
-"""What Python, C++ and the engines say when a limit on memory is reached; a control group kills instead."""
+"""What Python, C++, the dynamic linker and engines say when a limit on memory is reached; a control group kills."""
 
 
 def signal_name(code: int) -> str:
