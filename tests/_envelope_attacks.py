@@ -41,8 +41,10 @@ class Robot:
 
     def begin(self, random: np.random.Generator) -> None:
         """Start somewhere within the limits, now and then on one of them; elsewhere is refused."""
-        share = random.choice([0.0, 1.0, 0.5, random.random()], size=len(self.low))
-        self.start = [low + part * (high - low) for low, high, part in zip(self.low, self.high, share, strict=True)]
+        self.start = self._within_limits(random)
+        while self._kept_out():
+            refused(DataError, lambda: self.envelope.start(self.start))
+            self.start = self._within_limits(random)
         for index, joint in enumerate(self.joints):
             if joint.low is not None:
                 outside = [*self.start[:index], self.high[index] + 1e-3, *self.start[index + 1 :]]
@@ -52,6 +54,15 @@ class Robot:
         self.times: list[float] = []
         self.sent: list[tuple[float, ...]] = []
         self.now = 0.0
+
+    def _within_limits(self, random: np.random.Generator) -> list[float]:
+        share = random.choice([0.0, 1.0, 0.5, random.random()], size=len(self.low))
+        return [low + part * (high - low) for low, high, part in zip(self.low, self.high, share, strict=True)]
+
+    def _kept_out(self) -> bool:
+        """Return whether the start is in a box to keep out of."""
+        at = {joint.name: value for joint, value in zip(self.joints, self.start, strict=True)}
+        return any(all(box.low[name] < at[name] < box.high[name] for name in box.low) for box in self.limits.keep_out)
 
     def step(self, command: Any, interval: float, **more: Any) -> None:
         """Take a step, and log what was sent."""
